@@ -49,7 +49,8 @@ class MomentumObserver(NamedTuple):
     ) -> None:
         """Write the torque to `signals.demand`."""
         memory = memory_of(state.memory, settings)
-        P0, H, Yp, Yr = settings.initial_estimate, signals.H, signals.Yp, signals.Yr
+        P0, H = settings.initial_estimate, signals.H
+        Yp, Yr = signals.momentum.Yp, signals.momentum.Yr
         q, dq, dqr = signals.q, signals.dq, signals.dqr
         settings.model.regressor(q, dq, dqr, signals.ddqr, H)
         settings.model.momentum_regressor(q, dq, Yp, Yr)

@@ -6,6 +6,23 @@ class BlfDscError(Exception):
     """Base class of all errors that this package raises on purpose; can be pickled."""
 
 
+class ArgumentTypeError(BlfDscError, TypeError):
+    """An argument is of another type than the function takes."""
+
+
+def check_type(
+    name: str, value: object, expected: type | tuple[type, ...], remedy: str
+) -> None:
+    """Raise ArgumentTypeError, with the remedy, unless an argument is of an expected type."""
+    if isinstance(value, expected):
+        return
+    types = expected if isinstance(expected, tuple) else (expected,)
+    wanted = ' or '.join(each.__name__ for each in types)
+    raise ArgumentTypeError(
+        f'{name}: got {type(value).__name__}, expected {wanted}: {remedy}'
+    )
+
+
 class ConfigurationError(BlfDscError):
     """Invalid configuration; the message lists every problem found."""
 

@@ -10,6 +10,7 @@ from blf_dsc_controller.law.state import Settings
 
 _PARTS = {
     '': 'robust_gain=mu_bar',
+    'truth': 'known=truth_known parameters=true_parameters disturbance=true_disturbance',
     'barrier': 'bound initial_bound funnel_rate weight slope_limit knee',
     'surface': 'gain=K mu time_constant known_rate',
     'feedback': 'gain=Kp robust_gain=d2 damping_rate follows_inertia decoupled',

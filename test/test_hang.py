@@ -207,7 +207,7 @@ def test_arm_near_its_reference_returns_to_it_after_a_gap_at_the_torque_that_act
     assert start.content['resumed']
     error = guard.controller.signals.xi1
     assert np.abs(error).max() < 1e-9
-    whole = measurement[2 * n :] - guard.controller.signals.added
+    whole = measurement[2 * n :] - guard.controller.signals.saturation.added
     # as measured and delayed, within what an arm that brakes changes in some samples
     np.testing.assert_allclose(whole, held, atol=0.5)
     step = np.array(loop.config.torque.rate_limit) * loop.config.sample_time

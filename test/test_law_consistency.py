@@ -291,8 +291,8 @@ def test_change_is_detected_from_eight_times_the_residual_on(
     """What a window taught before it was full is taken back, and the torque stays the same."""
     controller, residual = learned
     settings, state, signals = controller.settings, controller.state, controller.signals
-    signals.row[:] = 0.0
-    signals.row[0, -1] = np.sqrt(ratio * residual)
+    signals.row.Xu[:] = 0.0
+    signals.row.Xu[0, -1] = np.sqrt(ratio * residual)
     state.window.rows[0] = rows * settings.window.length
     state.latch.anchor[:] = 0.9 * state.estimate
     before = state.estimate.copy()

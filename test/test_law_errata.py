@@ -141,7 +141,7 @@ def rows_of_a_loop(prediction, duration=1.0):
     arm = plant(constant=QUIET, amplitude=QUIET)
     for sample in closed_loop(law, arm, duration):
         if sample.t > 0.2:
-            row = law.signals.row
+            row = law.signals.row.Xu
             yield row[:, :3] @ P - row[:, 3], law, sample
 
 
@@ -179,11 +179,12 @@ def test_erratum_11_filter_gap_enters_the_error_rate_with_a_minus():
     for sample in closed_loop(law, plant(), 0.05):
         signals = law.signals
         if alpha2 is not None:  # the filter's state before this sample
-            gap = signals.beta2 - alpha2
+            beta2 = signals.surface.beta2
+            gap = beta2 - alpha2
             rate = sample.measurement[2:4] - signals.dqr
             off.append(
                 [
-                    signals.xi2 + signals.beta2 + sign * gap - law.signals.dqr - rate
+                    signals.xi2 + beta2 + sign * gap - law.signals.dqr - rate
                     for sign in (-1, 1)
                 ]
             )

@@ -23,6 +23,11 @@ ROW = prediction.Settings(
 )
 
 
+def scratch():
+    """Values of one sample."""
+    return part(prediction.Work, n=N, m=M, p=P)
+
+
 def empty():
     """State before the first row."""
     return part(prediction.State, n=N, m=M, p=P)
@@ -32,10 +37,13 @@ def test_row_of_an_interval_has_the_change_of_the_momentum_and_the_mean_of_the_r
     """X = (Yp_k - Yp_{k-1}) / T + (Yr_k + Yr_{k-1}) / 2, and the torque of the interval."""
     random = np.random.default_rng(0)
     before, now = random.normal(size=(2, N, P)), random.normal(size=(2, N, M))
-    state, row = empty(), np.zeros((N, M + 1))
-    prediction.keep_regressors(state, before[0], now[0])
+    state, work = empty(), scratch()
+    row = work.Xu
+    work.Yp[:], work.Yr[:] = before[0], now[0]
+    prediction.keep_regressors(state, work)
     state.late[1] = 7.0, 8.0
-    prediction.fill_interval(state, before[1], now[1], DT, row)
+    work.Yp[:], work.Yr[:] = before[1], now[1]
+    prediction.fill_interval(state, work, DT)
     expected = (now[0] + now[1]) / 2.0
     expected[:, :P] += (before[1] - before[0]) / DT
     np.testing.assert_allclose(row[:, :M], expected, rtol=1e-12)
@@ -46,11 +54,12 @@ def test_constant_row_passes_both_poles_and_is_weighted():
     """After k samples 1 - (1 + k g) (1 - g)^k of it has passed, with the gain g of each pole."""
     state, gain = empty(), 1.0 - exp(-ROW.filter_pole * DT)
     for k in range(1, 100):
-        row = np.ones((N, M + 1))
-        prediction.pass_poles(ROW, state, np.array([1e6, 0.0]), DT, row)
+        work = scratch()
+        work.Xu[:] = 1.0
+        prediction.pass_poles(ROW, state, work, np.array([1e6, 0.0]), DT)
         left = (1.0 - gain) ** k * (1.0 + k * gain)
         np.testing.assert_allclose(state.filter2, 1.0 - left, rtol=1e-9)
-        assert not row[1].any()  # a joint at rest
+        assert not work.Xu[1].any()  # a joint at rest
     prediction.forget(state)
     assert not state.filter1.any()
     assert not state.filter2.any()
@@ -126,16 +135,16 @@ def test_feedback_is_damping_and_the_robust_term_of_28(xi1, xi2, joint, torque):
 def test_acceleration_has_the_damping_and_the_restoring_torque_over_the_inertia(
     follows, expected
 ):
-    out = np.zeros(2)
+    work = part(feedback.Work, n=2)
+    work.restoring[:] = 1.0, -2.0
     feedback.fill_acceleration(
         FEEDBACK._replace(follows_inertia=follows),
+        work,
         wanted=np.array([1.0, 3.0]),
         xi2=np.array([0.1, -0.1]),
-        restoring=np.array([1.0, -2.0]),
         inertia=np.array([0.5, 0.25]),
-        out=out,
     )
-    np.testing.assert_allclose(out, expected)
+    np.testing.assert_allclose(work.acceleration, expected)
 
 
 def test_known_rate_of_the_virtual_control_is_its_derivative_along_the_measured_motion():
@@ -172,9 +181,9 @@ def test_known_rate_of_the_virtual_control_is_its_derivative_along_the_measured_
 def test_disturbance_estimate_follows_the_error_with_leakage_and_gives_up_what_is_learned():
     of = disturbance.Settings(gain=np.array([10.0, 20.0]), leakage=0.5, bumpless=1)
     d3 = np.array([2.0, -4.0])
-    step = np.zeros(2)
-    disturbance.fill_step(of, d3, np.array([0.1, 0.2]), DT, step)
-    np.testing.assert_allclose(step, DT * np.array([10.0 * 1.1, 20.0 * -1.8]))
+    work = part(disturbance.Work, n=2)
+    disturbance.fill_step(of, work, d3, np.array([0.1, 0.2]), DT)
+    np.testing.assert_allclose(work.step, DT * np.array([10.0 * 1.1, 20.0 * -1.8]))
     H, before = np.random.default_rng(1).normal(size=(2, 2, M))
     theta = before[0] + 0.1
     torque = H @ before[0] + d3

@@ -14,6 +14,7 @@ from closed_loop_case import (
     quick,
     recommended,
 )
+from law_part import part
 from paper_case import P
 from plain_law import PlainLaw, R, regressor
 from plants import QUIET
@@ -247,7 +248,16 @@ def limits(level, rate):
 
 def torque_state(held):
     """State of the saturation of one joint, which holds a torque back."""
-    return torque.State(np.full(1, held), *np.zeros((3, 1)))
+    state = part(torque.State, n=1)
+    state.held_back[:] = held
+    return state
+
+
+def torque_work(n, added):
+    """Values of one sample, in which the drives add a torque."""
+    work = part(torque.Work, n=n, torque=limits(1.0, 0.0))
+    work.added[:] = added
+    return work
 
 
 def cut(
@@ -262,19 +272,19 @@ def cut(
 ):
     """Torque and what cut it; the cuts are counted, and any is reported."""
     state = torque_state(held)
-    one = np.ones(1)
-    command, cuts = np.zeros((2, 1))
+    one, command = np.ones(1), np.zeros(1)
+    work = torque_work(1, added)
     saturated = saturate(
         limits(level, rate),
         state,
+        work,
         demand * one,
-        added * one,
         last * one,
         has_last,
         DT,
         command,
-        cuts,
     )
+    cuts = work.cuts
     assert saturated == (cuts[0] > 0.0)
     assert cuts == LEVEL_CUT * state.level_cuts + RATE_CUT * state.rate_cuts
     return command[0], cuts[0]
@@ -318,9 +328,9 @@ def follow(demands, rate):
     of, state = limits(1e3, rate), torque_state(0.0)
     last = np.full(1, demands[0])
     for demand in demands:
-        command, cuts, nothing = np.zeros((3, 1))
-        now = np.full(1, demand)
-        saturate(of, state, now, nothing, last, True, DT, command, cuts)  # noqa: FBT003
+        command, now = np.zeros(1), np.full(1, demand)
+        work = torque_work(1, 0.0)
+        saturate(of, state, work, now, last, True, DT, command)  # noqa: FBT003
         last = command
         yield command[0]
 
@@ -358,10 +368,11 @@ def test_torque_that_is_not_a_number_does_not_turn_into_one_that_looks_valid(rat
 
 def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends():
     command, before, added, applied = np.random.default_rng(3).normal(size=(4, 2))
-    expected = command + 0.5 * (before + added)
-    find_applied(command, before, added, applied)
-    np.testing.assert_array_equal(applied, expected)
-    np.testing.assert_array_equal(before, added)
+    drives, work = part(torque.State, n=2), torque_work(2, added)
+    drives.added[:] = before
+    find_applied(drives, work, command, applied)
+    np.testing.assert_array_equal(applied, command + 0.5 * (before + added))
+    np.testing.assert_array_equal(drives.added, added)
 
 
 class Filter:
@@ -374,11 +385,11 @@ class Filter:
 
     def step(self, xi2, dalpha2, dt):
         """Return ddq^ (2,) of the next sample."""
-        ddq = np.zeros(2)
+        self.acceleration = np.zeros(2)
         begins = self.samples == 0
-        prediction.differentiate(self, self, xi2, dalpha2, begins, dt, ddq)
+        prediction.differentiate(self, self, self, xi2, dalpha2, begins, dt)
         self.samples += 1
-        return ddq
+        return self.acceleration
 
 
 @pytest.mark.parametrize('omega', [1.0, 30.0, 1000.0])
@@ -414,14 +425,14 @@ def test_row_of_lambda_follows_equation_24_in_a_closed_loop():
         y = np.array([*dalpha2, *alpha2, 1.0])
         rest = x @ y / (x @ x) * np.column_stack([np.eye(2), applied])
         expected = np.column_stack([regressor(R, q, dq, alpha2, dalpha2), rest])
-        np.testing.assert_allclose(law.signals.row, expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(law.signals.row.Xu, expected, rtol=1e-9, atol=1e-9)
 
 
 def error_with_filter(omega):
     """Largest error of ddq^ [rad/s^2] from 0.5 s on, where the reference has 0.3."""
     law = controller(recommended(prediction=LAMBDA, omega=omega))
     found = [
-        (sample.measurement[2:4].copy(), law.signals.acceleration.copy())
+        (sample.measurement[2:4].copy(), law.signals.row.acceleration.copy())
         for sample in closed_loop(law, plant(), 2.0)
     ]
     velocity, ours = np.array(found).transpose(1, 0, 2)

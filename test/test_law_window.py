@@ -146,7 +146,7 @@ def excited_case(seed):
     state.window.rows[0] = settings.window.length
     state.window.cursor[0] = 0.0
     for row in np.random.default_rng(seed).normal(
-        size=(settings.window.length, *signals.row.shape)
+        size=(settings.window.length, *signals.row.Xu.shape)
     ):
         window.push_row(state.window, row)
     return case

@@ -96,7 +96,9 @@ def test_suspect_samples_are_flagged_and_not_kept(
 def test_cuts_add_up_if_they_take_more_than_a_fifth_of_the_time(law, every, stops):
     check = sample_check(build(ControllerConfig, {'safety.saturation_time': 0.05}), law)
     found = []
-    law.signals.added[1] = 5.0  # by the drive, so that the command is at its limit
+    law.signals.saturation.added[1] = (
+        5.0  # by the drive, so that the command is at its limit
+    )
     for k in range(2000):
         law.signals.demand[1] = -16.0 * (k % every == 0)
         law.flags = verdict(law)
@@ -152,7 +154,7 @@ def test_what_drives_add_is_no_lack_of_a_whole_effort():
     law = controller_of(config)
     law.update(0.0, DT, plant_of(loop.plant).measure())
     check = sample_check(config, law)
-    added, limit = law.signals.added, law.settings.torque.limit
+    added, limit = law.signals.saturation.added, law.settings.torque.limit
     i = int(np.argmax(np.abs(added) / limit))
     assert abs(added[i]) > 0.1 * limit[i]
     law.checks.effect.lack[i] = -np.sign(added[i]) * limit[i] / 3.0

@@ -45,10 +45,10 @@ def test_load_is_told_in_steps_of_half_a_percent_of_a_torque_limit(law):
     weigh(law, 2.0)
     told = []
     while (load := loads.next(law)) is not None:
-        before = law.state.added.copy()
+        before = law.state.saturation.added.copy()
         loads.take(law, load)
         told.append(load.mass)
-        step = np.abs(law.state.added - before) / law.settings.torque.limit
+        step = np.abs(law.state.saturation.added - before) / law.settings.torque.limit
         assert step.max() < 0.005 * (1.0 + 1e-9)
     assert len(told) > 10
     assert (np.diff(told) > 0.0).all()

@@ -216,7 +216,7 @@ def test_rate_limit_that_delays_the_torque_is_named():
     cause = StopCause(config.joints, law, Calming(config, law))
     assert cause.text(0.0) == ''
     cause.take_limited(1)
-    law.signals.cuts[:] = 0.0, RATE_CUT
+    law.signals.saturation.cuts[:] = 0.0, RATE_CUT
     assert cause.text(0.1).startswith(
         "joint 'joint2' has demanded more than its torque"
     )

@@ -31,6 +31,7 @@ from blf_dsc_controller.analysis.panels import (
     Panel,
     panels,
 )
+from blf_dsc_controller.errors import check_type
 from blf_dsc_controller.run import Run
 from blf_dsc_controller.writing import writing
 
@@ -154,6 +155,7 @@ def draw(run: Run, folder: str | Path, metrics: Metrics | None = None) -> list[P
     were learned. The folder is created if necessary. `metrics` are those of the run, if
     they have been measured already.
     """
+    check_type('run', run, Run, 'simulate(...).run() and read_run return one')
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     tracking, change, parameters = (folder / name for name in NAMES)

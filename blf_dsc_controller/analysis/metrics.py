@@ -21,6 +21,7 @@ from blf_dsc_controller.analysis.event_times import (
     first_violation,
     latch_time,
 )
+from blf_dsc_controller.errors import check_type
 from blf_dsc_controller.messages.topics import (
     LATE_STEPS,
     LATENCY,
@@ -105,7 +106,11 @@ class Metrics:
 
 @np.errstate(all='ignore')  # a bag may hold any number
 def measure(run: Run) -> Metrics:
-    """Compute the metrics of a run."""
+    """Compute the metrics of a run.
+
+    Raises ArgumentTypeError if it is none, as a record of `simulate`.
+    """
+    check_type('run', run, Run, 'simulate(...).run() and read_run return one')
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
     ratio = _largest_ratio(run)
     (violation, joint) = first_violation(run)

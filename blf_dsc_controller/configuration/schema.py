@@ -25,7 +25,7 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 import yaml
 
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import ArgumentTypeError, BlfDscError, ConfigurationError
 
 Config = TypeVar('Config')
 Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
@@ -271,7 +271,15 @@ def _plain(value: Any) -> Any:
 
 
 def change(config: Config, given: Mapping[str, object], source: str = '') -> Config:
-    """Return a configuration with some parameters changed, validated as a whole."""
+    """Return a configuration with some parameters changed, validated as a whole.
+
+    Raises ArgumentTypeError if it is none, as all of `load_loop`.
+    """
+    if not dataclasses.is_dataclass(config):
+        raise ArgumentTypeError(
+            f'config: got {type(config).__name__}, expected ControllerConfig or PlantConfig: give '
+            'the .controller or .plant of load_loop'
+        )
     return build(type(config), {**flatten(config), **given}, source)
 
 

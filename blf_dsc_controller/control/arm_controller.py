@@ -19,7 +19,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Output, Outputs
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.errors import BlfDscError, check_type
 from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -107,9 +107,16 @@ class ArmController:
         that are given; with `wall`, as much later as the wall clock was at the first.
 
         Raises:
+            ArgumentTypeError: it is none of these.
             ConfigurationError: with all problems of the file.
             BagError: there is such a folder.
         """
+        check_type(
+            'config',
+            config,
+            (ControllerConfig, str, Path),
+            'give the name of a preset, a file, or the .controller of load_loop',
+        )
         if not isinstance(config, ControllerConfig):
             config = load(locate(config), CONTROLLER, ControllerConfig)
         self.config = config

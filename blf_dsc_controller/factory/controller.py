@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import check_type
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.controller import Controller
@@ -13,7 +14,13 @@ from blf_dsc_controller.reference.approach import plan_start, reference_of
 
 
 def controller_of(config: ControllerConfig) -> Controller:
-    """Return the controller of a configuration, compiled and in its initial state."""
+    """Return the controller of a configuration, compiled and in its initial state.
+
+    Raises ArgumentTypeError if it is another configuration.
+    """
+    check_type(
+        'config', config, ControllerConfig, 'load_loop returns it as .controller'
+    )
     return Controller(law_of(config), settings_of_config(config), reference_of(config))
 
 

@@ -82,8 +82,8 @@ def _of_model_based(_config: ControllerConfig, settings: Settings) -> Settings:
     nothing = np.zeros(settings.n)
     columns = settings.initial_estimate[settings.p :]
     return settings._replace(
-        initial_estimate=np.concatenate((settings.true_parameters, columns)),
-        feed_forward=1,
+        initial_estimate=np.concatenate((settings.truth.parameters, columns)),
+        truth=settings.truth._replace(feed_forward=1),
         feedback=settings.feedback._replace(robust_gain=nothing),
         disturbance=settings.disturbance._replace(gain=nothing),
         adaptation=settings.adaptation._replace(adaptation_gain=np.zeros(settings.m)),

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -42,6 +41,7 @@ from blf_dsc_controller.law import (
     prediction,
     surface,
     torque,
+    truth,
     weighing,
     window,
 )
@@ -87,12 +87,11 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         m=m,
         memory=0,
         has_barrier=int(law_of(config).has_barrier),
-        feed_forward=0,
         initial_estimate=np.array((*config.learning.initial_estimate, *initial)),
         information=inverse(covariance),
         joint_inertia=inertia,
         robust_gain=np.zeros(model.n),
-        **_known(config, model.p),
+        truth=_truth(config, model.p),
         barrier=_barrier(config),
         surface=_surface(config, row.lag),
         feedback=_feedback(config),
@@ -113,18 +112,19 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     return settings._replace(friction=friction_settings(settings))
 
 
-def _known(config: ControllerConfig, p: int) -> dict[str, Any]:
-    """Return the settings of the known data of an arm with p parameters: zeros without any."""
+def _truth(config: ControllerConfig, p: int) -> truth.Settings:
+    """Return the known data of an arm with p parameters: zeros without any."""
     known = known_arm(config)
     disturbance = np.zeros((4, len(config.joints)))
     if known:
         disturbance[:] = known.constant, known.amplitude, known.frequency, known.phase
     parameters = known.parameters if known else ()
-    return {
-        'truth_known': int(bool(parameters)),
-        'true_parameters': np.array(parameters or (0.0,) * p),
-        'true_disturbance': disturbance,
-    }
+    return truth.Settings(
+        known=int(bool(parameters)),
+        feed_forward=0,
+        parameters=np.array(parameters or (0.0,) * p),
+        disturbance=disturbance,
+    )
 
 
 def _barrier(config: ControllerConfig) -> barrier.Settings:

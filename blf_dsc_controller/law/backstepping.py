@@ -50,7 +50,7 @@ class Backstepping(NamedTuple):
             )
             torque = -torque
             if settings.feedback.follows_inertia == 0:
-                torque += signals.restoring[i]
+                torque += signals.feedback.restoring[i]
             signals.demand[i] = compensated(settings, state, signals, i, torque)
 
     def finish(
@@ -70,8 +70,8 @@ def compute_surface(settings: Settings, state: State, signals: Signals) -> None:
     """Compute alpha2 = dqr - lambda_s z1, its derivative, which needs ddqr, and z2."""
     for i in range(settings.n):
         state.alpha2[i] = signals.dqr[i] - settings.surface.gain[i] * signals.xi1[i]
-        signals.beta2[i] = state.alpha2[i]
         rate = signals.dq[i] - signals.dqr[i]
         signals.dalpha2[i] = signals.ddqr[i] - settings.surface.gain[i] * rate
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
-        signals.restoring[i] = -settings.barrier.weight[i] * signals.xi1[i]
+        restoring = -settings.barrier.weight[i] * signals.xi1[i]
+        signals.feedback.restoring[i] = restoring

@@ -73,10 +73,11 @@ class BlfDsc(NamedTuple):
     ) -> None:
         """Adapt theta^ and d^3; advance alpha2 of the filter (13), exactly for the held beta2."""
         learning.adapt(settings, state, signals, dt, saturated)
+        work = signals.surface
         gain = filter_gain(settings.surface.time_constant, dt)
         for i in range(settings.n):
-            state.alpha2[i] += gain * (signals.beta2[i] - state.alpha2[i])
-            state.alpha2[i] += dt * signals.beta2_rate[i]
+            state.alpha2[i] += gain * (work.beta2[i] - state.alpha2[i])
+            state.alpha2[i] += dt * work.rate[i]
 
 
 @inner
@@ -84,26 +85,26 @@ def compute_surface(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Compute beta2 of (15) and (18), alpha2' of the filter (13), xi2, and -dV/dxi1."""
-    of = settings.surface
+    of, work = settings.surface, signals.surface
     gain = filter_gain(of.time_constant, dt)
     for i in range(settings.n):
         xi1, bound = signals.xi1[i], signals.bound[i]
         dqr, narrowing = signals.dqr[i], signals.barrier.narrowing[i]
-        signals.beta2[i] = virtual_control(
+        work.beta2[i] = virtual_control(
             xi1, bound, of.gain[i], of.mu[i], dqr + narrowing * xi1
         )
-        signals.beta2_rate[i] = 0.0
+        work.rate[i] = 0.0
         if of.known_rate == 1:
             dq, ddqr = signals.dq[i], signals.ddqr[i]
             f, late = known_rate(of, xi1, bound, narrowing, dq, dqr, ddqr, i)
-            signals.beta2[i] -= late
-            signals.beta2_rate[i] = f
+            work.beta2[i] -= late
+            work.rate[i] = f
         if state.samples[0] == 0.0:
-            state.alpha2[i] = signals.beta2[i]
-        signals.dalpha2[i] = gain * (signals.beta2[i] - state.alpha2[i]) / dt
-        signals.dalpha2[i] += signals.beta2_rate[i]
+            state.alpha2[i] = work.beta2[i]
+        signals.dalpha2[i] = gain * (work.beta2[i] - state.alpha2[i]) / dt
+        signals.dalpha2[i] += work.rate[i]
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
-        signals.restoring[i] = -barrier.joint_gradient(
+        signals.feedback.restoring[i] = -barrier.joint_gradient(
             settings.barrier, signals.barrier, xi1, bound, i
         )
 
@@ -115,4 +116,4 @@ def joint_feedback(settings: Settings, signals: Signals, layer: float, i: int) -
     torque = feedback.joint_torque(of, signals.xi1[i], signals.xi2[i], layer, i)
     if of.follows_inertia == 1:  # the barrier is in `model_torque`
         return torque
-    return torque + float(signals.restoring[i])
+    return torque + float(signals.feedback.restoring[i])

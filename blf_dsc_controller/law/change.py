@@ -25,7 +25,6 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 # ratio of mean squares; larger than the gate's, since a solution extrapolates
 _ALARM = 8.0
-_MEMORY = 0.1  # s, averaging time of the last rows
 
 
 class State(NamedTuple):
@@ -73,7 +72,7 @@ def compare_row(
             e -= row[i, j] * theta[j]
         error[i] = e
         square += e * e
-    state.recent_residual[0] += min(1.0, period / _MEMORY) * (
+    state.recent_residual[0] += min(1.0, period / innovation.MEMORY) * (
         square - state.recent_residual[0]
     )
 

@@ -90,7 +90,7 @@ def is_valid_sample(
     is_valid = True
     for i in range(settings.n):
         demand = signals.demand[i]
-        largest = max(abs(demand), abs(demand - signals.added[i]))
+        largest = max(abs(demand), abs(demand - signals.saturation.added[i]))
         is_within = largest <= settings.torque.limit[i]
         is_finite = isfinite(sample.torque[i]) and isfinite(state.disturbance[i])
         is_valid = is_valid and is_within and is_finite
@@ -125,7 +125,7 @@ def check_sample(
         qr=sample.qr,
         effort=checks.repeats.used[2 * n :],
         command=sample.torque,
-        added=signals.added,
+        added=signals.saturation.added,
         begins=begins,
         dt=T,
     )

@@ -30,35 +30,24 @@ from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import apparent_inertia, feedback, friction
 from blf_dsc_controller.law.prediction import FILTERED
 from blf_dsc_controller.law.state import REFERENCE, Settings, Signals, State
-from blf_dsc_controller.numerics.elementary import sin
-
-
-@inner
-def update_feedforward(settings: Settings, signals: Signals, t: float) -> None:
-    """Compute the known disturbance `signals.feedforward` (n,) [N m] at time t [s]."""
-    if settings.truth_known == 0 and settings.feed_forward == 0:
-        return
-    d = settings.true_disturbance
-    for i in range(settings.n):
-        signals.feedforward[i] = d[0, i] + d[1, i] * sin(d[2, i] * t + d[3, i])
 
 
 @inner
 def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
     """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
     model, of = settings.model, settings.feedback
-    H, damped = signals.H, signals.damped
+    H, a_f = signals.H, signals.feedback.acceleration
     q, dq, dqr, ddqr = signals.q, signals.dq, signals.dqr, signals.ddqr
     v, a = state.alpha2, signals.dalpha2
     if of.decoupled == 1:
         v, a = dqr, ddqr
     feedback.fill_acceleration(
-        of, a, signals.xi2, signals.restoring, settings.joint_inertia, damped
+        of, signals.feedback, a, signals.xi2, settings.joint_inertia
     )
     if settings.row.prediction == FILTERED:
-        model.regressors(q, dq, v, damped, H, signals.Yp, signals.Yr)
+        model.regressors(q, dq, v, a_f, H, signals.row.Yp, signals.row.Yr)
     else:
-        model.regressor(q, dq, v, damped, H)
+        model.regressor(q, dq, v, a_f, H)
     for i in range(settings.n):
         signals.model_torque[i] = 0.0
         for j in range(settings.p):
@@ -106,18 +95,17 @@ def fill_known_torque(
 def measure_rotors(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Update J~ from the last interval; overwrites Yp and Yr of `signals`."""
+    """Update J~ from the last interval."""
     part, now, work = settings.rotors, state.rotors, signals.rotors
     if state.samples[0] <= 1.0:  # the first torque has had no effect yet
         apparent_inertia.begin(now, signals.dq, signals.applied)
         return
     apparent_inertia.pass_band(part, now, work, signals.dq, signals.applied, dt)
     if apparent_inertia.has_settled(state.samples[0], dt):
-        settings.model.momentum_regressor(
-            signals.q, work.acceleration, signals.Yp, signals.Yr
-        )
+        Yp, Yr = signals.momentum.Yp, signals.momentum.Yr
+        settings.model.momentum_regressor(signals.q, work.acceleration, Yp, Yr)
         P0 = settings.initial_estimate
-        apparent_inertia.update(part, now, work, signals.Yp, P0, dt)
+        apparent_inertia.update(part, now, work, Yp, P0, dt)
 
 
 @inner
@@ -125,7 +113,7 @@ def correct_feedback(settings: Settings, state: State, signals: Signals) -> None
     """Add the torque of J~ for what the feedback accelerates to H P^(0)."""
     for i in range(settings.n):
         signals.model_torque[i] += state.rotors.error[i] * (
-            signals.damped[i] - signals.ddqr[i]
+            signals.feedback.acceleration[i] - signals.ddqr[i]
         )
 
 
@@ -136,8 +124,8 @@ def compensated(
     """Return the demand of joint i [N m]: feedback, model, d^3, r, and what is learned."""
     torque = feedback + signals.model_torque[i]
     torque += state.disturbance[i] + signals.friction.torque[i]
-    if settings.feed_forward == 1:
-        torque += signals.feedforward[i]
+    if settings.truth.feed_forward == 1:
+        torque += signals.truth.disturbance[i]
     if settings.observer.enabled == 1:
         torque += state.observer.torque[i]
     for j in range(settings.m):

@@ -25,6 +25,7 @@ from blf_dsc_controller.law import (
     repeats,
     torque,
     torque_sensors,
+    truth,
 )
 from blf_dsc_controller.law.check_state import (
     CONTRADICTION,
@@ -40,7 +41,6 @@ from blf_dsc_controller.law.checks import (
     is_valid_state,
     watch_oscillation,
 )
-from blf_dsc_controller.law.compensation import update_feedforward
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.lyapunov import fill_energies
@@ -87,7 +87,7 @@ def fill_sample(
         if settings.observer.enabled == 1:
             sample.disturbance[i] += state.observer.torque[i]
         sample.bound[i] = signals.bound[i]
-        sample.cuts[i] = signals.cuts[i]
+        sample.cuts[i] = signals.saturation.cuts[i]
     for j in range(settings.m):
         sample.estimate[j] = state.estimate[j] if state.latch.active[j] != 0.0 else nan
     sample.lambda_min[0] = state.latch.lambda_min[0]
@@ -137,11 +137,11 @@ def step(
         signals.q[i] = used[i]
         signals.dq[i] = used[n + i]
         signals.effort[i] = used[2 * n + i]
-    added = signals.added
-    torque.find_added(settings.torque, signals.saturation, signals.q, added)
-    torque.find_applied(state.torque, state.added, added, signals.applied)
+    drives, work = state.saturation, signals.saturation
+    torque.find_added(settings.torque, work, signals.q)
+    torque.find_applied(drives, work, state.torque, signals.applied)
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    update_feedforward(settings, signals, t)
+    truth.update_disturbance(settings.truth, signals.truth, t)
     barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
     for i in range(n):
         signals.xi1[i] = signals.q[i] - signals.qr[i]
@@ -150,14 +150,13 @@ def step(
     law.compute_demand(settings, state, signals, t, dt)
     saturated = torque.saturate(
         settings.torque,
-        state.saturation,
+        drives,
+        work,
         signals.demand,
-        added,
         state.torque,
-        not begins or state.saturation.takes_over[0] > 0.0,
+        not begins or drives.takes_over[0] > 0.0,
         dt,
         signals.torque,
-        signals.cuts,
     )
     law.finish(settings, state, signals, dt, saturated)
     for i in range(n):
@@ -408,7 +407,7 @@ class Controller:
         Call it before the first update: the rate limit then holds from this torque on.
         """
         self.state.torque[:] = torque
-        self.state.added[:] = added_torque(self.settings.torque, q)
+        self.state.saturation.added[:] = added_torque(self.settings.torque, q)
         self.state.saturation.held_back[:] = 0.0
         self.state.saturation.takes_over[0] = 1.0
 

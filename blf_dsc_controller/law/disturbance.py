@@ -24,14 +24,20 @@ class Settings(NamedTuple):
     bumpless: int  # 1: it gives up what a changed estimate adds to the torque
 
 
+class Work(NamedTuple):
+    """Values of one sample."""
+
+    step: Annotated[Array, 'n']  # by which d^3 falls, N m
+
+
 @inner
 def fill_step(
-    settings: Settings, estimate: Array, xi2: Array, dt: float, step: Array
+    settings: Settings, work: Work, estimate: Array, xi2: Array, dt: float
 ) -> None:
-    """Write dt gamma (xi2 + eta d^3) (n,) [N m] to `step`; `estimate` (n,) is d^3."""
+    """Compute the step dt gamma (xi2 + eta d^3); `estimate` (n,) [N m] is d^3."""
     for i in range(xi2.size):
         error = xi2[i] + settings.leakage * estimate[i]
-        step[i] = dt * settings.gain[i] * error
+        work.step[i] = dt * settings.gain[i] * error
 
 
 @inner

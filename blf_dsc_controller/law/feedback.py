@@ -26,6 +26,13 @@ class Settings(NamedTuple):
     decoupled: int  # 1: no feedback acts through M(q, P^(0))
 
 
+class Work(NamedTuple):
+    """Values of one sample."""
+
+    restoring: Annotated[Array, 'n']  # tau_c, by the error: -dV/dxi1 or -w z1, N m
+    acceleration: Annotated[Array, 'n']  # a_f, rad/s^2
+
+
 @inner
 def joint_torque(
     settings: Settings, xi1: float, xi2: float, layer: float, i: int
@@ -39,19 +46,14 @@ def joint_torque(
 
 @inner
 def fill_acceleration(
-    settings: Settings,
-    wanted: Array,
-    xi2: Array,
-    restoring: Array,
-    inertia: Array,
-    out: Array,
+    settings: Settings, work: Work, wanted: Array, xi2: Array, inertia: Array
 ) -> None:
-    """Write a_f (n,) [rad/s^2] to `out`.
+    """Compute a_f by tau_c, the acceleration that is `wanted` (n,) [rad/s^2], and m.
 
-    The surface has the acceleration `wanted` (n,) [rad/s^2], `restoring` (n,) [N m] is
-    tau_c, and `inertia` (n,) [kg m^2] m.
+    m is the `inertia` (n,) [kg m^2].
     """
+    out = work.acceleration
     for i in range(xi2.size):
         out[i] = wanted[i] - settings.damping_rate * xi2[i]
         if settings.follows_inertia == 1:
-            out[i] += restoring[i] / inertia[i]
+            out[i] += work.restoring[i] / inertia[i]

@@ -36,7 +36,7 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
 CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
-_MEMORY = 0.1  # s of motion
+MEMORY = 0.1  # s of motion, over which the last rows are averaged
 # times s^2: friction is no noise, and reaches what the noise of a sensor never would
 _ALARM = 8.0
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many
@@ -125,7 +125,7 @@ def update(
     The mean square is of some `most` moving rows, a window.
     """
     excess = square - share * state.recent[0]
-    state.recent[0] += min(1.0, period / _MEMORY) * excess
+    state.recent[0] += min(1.0, period / MEMORY) * excess
     has_changed = state.recent[0] > _ALARM * state.noise[0]
     state.rows[0] = min(state.rows[0] + share, most)
     if state.rows[0] > 0.0:

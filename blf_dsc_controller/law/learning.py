@@ -61,7 +61,7 @@ def observe(
         return
     samples = int(state.samples[0])
     if samples % settings.window.row_interval == 0:
-        window.push_row(state.window, signals.row)
+        window.push_row(state.window, signals.row.Xu)
         measure_reversals(settings, state, settings.window.row_interval * dt)
     if settings.excitation.change_detection == 1:
         detect_change(settings, state, signals, dt)
@@ -87,46 +87,43 @@ def fill_columns(settings: Settings, signals: Signals, t: float, dt: float) -> N
     q, dq = signals.q, signals.dq
     qr, dqr, ddqr = signals.qr, signals.dqr, signals.ddqr
     ripple.fill_compensated_ripple(of, lag, qr, dqr, ddqr, dt, signals.H)
-    columns.fill_columns(of, t, dq, signals.Yr)
-    ripple.fill_measured_ripple(of, lag, q, dq, signals.Yr)
+    columns.fill_columns(of, t, dq, signals.row.Yr)
+    ripple.fill_measured_ripple(of, lag, q, dq, signals.row.Yr)
 
 
 @inner
 def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Write the configured row of the last interval to `signals.row` (n, m + 1)."""
-    of, now, row = settings.row, state.row, signals.row
-    Yp, Yr = signals.Yp, signals.Yr
+    """Form the configured row of the last interval."""
+    of, now, work = settings.row, state.row, signals.row
     if of.prediction != FILTERED:
         form_lambda_row(settings, state, signals, dt)
         return
     if state.samples[0] > 0.0:
         begins = state.samples[0] <= 1.0
         prediction.delay_torque(of, now, signals.applied, begins, dt)
-        prediction.fill_interval(now, Yp, Yr, dt, row)
+        prediction.fill_interval(now, work, dt)
         if settings.observer.enabled == 1:
             observe_load(settings, state, signals, dt)
         if settings.contact.enabled == 1:
             filter_external_torque(settings, state, signals, dt)
-        prediction.pass_poles(of, now, signals.dqr, dt, row)
-    prediction.keep_regressors(now, Yp, Yr)
+        prediction.pass_poles(of, now, work, signals.dqr, dt)
+    prediction.keep_regressors(now, work)
 
 
 @inner
 def form_lambda_row(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Write the row `lambda` of (24) to `signals.row`; overwrites Yp of `signals`."""
-    q, dq, ddq = signals.q, signals.dq, signals.acceleration
+    """Form the row `lambda` of (24)."""
+    work, q, dq = signals.row, signals.q, signals.dq
     alpha2, dalpha2 = state.alpha2, signals.dalpha2
     begins = state.samples[0] == 0.0
     prediction.differentiate(
-        settings.row, state.row, signals.xi2, dalpha2, begins, dt, ddq
+        settings.row, state.row, work, signals.xi2, dalpha2, begins, dt
     )
-    scale = prediction.lambda_of(ddq, dq, dalpha2, alpha2)
-    settings.model.regressor(q, dq, alpha2, dalpha2, signals.Yp)
-    prediction.fill_lambda_row(
-        scale, signals.Yp, signals.Yr, signals.applied, signals.row
-    )
+    scale = prediction.lambda_of(work.acceleration, dq, dalpha2, alpha2)
+    settings.model.regressor(q, dq, alpha2, dalpha2, work.Yp)
+    prediction.fill_lambda_row(work, scale, signals.applied)
 
 
 @inner
@@ -139,14 +136,14 @@ def filter_external_torque(
             settings.friction, state.friction, state.estimate, i
         )
         external_torque.filter_interval(
-            settings.contact, state.contact, i, signals.row[i], extra, dt
+            settings.contact, state.contact, i, signals.row.Xu[i], extra, dt
         )
 
 
 @inner
 def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Let `load_observer` find r by the row of the last interval, before its poles."""
-    of, now = settings.observer, state.observer
+    of, now, row = settings.observer, state.observer, signals.row.Xu
     is_learned = state.latch.latched[0] == 1.0 and settings.adaptation.weight > 0.0
     if state.samples[0] <= 1.0:
         load_observer.begin(now, state.disturbance)
@@ -154,7 +151,7 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
         return
     had_settled = load_observer.has_settled(of, now)
     for i in range(settings.n):
-        load_observer.filter_interval(of, now, i, signals.row[i], signals.effort[i], dt)
+        load_observer.filter_interval(of, now, i, row[i], signals.effort[i], dt)
     load_observer.update(
         of,
         now,
@@ -166,7 +163,7 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
         dt,
     )
     torque_sensors.follow_applied(
-        state.sensors, signals.row, settings.m, of.observer_bandwidth, dt
+        state.sensors, row, settings.m, of.observer_bandwidth, dt
     )
     if load_observer.has_settled(of, now):
         check_sensors(settings, state, signals, not had_settled, dt)
@@ -234,7 +231,7 @@ def detect_change(
     What a window has taught before it was full is taken back: back to the estimate
     before.
     """
-    of, latch, row = settings.excitation, state.latch, signals.row
+    of, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.window)
     prior = Prior(settings.initial_estimate, settings.information)
     if change.is_predicted(sliding):
@@ -351,29 +348,28 @@ def hand_over_friction(settings: Settings, state: State, signals: Signals) -> No
 def follow_disturbance(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF.
-
-    Overwrites Yp and Yr of `signals`.
-    """
-    step = signals.unit
+    """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF."""
+    work = signals.disturbance
     disturbance.fill_step(
-        settings.disturbance, state.disturbance, signals.xi2, dt, step
+        settings.disturbance, work, state.disturbance, signals.xi2, dt
     )
     if settings.feedback.follows_inertia == 1:
-        scale_by_inertia(settings, state, signals)
+        scale_by_inertia(settings, state, signals, work.step)
     for i in range(settings.n):
-        state.disturbance[i] -= step[i]
-        friction.follow_observer(state.friction, signals.friction, i, -step[i])
+        state.disturbance[i] -= work.step[i]
+        friction.follow_observer(state.friction, signals.friction, i, -work.step[i])
 
 
 @inner
-def scale_by_inertia(settings: Settings, state: State, signals: Signals) -> None:
-    """Replace x in `signals.unit` by (M(q, P^(0)) + J~) x / m; overwrites Yp and Yr."""
-    x = signals.unit
+def scale_by_inertia(
+    settings: Settings, state: State, signals: Signals, x: Array
+) -> None:
+    """Replace x (n,) by (M(q, P^(0)) + J~) x / m."""
+    Yp, Yr = signals.momentum.Yp, signals.momentum.Yr
     for i in range(settings.n):
         x[i] /= settings.joint_inertia[i]
-    settings.model.momentum_regressor(signals.q, x, signals.Yp, signals.Yr)
+    settings.model.momentum_regressor(signals.q, x, Yp, Yr)
     for i in range(settings.n):
         x[i] *= state.rotors.error[i]
         for j in range(settings.p):
-            x[i] += signals.Yp[i, j] * settings.initial_estimate[j]
+            x[i] += Yp[i, j] * settings.initial_estimate[j]

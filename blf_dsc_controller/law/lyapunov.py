@@ -37,19 +37,18 @@ def fill_energies(
 
     After the error's: xi2^T M xi2 / 2, where M xi2 = Yp(q, xi2) P; P~^T Gamma^-1 P~ / 2
     of the parameters that are adapted (Gamma_j > 0); (tau_dist - d^3)^2 / (2 gamma) of
-    the joints whose d^3 is adapted (gamma > 0), all in J.  Overwrites Yp and Yr in
-    `signals`.
+    the joints whose d^3 is adapted (gamma > 0), all in J.
     """
     n = settings.n
     p = settings.p
     V = sample.lyapunov
     V[0] = error_term(settings, state, signals)
     for k in range(1, 4):
-        V[k] = 0.0 if settings.truth_known == 1 else nan
-    if settings.truth_known == 0:
+        V[k] = 0.0 if settings.truth.known == 1 else nan
+    if settings.truth.known == 0:
         return
-    P, Yp = settings.true_parameters, signals.Yp
-    settings.model.momentum_regressor(signals.q, signals.xi2, Yp, signals.Yr)
+    P, Yp, Yr = settings.truth.parameters, signals.momentum.Yp, signals.momentum.Yr
+    settings.model.momentum_regressor(signals.q, signals.xi2, Yp, Yr)
     for i in range(n):
         for j in range(p):
             V[1] += 0.5 * signals.xi2[i] * Yp[i, j] * P[j]
@@ -59,7 +58,7 @@ def fill_energies(
             V[2] += 0.5 * error * error / settings.adaptation.adaptation_gain[j]
     for i in range(n):
         if settings.disturbance.gain[i] > 0.0:
-            error = signals.feedforward[i] - state.disturbance[i]
+            error = signals.truth.disturbance[i] - state.disturbance[i]
             V[3] += (
                 0.5
                 * error
@@ -76,7 +75,7 @@ def largest_inertia(settings: Settings) -> float:
     postures = np.linspace(-np.pi, np.pi, _POSTURES)[:, np.newaxis] * np.ones(
         settings.n
     )
-    M = inertia_matrices(settings.model, settings.true_parameters, postures)
+    M = inertia_matrices(settings.model, settings.truth.parameters, postures)
     return float(np.linalg.eigvalsh(M).max())
 
 
@@ -88,7 +87,7 @@ def decay_rate(settings: Settings) -> float:
     A Newton step replaces sigma, the smallest eigenvalue of Phi_e, by sigma / (sigma +
     rho).
     """
-    if settings.has_barrier == 0 or settings.truth_known == 0:
+    if settings.has_barrier == 0 or settings.truth.known == 0:
         return 0.0
     if settings.compensation == REFERENCE or settings.disturbance.bumpless == 1:
         return 0.0
@@ -121,7 +120,7 @@ def exponential_bound(settings: Settings, t: Array, V: Array, holds: Array) -> A
     rate = decay_rate(settings)
     if rate == 0.0:
         return np.full(t.size, nan)
-    constant, amplitude = np.abs(settings.true_disturbance[:2])
+    constant, amplitude = np.abs(settings.truth.disturbance[:2])
     floor = (
         0.5
         * settings.disturbance.leakage

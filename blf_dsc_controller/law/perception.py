@@ -26,8 +26,6 @@ from blf_dsc_controller.law.state import (
 )
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
-_SETTLED = 6.0  # time constants of the row filters, until learning goes on
-
 CONTACT, DISTANCE = 0, 1  # in `sample.contact`
 
 
@@ -125,7 +123,7 @@ def sense(
     distance = update_external_torque(settings, state, signals, dt)
     is_touched = external_torque.is_touched(state.contact)
     if is_touched and settings.contact.freezes == 1:
-        state.frozen[0] = _SETTLED / settings.row.filter_pole
+        state.frozen[0] = prediction.SETTLED / settings.row.filter_pole
     fill_sample(settings, state, signals, distance, sample_of(sample_vector, settings))
     return is_touched and not was_touched
 
@@ -145,10 +143,10 @@ def sense_nothing(
 
 @inner
 def fill_breakaway(settings: Settings, state: State, signals: Signals) -> None:
-    """Write the shapes of breakaway (n,), filtered and weighted as the row, to `signals.unit`."""
+    """Compute the shapes of breakaway, filtered and weighted as the row."""
     for i in range(settings.n):
         weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        signals.unit[i] = weight * state.friction.shape_lags[1, 2, i]
+        signals.weighing.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
 
 
 @kernel
@@ -171,8 +169,8 @@ def weigh(
         state.weighing,
         signals.weighing,
         Prior(settings.initial_estimate, settings.information),
-        signals.row,
-        signals.unit,
+        signals.row.Xu,
+        signals.weighing.shapes,
         state.friction.shape_lags[0, 2],
         signals.dqr,
         int(state.samples[0]),

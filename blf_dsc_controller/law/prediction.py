@@ -30,6 +30,9 @@ from blf_dsc_controller.numerics.elementary import exp
 FILTERED, LAMBDA = range(2)
 """Choices of `gains.prediction` of the law `paper`, in the order of the configuration."""
 
+SETTLED = 6.0
+"""Time constants of the poles after which a row shows nothing of what was before."""
+
 
 class Settings(NamedTuple):
     """The parameters `learning.*` of a row, and what follows from others."""
@@ -55,6 +58,15 @@ class State(NamedTuple):
     observed_rate: Annotated[Array, 'n']  # its derivative, rad/s^2
 
 
+class Work(NamedTuple):
+    """Values of one sample."""
+
+    Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq; of `lambda` H(q, dq, alpha2, alpha2')
+    Yr: Annotated[Array, 'n', 'm']  # [Yr | D], Yr P = G - C^T dq
+    acceleration: Annotated[Array, 'n']  # ddq^ of `lambda`, rad/s^2
+    Xu: Annotated[Array, 'n', 'm + 1']  # [X | u], the row
+
+
 @inner
 def delay_torque(
     settings: Settings, state: State, applied: Array, begins: bool, dt: float
@@ -78,8 +90,9 @@ def delay_torque(
 
 
 @inner
-def fill_interval(state: State, Yp: Array, Yr: Array, dt: float, row: Array) -> None:
-    """Write [X | u] of the last interval, between the last regressors and these, to `row`."""
+def fill_interval(state: State, work: Work, dt: float) -> None:
+    """Compute [X | u] of the last interval, between the last regressors and these."""
+    Yp, Yr, row = work.Yp, work.Yr, work.Xu
     n, m = Yr.shape
     for i in range(n):
         for j in range(m):
@@ -120,9 +133,10 @@ def moving_share(dqr: Array, motion_scale: float) -> float:
 
 @inner
 def pass_poles(
-    settings: Settings, state: State, dqr: Array, dt: float, row: Array
+    settings: Settings, state: State, work: Work, dqr: Array, dt: float
 ) -> None:
-    """Pass [X | u] of the last interval in `row` through both poles, and weight it."""
+    """Pass [X | u] of the last interval through both poles, and weight it."""
+    row = work.Xu
     gain = filter_gain(1.0 / settings.filter_pole, dt)
     for i in range(dqr.size):
         weight = motion_weight(settings, dqr[i], i)
@@ -140,8 +154,9 @@ def forget(state: State) -> None:
 
 
 @inner
-def keep_regressors(state: State, Yp: Array, Yr: Array) -> None:
-    """Keep Yp (n, p) and [Yr | D] (n, m) for the next interval."""
+def keep_regressors(state: State, work: Work) -> None:
+    """Keep Yp and [Yr | D] for the next interval."""
+    Yp, Yr = work.Yp, work.Yr
     for i in range(Yr.shape[0]):
         for j in range(Yr.shape[1]):
             state.Yr[i, j] = Yr[i, j]
@@ -153,15 +168,15 @@ def keep_regressors(state: State, Yp: Array, Yr: Array) -> None:
 def differentiate(
     settings: Settings,
     state: State,
+    work: Work,
     xi2: Array,
     dalpha2: Array,
     begins: bool,
     dt: float,
-    acceleration: Array,
 ) -> None:
     """Step the filter (8) with damping 1, exactly for held xi2 (n,).
 
-    Writes ddq^, the sum of alpha2' and the derivative of xi2, to `acceleration` (n,).
+    ddq^ is the sum of alpha2' and the derivative of xi2.
     """
     decay = exp(-settings.omega * dt)
     for i in range(xi2.size):
@@ -175,7 +190,7 @@ def differentiate(
             state.observed_rate[i] = (
                 state.observed_rate[i] - settings.omega * slope * dt
             ) * decay
-        acceleration[i] = dalpha2[i] + state.observed_rate[i]
+        work.acceleration[i] = dalpha2[i] + state.observed_rate[i]
 
 
 @inner
@@ -190,13 +205,9 @@ def lambda_of(ddq: Array, dq: Array, dalpha2: Array, alpha2: Array) -> float:
 
 
 @inner
-def fill_lambda_row(
-    scale: float, H: Array, Yr: Array, applied: Array, row: Array
-) -> None:
-    """Write the row `lambda`, with its `scale` Lambda, to `row`.
-
-    H (n, p) is H(q, dq, alpha2, alpha2'), Yr (n, m) has the columns D.
-    """
+def fill_lambda_row(work: Work, scale: float, applied: Array) -> None:
+    """Compute the row `lambda`, with its `scale` Lambda, of the torque `applied` (n,) [N m]."""
+    H, Yr, row = work.Yp, work.Yr, work.Xu
     n, m = Yr.shape
     for i in range(n):
         for j in range(m):

@@ -41,7 +41,7 @@ _LATE = 0.9  # of the larger mean square: a first-order lag has less than 1
 _SECOND = 2.0  # readings before that of a second difference
 _ROW = 0.01  # s: up to here, the ends of an interval show the velocity within it
 _GAP = 2.5  # samples: readings are missing in an interval that is also longer than this
-_SLOW = 0.03  # rad/s: slower motion shows nothing
+SLOW = 0.03  # rad/s: slower motion shows nothing
 
 
 class State(NamedTuple):
@@ -160,4 +160,4 @@ def unseen(state: State, i: int, share: float) -> float:
     n = state.resolution.size
     position = _SIGMAS * _SIGMAS * state.noise[i] + state.resolution[i] ** 2
     velocity = _SIGMAS * _SIGMAS * state.noise[n + i] * 0.5 * share
-    return float(_SLOW * _SLOW + position / (FILTER * FILTER) + velocity)
+    return float(SLOW * SLOW + position / (FILTER * FILTER) + velocity)

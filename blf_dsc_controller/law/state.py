@@ -32,6 +32,7 @@ from blf_dsc_controller.law import (
     surface,
     torque,
     torque_sensors,
+    truth,
     weighing,
     window,
 )
@@ -53,17 +54,13 @@ class Settings(NamedTuple):
     memory: int  # numbers in the memory of a law of a file
     has_barrier: int  # 1: the law keeps the error inside its bound
     compensation: int  # of what is learned: REFERENCE or STATE
-    truth_known: int  # 1: the true parameters are known, for (29)
-    feed_forward: int  # 1: the true disturbance is fed forward
     initial_estimate: Annotated[Array, 'm']  # P^(0), then that of the columns
     # R, inverse covariance of the prior of theta
     information: Annotated[Array, 'm', 'm']
     # m, least inertia of a joint with the others free, kg m^2
     joint_inertia: Annotated[Array, 'n']
     robust_gain: Annotated[Array, 'n']  # mu_bar of (35), N m
-    true_parameters: Annotated[Array, 'p']
-    # constant, then amplitude, frequency, phase
-    true_disturbance: Annotated[Array, 4, 'n']
+    truth: truth.Settings
     barrier: barrier.Settings
     surface: surface.Settings
     feedback: feedback.Settings
@@ -88,7 +85,6 @@ class State(NamedTuple):
     frozen: Cell  # s, for which nothing is learned
     alpha2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # last commanded torque, N m
-    added: Annotated[Array, 'n']  # what the drive added to it then, N m
     disturbance: Annotated[Array, 'n']  # d^3, N m
     estimate: Annotated[Array, 'm']  # theta^ = [P^; columns]
     saturation: torque.State
@@ -105,8 +101,18 @@ class State(NamedTuple):
     window: window.State
 
 
+class Momentum(NamedTuple):
+    """What `momentum_regressor` of the model writes for a vector x: Yp P = M(q) x."""
+
+    Yp: Annotated[Array, 'n', 'p']
+    Yr: Annotated[Array, 'n', 'm']
+
+
 class Signals(NamedTuple):
-    """Values that a law reads and computes in one sample."""
+    """Values that a law reads and computes in one sample.
+
+    First those that parts pass on to one another, then what each keeps for itself.
+    """
 
     q: Annotated[Array, 'n']  # rad
     dq: Annotated[Array, 'n']  # rad/s
@@ -115,32 +121,22 @@ class Signals(NamedTuple):
     ddqr: Annotated[Array, 'n']  # rad/s^2
     xi1: Annotated[Array, 'n']  # rad
     bound: Annotated[Array, 'n']  # k(t), rad
-    beta2: Annotated[Array, 'n']  # rad/s
     dalpha2: Annotated[Array, 'n']  # rad/s^2
-    # of beta2, as far as it is known before the filter (13); else zero, rad/s^2
-    beta2_rate: Annotated[Array, 'n']
     xi2: Annotated[Array, 'n']  # rad/s
-    restoring: Annotated[Array, 'n']  # torque by the error: -dV/dxi1 or -w z1, N m
-    damped: Annotated[
-        Array, 'n'
-    ]  # a_f of `feedback`, acceleration of the model, rad/s^2
-    model_torque: Annotated[Array, 'n']  # H(q, dq, v, damped) P^(0), N m
-    feedforward: Annotated[Array, 'n']  # known disturbance, fed forward, N m
-    acceleration: Annotated[Array, 'n']  # estimated ddq of the row `lambda`, rad/s^2
-    added: Annotated[Array, 'n']  # torque that the drive adds to the command, N m
+    model_torque: Annotated[Array, 'n']  # H(q, dq, v, a_f) P^(0), N m
     applied: Annotated[Array, 'n']  # mean whole torque of the last interval, N m
     effort: Annotated[Array, 'n']  # measured torque of the last interval, N m
     demand: Annotated[Array, 'n']  # whole torque (28) before saturation, N m
     torque: Annotated[Array, 'n']  # commanded torque, N m
-    # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
-    cuts: Annotated[Array, 'n']
     H: Annotated[Array, 'n', 'm']  # of what is learned: [H | compensated columns]
-    Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq
-    Yr: Annotated[Array, 'n', 'm']  # [Yr | columns], Yr P = G - C^T dq
-    row: Annotated[Array, 'n', 'm + 1']  # filtered [X | u]
-    unit: Annotated[Array, 'n']  # scratch
+    momentum: Momentum  # scratch
+    truth: truth.Work
     barrier: barrier.Work
+    surface: surface.Work
+    feedback: feedback.Work
+    disturbance: disturbance.Work
     saturation: torque.Work
+    row: prediction.Work
     observer: load_observer.Work
     sensors: torque_sensors.Work
     window: window.Work

@@ -28,6 +28,14 @@ class Settings(NamedTuple):
     lag: float  # of measured velocities and applied torques together, s
 
 
+class Work(NamedTuple):
+    """Values of one sample."""
+
+    beta2: Annotated[Array, 'n']  # virtual control, rad/s
+    # its rate as far as it is known before the filter (13); else zero, rad/s^2
+    rate: Annotated[Array, 'n']
+
+
 @inner
 def sinc(x: float) -> float:
     """Return sin(x) / x, by its series where the quotient would lose precision."""

@@ -65,6 +65,7 @@ class Settings(NamedTuple):
 class State(NamedTuple):
     """What saturation keeps from one sample to the next."""
 
+    added: Annotated[Array, 'n']  # G_d at the last one, N m
     # demand beyond the torque, that the rate limit has held back, N m
     held_back: Annotated[Array, 'n']
     takes_over: Cell  # 1: the last torque acts already when the first sample comes
@@ -75,18 +76,21 @@ class State(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Scratch of one sample."""
+    """Values of one sample."""
 
+    added: Annotated[Array, 'n']  # G_d, torque that the drive adds to the command, N m
+    # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
+    cuts: Annotated[Array, 'n']
     columns: Annotated[Array, 'n', 'torque.drive']  # of the gravity that the drive adds
     zeros: Annotated[Array, 'n']
 
 
 @inner
-def find_added(settings: Settings, work: Work, q: Array, added: Array) -> None:
-    """Write G_d(q) at the position q (n,) [rad] to `added` (n,) [N m]."""
+def find_added(settings: Settings, work: Work, q: Array) -> None:
+    """Compute what the drives add at the position q (n,) [rad]."""
     if settings.drive == 0:
         return
-    zeros = work.zeros
+    added, zeros = work.added, work.zeros
     fill_regressor(settings.drive_chain, q, zeros, zeros, zeros, work.columns)
     for i in range(q.size):
         added[i] = 0.0
@@ -95,15 +99,14 @@ def find_added(settings: Settings, work: Work, q: Array, added: Array) -> None:
 
 
 @inner
-def find_applied(command: Array, before: Array, added: Array, applied: Array) -> None:
+def find_applied(state: State, work: Work, command: Array, applied: Array) -> None:
     """Write the mean whole torque of the last interval to `applied` (n,) [N m].
 
-    It is the last `command` (n,) and the mean of G_d at both ends, `before` and `added`
-    (n,); the former takes the value of the latter.
+    It is the last `command` (n,) and the mean of G_d at both ends.
     """
     for i in range(applied.size):
-        applied[i] = command[i] + 0.5 * (before[i] + added[i])
-        before[i] = added[i]
+        applied[i] = command[i] + 0.5 * (state.added[i] + work.added[i])
+        state.added[i] = work.added[i]
 
 
 def added_torque(settings: Settings, q: Array) -> Array:
@@ -126,19 +129,18 @@ def slow_down(demand: float, last: float, held: float, step: float) -> float:
 def saturate(
     settings: Settings,
     state: State,
+    work: Work,
     demand: Array,
-    added: Array,
     last: Array,
     has_last: bool,
     dt: float,
     torque: Array,
-    cuts: Array,
 ) -> bool:
     """Limit the `demand` (n,), giving the command `torque` (n,) [N m]; return whether it is cut.
 
-    `added` (n,) [N m] is what the drives add to it, `last` (n,) [N m] the last command,
-    `dt` [s] ago, if it `has_last`.  How each joint's torque is cut is in `cuts` (n,).
+    `last` (n,) [N m] is the last command, `dt` [s] ago, if it `has_last`.
     """
+    added, cuts = work.added, work.cuts
     saturated = False
     for i in range(demand.size):
         top = settings.limit[i]

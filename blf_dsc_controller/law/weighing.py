@@ -44,13 +44,12 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import innovation, sums
 from blf_dsc_controller.law.innovation import Prior
-from blf_dsc_controller.law.prediction import moving_share, moving_square
+from blf_dsc_controller.law.prediction import SETTLED, moving_share, moving_square
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _FEWEST = 0.5  # s of motion that a part has
 # s, for which the latest rows are kept apart, and then those of them again
 _APART = 0.15
-_SETTLED = 6.0  # time constants of the filters
 _CHANGING = 20.0  # s, until the variance of e has grown
 # rad/s or m/s, below which friction is least like its columns, and rows count less
 _SLOW = 0.1
@@ -103,6 +102,7 @@ class State(NamedTuple):
 class Work(NamedTuple):
     """Scratch of one row."""
 
+    shapes: Annotated[Array, 'n']  # of breakaway, filtered and weighted as the row
     before: Annotated[Array, 'weighing.size', 'weighing.size']  # sums of all such rows
     since: Annotated[Array, 'weighing.size', 'weighing.size']
     row: Annotated[Array, 'n', 'weighing.size']  # [X | u], weighted
@@ -264,7 +264,7 @@ def begin(
     discard(state, BEFORE)
     state.complete[0] = 0.0
     state.age[0] = 0.0
-    state.wait[0] = _SETTLED / (settings.pole * period)
+    state.wait[0] = SETTLED / (settings.pole * period)
     solve(settings, state, work, prior, period)
 
 
@@ -325,7 +325,7 @@ def end_part(
     else:
         discard(state, BEFORE)
     innovation.forget_recent(state.innovation)
-    state.wait[0] = _SETTLED / (settings.pole * period)
+    state.wait[0] = SETTLED / (settings.pole * period)
     solve(settings, state, work, prior, period)
 
 

@@ -24,7 +24,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.errors import BlfDscError, check_type
 from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.controller import Controller
@@ -64,9 +64,13 @@ def simulate(
     The plant's duration must not be 0.  If not `supervised`, the law runs alone, past
     its limits too.  A run whose law has been stopped for `after_stop` [s] may end early.
 
-    Raises StartError if the law cannot take over and approach.enabled is false, and
-    MotionError if there is no approach within the limits.
+    Raises StartError if the law cannot take over and approach.enabled is false,
+    MotionError if there is no approach within the limits, and ArgumentTypeError if the
+    configurations are others.
     """
+    remedy = 'simulate(loop.controller, loop.plant) runs what load_loop returns'
+    check_type('controller_config', controller_config, ControllerConfig, remedy)
+    check_type('plant_config', plant_config, PlantConfig, remedy)
     plant = plant_of(plant_config)
     if supervised:
         guard = Guard(controller_config, lambda: 0, lambda: 0)

@@ -201,6 +201,7 @@ class Calming:
         settings = settings_of(controller.settings_vector, controller.settings.model)
         if settings.has_barrier == 1:  # so that beta2 - alpha2 does not jump
             signals = controller.signals
-            controller.state.alpha2[:] += (1.0 - factor) * (signals.dqr - signals.beta2)
+            gap = signals.dqr - signals.surface.beta2
+            controller.state.alpha2[:] += (1.0 - factor) * gap
         controller.retune(controller.law, softened(settings, factor))
         self.share *= factor

@@ -87,7 +87,8 @@ class DriveLoads:
         settings = controller.settings
         settings.torque.drive_inertias[:] = self._added()
         # the last command met the drives with this load already
-        controller.state.added[:] = added_torque(settings.torque, controller.signals.q)
+        added = added_torque(settings.torque, controller.signals.q)
+        controller.state.saturation.added[:] = added
 
     def forget(self, controller: Controller) -> None:
         """Begin again with a law that has forgotten what the tip holds.

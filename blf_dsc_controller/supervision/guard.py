@@ -34,7 +34,7 @@ from blf_dsc_controller.law.check_state import (
     OSCILLATES,
 )
 from blf_dsc_controller.law.checks import is_valid_state
-from blf_dsc_controller.law.sensor import is_late
+from blf_dsc_controller.law.sensor import SLOW, is_late
 from blf_dsc_controller.messages.errors import (
     DuplicatedJointError,
     MessageError,
@@ -82,7 +82,6 @@ from blf_dsc_controller.supervision.told_loads import ToldLoads
 Vector = NDArray[np.float64]
 _MANY = 0.5  # states missed for each that came
 _CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
-_SLOWEST = 0.03  # rad/s: a velocity that contradicts positions has more
 
 _REASONS: dict[type[MessageError], Reason] = {
     MissingJointError: Reason.JOINT_MISSING,
@@ -439,7 +438,7 @@ class Guard:
         checks = self.controller.checks
         sensor = checks.sensor
         fault = self.states.contradicted(sensor.derived, sensor.measured)
-        worst = int(np.argmax(sensor.mismatch / (sensor.speed + _SLOWEST**2)))
+        worst = int(np.argmax(sensor.mismatch / (sensor.speed + SLOW**2)))
         cause = self.calming.cause if self.supervisor.running else ''
         if cause and is_late(sensor, worst):
             fault = Fault(Reason.OSCILLATION, cause)

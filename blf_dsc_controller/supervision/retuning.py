@@ -52,12 +52,12 @@ def apply_bumpless(
     signals = controller.signals
     T = config.sample_time
     controller.trial(t, T, measurement)
-    beta2 = signals.beta2.copy()
+    beta2 = signals.surface.beta2.copy()
     demand = signals.demand.copy()
     apply(controller, config)
     if controller.settings.has_barrier == 1:
         controller.trial(t, T, measurement)
-        state.alpha2[:] += signals.beta2 - beta2
+        state.alpha2[:] += signals.surface.beta2 - beta2
     controller.trial(t, T, measurement)
     integrates = controller.settings.disturbance.gain > 0.0
     state.disturbance[integrates] -= (signals.demand - demand)[integrates]

@@ -197,7 +197,7 @@ class SampleCheck:
         lack = checks.effect.lack - checks.effect.usual
         now = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
         if settings.torque.drive > 0 and settings.torque.effort_is_whole == 1:
-            now += self._controller.signals.added
+            now += self._controller.signals.saturation.added
         now -= checks.effect.usual
         share = np.abs(lack) / settings.torque.limit
         share_now = np.abs(now) / settings.torque.limit
@@ -259,9 +259,8 @@ class SampleCheck:
         """Count a sample with a torque at its limit."""
         signals = self._controller.signals
         limit = self._controller.settings.torque.limit
-        needed = np.maximum(
-            np.abs(signals.demand), np.abs(signals.demand - signals.added)
-        )
+        demand, added = signals.demand, signals.saturation.added
+        needed = np.maximum(np.abs(demand), np.abs(demand - added))
         worst = int(np.argmax(needed - limit))
         self._cause.take_limited(worst)
         self.saturated += 1

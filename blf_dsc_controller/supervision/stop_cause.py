@@ -87,7 +87,7 @@ class StopCause:
             f'joint {self._joints[i]!r} has demanded more than its torque limit of '
             f'{settings.torque.limit[i]:g} N m for {time:.2g} s'
         )
-        if self._controller.signals.cuts[i] >= RATE_CUT:
+        if self._controller.signals.saturation.cuts[i] >= RATE_CUT:
             return (
                 f'{demands}, and torque.rate_limit delays what it gets: raise it to what the drive '
                 'bears, or lower the gains'
