@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -23,9 +24,10 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, simulated
-from blf_dsc_controller.commissioning.choice import Loops, choose
+from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
+from blf_dsc_controller.commissioning.chosen import kept_stop
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
-from blf_dsc_controller.commissioning.motion import excitation, lines_in
+from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import (
     Response,
@@ -81,6 +83,12 @@ def planned():
 
 
 @cache
+def sliding():
+    """Return the motion around POSTURE that keeps joints sliding."""
+    return plan(CONFIG, POSTURE[None], sliding=True)[0]
+
+
+@cache
 def found():
     """Return what the simulated arm shows, without friction but viscous."""
     return commissioned(CONFIG, [simulated.measured(planned(), ARM)])
@@ -114,22 +122,84 @@ def test_motion_begins_at_rest_and_keeps_its_limits():
     np.testing.assert_allclose(np.abs(dq).max(axis=0), made.speed, rtol=0.05)
 
 
+def test_swings_are_at_rest_at_both_ends_of_a_run():
+    """An arm that is softly held would go on with the momentum that it has at the end."""
+    motion = sliding()
+    made = motion.excitation
+    # nothing had to shrink: the joints swing as fast as they should, with 10 mm to spare
+    np.testing.assert_allclose(swing_speeds(made), 0.1, rtol=1e-9)
+    rates = 2.0 * np.pi / made.period * made.slow
+    phase = made.phase[:, -SLOW_TONES:]
+    amplitude = made.amplitude[:, -SLOW_TONES:]
+
+    def speed(t):
+        return (-amplitude * rates * np.sin(rates * t + phase)).sum(axis=1)
+
+    np.testing.assert_allclose(speed(0.0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(speed(motion.duration), 0.0, atol=1e-12)
+    times = np.linspace(0.0, motion.duration, 10_000)
+    assert np.abs([speed(t) for t in times]).max() > 0.099
+    # and so are all tones at the start, from which the arm is not jerked
+    q, dq, ddq = sampled(reference_of(motion.config), np.zeros(1))[0]
+    np.testing.assert_allclose(q, POSTURE, atol=1e-9)
+    np.testing.assert_allclose(dq, 0.0, atol=1e-9)
+    np.testing.assert_allclose(ddq, 0.0, atol=1e-7)
+
+
+def swing_speeds(made):
+    """Return the largest speeds (n,) [rad/s] by the slow tones of a motion."""
+    rates = 2.0 * np.pi / made.period * made.slow
+    return (made.amplitude[:, -SLOW_TONES:] * rates).sum(axis=1)
+
+
+@pytest.mark.parametrize('slides', [False, True])
 @pytest.mark.parametrize('travel', [1e-4, 1e-3, 0.1])
-def test_travel_is_what_is_permitted(travel):
-    made = excitation(CONFIG, POSTURE, 0.03, travel)
+def test_travel_is_what_is_permitted(travel, slides):
+    made = excitation(CONFIG, POSTURE, 0.03, travel, sliding=slides)
     assert made.travel <= travel
+    if slides and travel <= 1e-3:  # all of it is used
+        assert made.travel > 0.95 * travel
     assert (made.speed <= 0.25 * np.array(CONFIG.limits.velocity)).all()
 
 
-def test_lines_belong_to_one_joint_each_and_are_known_from_the_configuration():
-    made = planned().excitation
-    lines = lines_in(planned().config)
+@pytest.mark.parametrize('motion', [planned, sliding])
+def test_lines_belong_to_one_joint_each_and_are_known_from_the_configuration(motion):
+    made = motion().excitation
+    lines = lines_in(motion().config)
     np.testing.assert_array_equal(lines.bins, made.bins)
     assert lines.period == pytest.approx(made.period)
-    every = np.concatenate((made.bins.ravel(), made.slow.ravel()))
-    assert np.unique(every).size == every.size
+    assert np.unique(made.bins).size == made.bins.size
+    assert not np.isin(made.slow, made.bins).any()
+    np.testing.assert_array_equal(lines.slow, made.slow)
     # all together within 1 / period of each other
     assert np.ptp(made.bins, axis=0).max() == 1
+
+
+def test_what_friction_makes_of_the_swings_meets_no_line():
+    """It is odd: of sums of an odd number of swings, here of three and five."""
+    made = sliding().excitation
+    for count in (3, 5):
+        signed = np.concatenate((made.slow[0], -made.slow[0]))
+        sums = {sum(each) for each in product(signed.tolist(), repeat=count)}
+        assert not sums & set(made.bins.ravel().tolist())
+
+
+def test_fast_joint_takes_no_swing_from_the_others():
+    """Joint 2 may move by a hundredth of what it would: joint 1 slides as fast."""
+    free = sliding().excitation
+    slow = change(CONFIG, {'limits.velocity': [5.0, 0.05 * free.speed[1]]})
+    made = excitation(slow, POSTURE, 0.03, 0.01, sliding=True)
+    assert made.speed[1] <= 0.25 * 0.05 * free.speed[1]
+    np.testing.assert_allclose(made.amplitude[0], free.amplitude[0])
+
+
+def test_joints_slide_on_an_arm_whose_wrists_are_as_fast_as_they_may():
+    """Swings of a UR5e keep 0.04 rad/s or more, in 10 mm: friction is steep below 0.02 rad/s."""
+    loop = load_loop(share_folder() / 'config' / 'ur5e.yaml')
+    posture = np.array(loop.plant.initial.position)
+    made = excitation(loop.controller, posture, 0.03, 0.01, sliding=True)
+    assert (swing_speeds(made) > 0.04).all()
+    assert 0.9 * 0.01 < made.travel <= 0.01
 
 
 def test_speed_of_a_motion_is_the_largest_in_either_direction():
@@ -234,6 +304,31 @@ def test_chosen_gains_have_the_margin_of_the_true_loop_and_twice_of_them_do_not(
     assert true.value == pytest.approx(choice.margin.value, abs=0.1)
     twice = true_loop(choice.gains.scaled(2.0), inertia).margin()
     assert twice.value < 0.4
+
+
+def test_friction_does_not_hide_where_the_loop_is_unstable():
+    """In one direction Coulomb friction damps nothing: the loop without it is the true one.
+
+    Of an arm that sticks, one measures its friction instead: gains that seem to have the
+    margin are beyond the limit of stability.  So it is measured again with swings, and once
+    more with more torque, since much noise is left by friction.
+    """
+    rubbing = change(
+        ARM, {'disturbance.coulomb': [1.0, 0.5], 'disturbance.stribeck': 0.5}
+    )
+    commissioning = blf.Commissioning(CONFIG, [POSTURE])
+    (first,) = commissioning.motions
+    run, config = simulated.measured(first, rubbing)
+    stuck = commissioned(CONFIG, [(run, config)])
+    assert stuck.has_margin
+    assert true_loop(stuck.choice.gains, stuck.loops.inertia).margin().value == 0.0
+    again = commissioning.stronger(first, run)
+    run, _ = simulated.measured(again, rubbing)
+    again = commissioning.stronger(again, run)
+    seen = commissioned(CONFIG, [simulated.measured(again, rubbing)])
+    assert seen.has_margin
+    gains = seen.choice.gains
+    assert true_loop(gains, seen.loops.inertia).margin().value > 0.3
 
 
 def test_noise_is_counted_against_the_margin():
@@ -396,9 +491,71 @@ def test_no_gains_have_a_margin_if_noise_hides_the_response():
     loud = response._replace(position_noise=1e4 * (response.position_noise + 1e-6))
     loops = found().loops._replace(responses=[loud])
     start = found().start
-    choice = choose(loops, start, start.scaled)
+    choice = choose(loops, start, start.scaled, true_rigid_arm())
     assert choice.margin.value < 0.5
     assert (choice.factors < 0.1).all()
+    assert not choice.by_inertia.any()
+
+
+def true_rigid_arm():
+    """Return the arm of the true inertias and delay, without springs and friction."""
+    (links,) = true_loop(found().start, found().loops.inertia).links
+    return RigidArm(np.diag(links) + ROTORS, TIMING)
+
+
+def test_gains_are_none_that_the_inertia_alone_would_not_bear():
+    """The joints answer a thousandth of what their inertias would: something damps them."""
+    (response,) = found().responses
+    stuck = response._replace(
+        position=0.001 * response.position,
+        velocity=0.001 * response.velocity,
+        position_noise=0.0 * response.position_noise,
+        velocity_noise=0.0 * response.velocity_noise,
+    )
+    loops = found().loops._replace(responses=[stuck])
+    start = found().start
+    rigid = true_rigid_arm()
+    choice = choose(loops, start, start.scaled, rigid)
+    assert choice.by_inertia.tolist() == [False, True]
+    assert choice.factors[0] > 90.0  # 100 times those of the measurement are tried
+    assert rigid.margin(choice.gains, loops.inertia) >= 0.5
+    more = choice.gains.scaled(np.array([1.0, 1.5]))
+    assert loops.margin(more).value >= 0.5  # nothing else would limit them
+    assert rigid.margin(more, loops.inertia) < 0.5
+
+
+def test_inertias_of_the_arm_are_those_that_were_measured():
+    """Of motors five times as heavy as assumed; a load in one of the runs is no motor."""
+    light = change(CONFIG, {'robot.rotor_inertia': [each / 5.0 for each in ROTORS]})
+    config = build(
+        ControllerConfig, {**GIVEN, 'robot.rotor_inertia': light.robot.rotor_inertia}
+    )
+    (motion,) = plan(config, POSTURE[None])
+    runs = [simulated.measured(motion, ARM, payload) for payload in (0.0, 1.0)]
+    result = commissioned(config, runs)
+    settings = settings_of_config(result.config)
+    (M,) = inertia_matrices(
+        settings.model, settings.initial_estimate[: settings.p], POSTURE[None]
+    )
+    true = true_rigid_arm().inertias
+    np.testing.assert_allclose(np.diag(M), true, rtol=0.1)  # as the inertias above
+    assert result.findings.inertia[0] > 1.2 * true[0]  # 1 kg at 1 m and more
+    # so are the errors to expect: with the assumed motors the loop would be another
+    errors = expected_errors(result.config, settings)
+    assert (errors.unmodelled < 0.1).all()
+    written = build(ControllerConfig, {**GIVEN, **result.parameters()})
+    assert written == result.config
+
+
+def test_stop_damps_as_before_but_no_more_than_the_gains_with_the_margin():
+    usual = CONFIG.safety.damping
+    damping = np.array([0.5 * usual[0], 2.0 * usual[1]])
+    expected = {'safety.damping': (damping[0], usual[1])}
+    assert kept_stop(CONFIG, damping) == expected
+    given = change(CONFIG, {'safety.damping': [9.0, 9.0]})
+    assert kept_stop(given, damping) == {}
+    chosen = found().config
+    assert (np.array(chosen.safety.damping) <= chosen.feedback.joint_damping).all()
 
 
 def test_loop_of_ones_own_has_the_same_motions_and_gains():
@@ -474,6 +631,21 @@ def test_joint_whose_inertia_friction_hides_is_not_trusted():
     assert 'joints that stick' in told
     assert '--prove' in told
     assert 'stick' not in '\n'.join(sentences(seen))
+
+
+def test_what_friction_and_inertia_do_to_the_gains_is_told():
+    seen = found()
+    damping = seen.choice.gains.damping * np.array([0.9, 1.1])
+    rubbing = seen._replace(findings=seen.findings._replace(damping=damping))
+    told = '\n'.join(sentences(rubbing))
+    assert 'friction damps joint2 more than the gains do' in told
+    assert '--prove' in told
+    choice = seen.choice._replace(by_inertia=np.array([True, False]))
+    told = '\n'.join(sentences(seen._replace(choice=choice)))
+    assert 'joint1: limited by inertia' in told
+    told = '\n'.join(sentences(seen))
+    assert 'limited by inertia' not in told
+    assert 'more than the gains do' not in told
 
 
 def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():

@@ -304,6 +304,28 @@ def test_a_posture_that_noise_hides_is_measured_again(arm, capsys):
     np.testing.assert_array_equal(gains_of(again), gains)
 
 
+def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):
+    """Its soft damping would let it drift on, if the run ended in the middle of a swing."""
+    friction = '{coulomb: [1.0, 0.5], stribeck: 0.5, '
+    arm.write_text(
+        arm.read_text().replace('disturbance: {', f'disturbance: {friction}')
+    )
+    assert commission(arm, 'plant', '--yes') == 0
+    folder = arm.with_name('out_bags')
+    assert {bag.name for bag in folder.iterdir()} == {
+        *('move_1', 'weak_posture_1', 'again_weak_posture_1', 'posture_1')
+    }
+    run = blf.read_run(folder / 'posture_1')
+    chain = (
+        read_content(folder / 'posture_1').controller_config().robot.chain(run.joints)
+    )
+    tips = frames(chain, run.position)[-1][:, :3, 3]
+    middle = frames(chain, run.position[0])[-1][:3, 3]
+    # the reference travels 10 mm at most; as without friction
+    assert np.linalg.norm(tips - middle, axis=1).max() < 0.015
+    assert np.abs(run.velocity[-1]).max() < 0.01  # rad/s, at rest
+
+
 def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
     """Not once all postures have been measured."""
     coarse = '    sensor: {resolution: 1.0e-3, velocity: differenced}\n'

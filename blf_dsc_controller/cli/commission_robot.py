@@ -22,6 +22,7 @@ from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.driven import Driven
 from blf_dsc_controller.commissioning.own_loop import (
+    REPEATS,
     Commissioning,
     Measured,
     measured_in,
@@ -76,7 +77,7 @@ def measured_on(
     with arm as here:
         planned = commissioning.motions_from(here.position())
         duration = here.duration(planned)
-        ask(options, _limits(options, commissioning.config, planned, duration))
+        ask(options, _limits(options, commissioning, planned, duration))
         bags = list(_followed(here, planned))
         here.leave()
     return [(name, measured_in(bag)) for name, bag in bags]
@@ -168,13 +169,14 @@ def _of_proof(options: Namespace, planned: Sequence[Step]) -> Iterator[str]:
 
 def _limits(
     options: Namespace,
-    config: ControllerConfig,
+    commissioning: Commissioning,
     planned: list[Planned],
     duration: float,
 ) -> Iterator[str]:
     """Yield what the arm is about to do at most."""
     for k, each in enumerate(planned, 1):
         yield f'posture {k}: {page.description(each)}'
+    config = commissioning.config
     rated = config.robot.efforts(config.robot.chain(config.joints))
     shaking, shaken_most = (
         ', '.join(f'{torque:.2g}' for torque in share * rated)
@@ -191,12 +193,19 @@ def _limits(
         f'where noise hides too much, a posture is measured once more, with {shaken_most} N m at '
         f'most; the tool then travels {1e3 * options.travel:.3g} mm at most'
     )
+    slid = [commissioning.sliding(each.posture) for each in planned]
+    swing = np.max([each.excitation.swing for each in slid], axis=0)
+    swings = ', '.join(f'{torque:.2g}' for torque in swing)
+    yield (
+        f'where friction damps a joint more than its gains do, likewise, with swings of {swings} '
+        'N m, and friction, which keep all joints sliding'
+    )
     yield (
         f'an error of {bound} rad, any other check of the controller, or Ctrl-C brings the arm to '
         'rest and ends'
     )
-    again = sum(each.duration for each in planned)
+    again = REPEATS * sum(each.duration for each in slid)
     yield (
         f'the arm moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
-        'every posture is measured twice'
+        'every posture is measured three times'
     )

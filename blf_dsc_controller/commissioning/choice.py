@@ -9,6 +9,9 @@ singular value passes zero, so every step on the way must have the margin.
 
 First the stiffness and damping of all joints grow together, then those of each joint by
 itself, in turns, as far as the margin allows.
+
+A rigid joint of the measured inertia and lags must have the margin, too (`RigidArm`).  What is
+measured bears more only where friction damps it, or where it is not seen.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains, linear
-from blf_dsc_controller.arms.linear_loop import law_responses
+from blf_dsc_controller.arms.linear_loop import Joints, Loop, Timing, law_responses
 from blf_dsc_controller.commissioning.response import DEVIATIONS, Response
 
 Floats = NDArray[np.float64]
@@ -53,6 +56,26 @@ class Choice(NamedTuple):
     factors: Floats  # (n,) on the damping of the measurement
     margin: Margin
     measured: Margin  # of the gains with which the arm was measured
+    by_inertia: NDArray[
+        np.bool_
+    ]  # (n,) of which joints more is too much for a rigid arm
+
+
+class RigidArm(NamedTuple):
+    """Rigid joints without friction, the others held: what inertias and lags alone bear."""
+
+    inertias: Floats  # (n,) kg m^2, the least of each joint
+    timing: Timing
+
+    def margin(self, gains: JointGains, inertia: Floats) -> float:
+        """Return the modulus margin of gains; 0 if a loop is unstable.
+
+        `inertia` (n,) [kg m^2] is the largest of each joint.
+        """
+        nothing = np.zeros(len(inertia))
+        M = np.diag(self.inertias)[None]
+        joints = Joints(motors=nothing, viscous=nothing)
+        return Loop(M, joints, self.timing, linear(gains, inertia, 1)).margin().value
 
 
 class Loops(NamedTuple):
@@ -102,23 +125,36 @@ def choose(
     loops: Loops,
     start: JointGains,
     by_factors: Callable[[Floats], JointGains],
+    rigid: RigidArm,
     margin: float = MARGIN,
 ) -> Choice:
-    """Return the stiffest gains with the margin.
+    """Return the stiffest gains with the margin, of the measured and of the rigid arm.
 
     `start` are the gains of the measurement, `by_factors` the gains for factors (n,) on
     its damping.
     """
+    n = len(start.damping)
+
+    def is_borne(factors: Floats) -> bool:
+        return rigid.margin(by_factors(factors), loops.inertia) >= margin
 
     def has_margin(factors: Floats) -> bool:
-        return loops.margin(by_factors(factors)).value >= margin
+        measured = loops.margin(by_factors(factors)).value
+        return measured >= margin and is_borne(factors)
 
-    factors = _LEAST * np.ones(len(start.damping))
+    factors = _LEAST * np.ones(n)
     while factors[0] * _STEP <= _MOST and has_margin(_STEP * factors):
         factors *= _STEP
     factors = _one_by_one(factors, has_margin)
     gains = by_factors(factors)
-    return Choice(gains, factors, loops.margin(gains), loops.margin(start))
+    raised = factors * np.where(np.eye(n, dtype=bool), _STEP, 1.0)
+    return Choice(
+        gains=gains,
+        factors=factors,
+        margin=loops.margin(gains),
+        measured=loops.margin(start),
+        by_inertia=np.array([not is_borne(each) for each in raised]),
+    )
 
 
 def _one_by_one(factors: Floats, has_margin: Callable[[Floats], bool]) -> Floats:

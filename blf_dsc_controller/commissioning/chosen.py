@@ -36,7 +36,8 @@ def with_gains(
 ) -> ControllerConfig:
     """Return a configuration with values, and what follows from them, as if read from a file.
 
-    `values` have `feedback.joint_stiffness` and `feedback.joint_damping`.
+    `values` have `feedback.joint_stiffness` and `feedback.joint_damping`, and may have
+    `robot.lag` and `robot.rotor_inertia`.
     """
     names = 'feedback.joint_stiffness', 'feedback.joint_damping'
     gains = JointGains(*(np.array(values[name], float) for name in names))
@@ -44,7 +45,9 @@ def with_gains(
     bound = np.array(values.get('barrier.bound', config.barrier.bound), float)
     before = gains_of(arm, np.array(config.barrier.bound))
     lag = float(np.asarray(values.get('robot.lag', arm.lag), float))
-    after = gains_of(arm._replace(joints=gains, stiffness=1.0, lag=lag), bound)
+    rotors = np.array(values.get('robot.rotor_inertia', arm.rotors), float)
+    follows = arm._replace(joints=gains, stiffness=1.0, lag=lag, rotors=rotors)
+    after = gains_of(follows, bound)
     present = flatten(config)
     followed = {
         name: value
@@ -52,6 +55,19 @@ def with_gains(
         if name in FOLLOWED or (name in present and present[name] == before[name])
     }
     return change(config, {**followed, **values})
+
+
+def kept_stop(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
+    """Return the damping of a stop by dotted name: as it is, but no more than `damping` (n,).
+
+    Gains have a margin with that of the joints.  By the measured inertia it could be more.
+    None, if the damping of a stop is given.
+    """
+    arm, _ = design_of(config)
+    usual = gains_of(arm, np.array(config.barrier.bound))['safety.damping']
+    if config.safety.damping != usual:
+        return {}
+    return {'safety.damping': tuple(np.minimum(usual, damping).tolist())}
 
 
 def kept_bound(config: ControllerConfig) -> dict[str, Value]:

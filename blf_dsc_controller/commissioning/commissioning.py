@@ -16,8 +16,18 @@ from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, unknown_
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
-from blf_dsc_controller.commissioning.choice import MARGIN, Choice, Loops, choose
-from blf_dsc_controller.commissioning.chosen import kept_bound, with_gains
+from blf_dsc_controller.commissioning.choice import (
+    MARGIN,
+    Choice,
+    Loops,
+    RigidArm,
+    choose,
+)
+from blf_dsc_controller.commissioning.chosen import (
+    kept_bound,
+    kept_stop,
+    with_gains,
+)
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.response import Response, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
@@ -45,8 +55,12 @@ class Planned(NamedTuple):
 
     @property
     def duration(self) -> float:
-        """Time [s] that a run needs, a little more than the period that counts."""
-        return motion.SETTLING + self.excitation.period + 0.5
+        """Time [s] that a run needs, a little more than the period that counts.
+
+        Swings end where they vanish.
+        """
+        more = motion.BEAT if self.excitation.sliding else 0.5
+        return motion.SETTLING + self.excitation.period + more
 
 
 class Commissioned(NamedTuple):
@@ -59,7 +73,8 @@ class Commissioned(NamedTuple):
     choice: Choice
     findings: Findings
     assumed: Floats  # (n,) kg m^2, inertias by URDF and guess, where findings has them
-    lag: float  # s, robot.lag: measured, else as given
+    rotors: Floats  # (n,) kg m^2, robot.rotor_inertia: measured, unless drives hide it
+    lag: float  # s, robot.lag: likewise
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
@@ -92,11 +107,17 @@ class Commissioned(NamedTuple):
 
     def _values(self) -> dict[str, Value]:
         gains = self.choice.gains
+        damping = _rounded(gains.damping)
+        motors: dict[str, Value] = {}
+        if not self.before.robot.torque_loop:
+            motors = kept_stop(self.before, np.array(damping))
+            motors['robot.rotor_inertia'] = _rounded(self.rotors)
         return {
+            **motors,
             'robot.lag': float(f'{self.lag:.3g}'),
             'feedback.inertia': 'none',
             'feedback.joint_stiffness': _rounded(gains.stiffness),
-            'feedback.joint_damping': _rounded(gains.damping),
+            'feedback.joint_damping': damping,
             'feedback.stiffness': 1.0,
             'commissioning.date': self.date,
             'commissioning.version': __version__,
@@ -129,8 +150,11 @@ def plan(
     *,
     torque: float = TORQUE,
     travel: float = TRAVEL,
+    sliding: bool = False,
 ) -> list[Planned]:
     """Return the motions around postures (k, n) [rad] by which an arm is measured.
+
+    With swings that keep its joints sliding, if these stick without (`sliding`).
 
     Raises BlfDscError if the arm is not from a URDF, or has feedback through its inertia
     matrix, with which no arm with elastic joints is safe to be measured.
@@ -147,7 +171,7 @@ def plan(
     planned = []
     for posture in postures:
         _check_posture(config, posture)
-        excitation = motion.excitation(config, posture, torque, travel)
+        excitation = motion.excitation(config, posture, torque, travel, sliding=sliding)
         values = motion.shaken(config, excitation, posture)
         planned.append(Planned(change(config, values), values, posture, excitation))
     return planned
@@ -181,6 +205,12 @@ def commissioned(
     known = np.where(np.isnan(found.inertia), here.max(axis=0), found.inertia)
     inertia = known + np.maximum(elsewhere, 0.0)
     loops = Loops(responses, inertia, T)
+    rotors = arm.rotors
+    if not config.robot.torque_loop:  # else drives hide their motors
+        beyond = _least(found.inertias - here, 0.0 * here)  # least: a load is no motor
+        rotors = (rotors + beyond).clip(0.0)
+    least = _least(found.inertias, here)
+    rigid = RigidArm(least, found.timing(T, arm.lag))
 
     def by_factors(factors: Floats) -> JointGains:
         if config.feedback.joint_stiffness:
@@ -193,14 +223,21 @@ def commissioned(
         responses=responses,
         loops=loops,
         start=start,
-        choice=choose(loops, start, by_factors, margin),
+        choice=choose(loops, start, by_factors, rigid, margin),
         findings=found,
         assumed=here.max(axis=0),
+        rotors=rotors,
         lag=config.robot.lag if np.isnan(lag) else lag,
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
         aim=margin,
         before=config,
     )
+
+
+def _least(measured: Floats, assumed: Floats) -> Floats:
+    """Return the least (n,) of what was measured in k runs (k, n); of `assumed` where none was."""
+    least = np.where(np.isnan(measured), np.inf, measured).min(axis=0)
+    return np.asarray(np.where(np.isinf(least), assumed.min(axis=0), least))
 
 
 def measuring_gains(arm: Design) -> JointGains:

@@ -31,13 +31,14 @@ def of_commissioned(
 ) -> dict[str, _Values]:
     """Return the sections of a file with what was measured in the place of guesses.
 
-    Gains of the law that the file gives are left out, since they follow.
+    Gains of the law that the file gives are left out, since they follow; so is a factor on the
+    rotors of the simulated arm, which those that were measured have.
     """
     chosen = found.parameters()
     of_robot = {name: value for name, value in chosen.items() if 'robot.' in name}
     own = {name: value for name, value in chosen.items() if name not in of_robot}
     given = {'/**': of_robot, f'/**/{CONTROLLER}': own}
-    return _with(sections, given, removed=FOLLOWED)
+    return _with(sections, given, removed=(*FOLLOWED, 'truth.rotor_factor'))
 
 
 def _with(

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.linear_loop import Timing
 from blf_dsc_controller.commissioning.response import Response
 from blf_dsc_controller.run import Run
 
@@ -50,6 +51,7 @@ class Findings(NamedTuple):
     inertia: (
         Floats  # (n,) kg m^2, the largest with the others held; nan: friction hides it
     )
+    inertias: Floats  # (k, n) likewise in each run
     damping: Floats  # (n,) N m s/rad, the mean
     drive_lag: float  # s, from a torque to the motion, sampling included; nan likewise
     velocity_lag: float  # s, of velocities against positions
@@ -61,25 +63,36 @@ class Findings(NamedTuple):
 
     def lag(self, sample_time: float) -> float:
         """Return `robot.lag` [s]: the lags beyond those of sampling; nan: not known."""
-        beyond = self.drive_lag - 1.5 * sample_time
-        of_velocity = self.velocity_lag - 0.5 * sample_time
-        return float(np.maximum(0.0, beyond) + np.maximum(0.0, of_velocity))
+        return float(np.sum(self._lags(sample_time)))
+
+    def timing(self, sample_time: float, lag: float) -> Timing:
+        """Return sampling and lags; where they are not known, halves of `lag` [s]."""
+        drives, velocity = self._lags(sample_time)
+        if np.isnan(drives):
+            drives = velocity = 0.5 * lag
+        return Timing(sample_time, drive_lag=drives, velocity_lag=velocity)
+
+    def _lags(self, sample_time: float) -> tuple[float, float]:
+        """Return the lags of drives and velocities [s] beyond those of sampling."""
+        drives = np.maximum(0.0, self.drive_lag - 1.5 * sample_time)
+        velocity = np.maximum(0.0, self.velocity_lag - 0.5 * sample_time)
+        return float(drives), float(velocity)
 
 
 def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
     """Return what runs of the motion and their responses show."""
     peaks = [_resonances(each, posture) for posture, each in enumerate(responses)]
     fits = [
-        _rigid_fit(each, min((peak.frequency for peak in found), default=np.inf))
-        for each, found in zip(responses, peaks, strict=True)
+        _rigid_fit(each, found) for each, found in zip(responses, peaks, strict=True)
     ]
     inertia, damping, lag = (np.array(each) for each in zip(*fits, strict=True))
-    hidden = inertia * 2.0 * np.pi * _RIGID[1] < _SEEN * damping
+    hidden = _is_hidden(inertia, damping)
     inertia[hidden] = lag[hidden] = np.nan
     gaps = np.concatenate([np.diff(run.stamp) for run in runs]) * 1e-9
     usual = float(np.median(gaps))
     return Findings(
         inertia=_largest(inertia),
+        inertias=inertia,
         damping=damping.mean(axis=0),
         drive_lag=_middle(lag),
         velocity_lag=float(np.median([_velocity_lag(each) for each in responses])),
@@ -91,8 +104,24 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
     )
 
 
-def _rigid_fit(response: Response, peak: float) -> tuple[Floats, Floats, Floats]:
-    """Return inertia, damping and lag (n,) of the joints, below the lowest resonance [Hz]."""
+def rubs(response: Response, damping: Floats) -> bool:
+    """Whether friction hides the inertia of a joint, or damps it more than its gains do.
+
+    Those with which it was measured have `damping` (n,) [N m s/rad].
+    """
+    inertia, found, _ = _rigid_fit(response, _resonances(response, 0))
+    return bool((_is_hidden(inertia, found) | (found > damping)).any())
+
+
+def _is_hidden(inertia: Floats, damping: Floats) -> NDArray[np.bool_]:
+    return np.asarray(inertia * 2.0 * np.pi * _RIGID[1] < _SEEN * damping)
+
+
+def _rigid_fit(
+    response: Response, peaks: Sequence[Resonance]
+) -> tuple[Floats, Floats, Floats]:
+    """Return inertia, damping and lag (n,) of the joints, below the lowest resonance."""
+    peak = min((each.frequency for each in peaks), default=np.inf)
     low, high = _RIGID[0], max(_FEWEST, min(_RIGID[1], _BELOW * peak))
     rows = (response.frequency >= low) & (response.frequency <= high)
     s: Complex = np.asarray(2j * np.pi * response.frequency[rows], complex)

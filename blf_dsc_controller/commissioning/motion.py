@@ -11,8 +11,12 @@ from which the whole matrix of responses follows.  What a period shows between t
 is noise and friction, and tells how much of a response can be believed.
 
 Torques are alike at all frequencies: a joint with inertia J moves by tau / (J omega^2).  Two
-slow tones keep each joint sliding, since friction hides the resonances of a joint that
-sticks.  Phases are random, but for the start: positions, velocities and accelerations
+slow tones more move each joint a little.  Where it sticks nevertheless, friction hides and
+damps its resonances: then its two tones more are swings of 4 Hz, which travel less than slower
+ones of the same speed (`sliding`).  They cancel each other every `BEAT` seconds, so that an
+arm which is softly held has no momentum where its run ends.
+
+Phases are random, but for the start: positions, velocities and accelerations
 begin at zero, so an arm at rest is not jerked.
 """
 
@@ -39,12 +43,17 @@ SETTLING = 6.0
 SLOW_TONES = 2
 """The last tones of a joint, which keep it sliding."""
 
+BEAT = 2.0
+"""Time [s] between the moments at which the swings of all joints vanish."""
+
+SLIDING = 0.1
+"""Largest speed of the swings [rad/s]."""
+
 _LINES = 80  # of each joint, at most
 _SLOWEST, _FASTEST = 2.0, 120.0  # Hz
 _OF_RATE = 0.35  # of the sample rate, the fastest line at most
 _SECONDS = 4.0  # of the period, for each joint
-_SLOW = 1.0  # Hz, of the tones that keep joints sliding
-_SLIDING = 0.1  # rad/s, their largest speed
+_SLOW, _SWING = 1.0, 4.0  # Hz, of slow tones and of swings
 _LEAST_SWING = 0.05  # times that, before the lines shrink, too
 _SHRINKS = 40  # until travel and speeds are within their limits
 _SPEED = 0.25  # of the limit of velocity
@@ -58,12 +67,14 @@ class Excitation(NamedTuple):
 
     period: float  # s
     bins: Ints  # (n, K) of the spectrum of a period: lines of each joint
-    slow: Ints  # (n, 2) likewise: the tones that keep the joints sliding
+    slow: Ints  # (n, 2) likewise: slow tones, or swings, of all joints alike
     amplitude: Floats  # (n, K + 2) rad, of lines and slow tones
     phase: Floats  # (n, K + 2) rad
     travel: float  # m, of the tool from its middle
     speed: Floats  # (n,) rad/s, the largest
     acceleration: Floats  # (n,) rad/s^2, which none exceeds
+    swing: Floats  # (n,) N m, torque of slow tones or swings at most, without friction
+    sliding: bool  # with swings
 
     @property
     def frequencies(self) -> Floats:
@@ -95,6 +106,7 @@ class Lines(NamedTuple):
 
     period: float  # s
     bins: Ints  # (n, K)
+    slow: Ints  # (n, 2) of slow tones or swings, which are neither lines nor noise
 
     @property
     def frequencies(self) -> Floats:
@@ -116,7 +128,8 @@ def lines_in(config: ControllerConfig) -> Lines:
     if np.abs(bins - np.rint(bins)).max() > 1e-6:
         raise BlfDscError(_OTHER_MOTION)
     by_joint = np.rint(bins).astype(np.int64).reshape(n, -1)
-    return Lines(2.0 * np.pi / float(rates[0]), by_joint[:, :-SLOW_TONES])
+    period = 2.0 * np.pi / float(rates[0])
+    return Lines(period, by_joint[:, :-SLOW_TONES], by_joint[:, -SLOW_TONES:])
 
 
 _OTHER_MOTION = (
@@ -126,19 +139,24 @@ _OTHER_MOTION = (
 
 
 def excitation(
-    config: ControllerConfig, posture: Floats, share: float, travel: float
+    config: ControllerConfig,
+    posture: Floats,
+    share: float,
+    travel: float,
+    *,
+    sliding: bool = False,
 ) -> Excitation:
     """Return the motion around a posture (n,) [rad] of an arm from a URDF.
 
     Its torques are `share` of the rated ones (rms), by the inertias that the URDF and
     `robot.rotor_inertia` have; less, where its tool would travel farther than `travel`
-    [m] or a joint would move faster than a quarter of its limit.
+    [m] or a joint would move faster than a quarter of its limit.  Joints with swings
+    (`sliding`) shrink each on its own where they are too fast, swing and lines alike.
     """
     n = len(config.joints)
     period = _SECONDS * n
     bins = _bins(n, period, config.sample_time)
-    first = round(_SLOW * period) - n + np.arange(n)
-    slow = np.column_stack((first, first + 2 * n))
+    slow = _swings(n, period) if sliding else _slow(n, period)
     chain = config.robot.chain(config.joints)
     base = parameters_of(config.robot, chain)
     P = base.of(chain.inertias, config.robot.rotors(chain))
@@ -147,32 +165,57 @@ def excitation(
     rate = 2.0 * np.pi / period * bins
     torque = share * rated / math.sqrt(0.5 * bins.shape[1])
     lines = torque[:, None] / (inertia[:, None] * rate**2)
-    swing = np.full(slow.shape, _SLIDING / (2.0 * np.pi * _SLOW) / SLOW_TONES)
-    shape = _Shape(np.column_stack((bins, slow)), period)
+    rates = 2.0 * np.pi / period * slow if sliding else 2.0 * np.pi * _SLOW
+    swing = np.full(slow.shape, SLIDING / rates / SLOW_TONES)
+    shape = _Shape(np.column_stack((bins, slow)), period, SLOW_TONES * sliding)
     limit = _SPEED * np.array(config.limits.velocity)
     middle = frames(chain, posture)[-1][:3, 3]
-    factors = np.ones(2)  # of lines and swings
+    factors = np.ones((n, 2))  # of lines and of slow tones or swings
     for _ in range(_SHRINKS):
-        amplitude = np.column_stack((factors[0] * lines, factors[1] * swing))
+        amplitude = np.column_stack((factors[:, :1] * lines, factors[:, 1:] * swing))
         phase, moved, speed = shape.motion(amplitude)
         tips = frames(chain, posture + moved)[-1][:, :3, 3]
         far = float(np.linalg.norm(tips - middle, axis=1).max())
-        excess = max(far / travel, float((speed / limit).max()))
-        if excess <= 1.0:
+        excess = np.maximum(speed / limit, far / travel)
+        if (excess <= 1.0).all():
             break
-        shrunk = slice(1, 2) if factors[1] > _LEAST_SWING else slice(None)
-        factors[shrunk] /= max(min(excess, 2.0), 1.05)
-    acceleration = (amplitude * shape.rates**2).sum(axis=1)
-    return Excitation(period, bins, slow, amplitude, phase, far, speed, acceleration)
+        shrink = _shrink_each if sliding else _shrink_all
+        shrink(factors, excess)
+    accelerations = amplitude * shape.rates**2
+    return Excitation(
+        period=period,
+        bins=bins,
+        slow=slow,
+        amplitude=amplitude,
+        phase=phase,
+        travel=far,
+        speed=speed,
+        acceleration=accelerations.sum(axis=1),
+        swing=inertia * accelerations[:, -SLOW_TONES:].sum(axis=1),
+        sliding=sliding,
+    )
+
+
+def _shrink_all(factors: Floats, excess: Floats) -> None:
+    """Make slow tones smaller, of all joints alike; at last lines, too."""
+    shrunk = slice(1, 2) if factors[0, 1] > _LEAST_SWING else slice(None)
+    factors[:, shrunk] /= max(min(float(excess.max()), 2.0), 1.05)
+
+
+def _shrink_each(factors: Floats, excess: Floats) -> None:
+    """Make lines and swing of each joint smaller that exceeds (n,) something."""
+    factors /= np.where(excess > 1.0, excess.clip(1.02, 2.0), 1.0)[:, None]
 
 
 class _Shape:
     """Motions of given lines (n, K), by their amplitudes."""
 
-    def __init__(self, bins: Ints, period: float) -> None:
+    def __init__(self, bins: Ints, period: float, held: int) -> None:
+        """Use lines, of which the last `held` keep their phases."""
         self.rates = 2.0 * np.pi / period * bins  # rad/s
         self._bins = bins
         self._period = period
+        self._held = held
         random = np.random.default_rng(_SEED)
         self._phase = random.uniform(0.0, 2.0 * np.pi, bins.shape)
         # against each other at the start
@@ -181,7 +224,7 @@ class _Shape:
     def motion(self, amplitude: Floats) -> tuple[Floats, Floats, Floats]:
         """Return phases (n, K), motion (N, n) [rad] over a period, and speeds (n,) [rad/s]."""
         rows = zip(amplitude, self._bins, self._phase, strict=True)
-        phase = np.array([_from_rest(*row) for row in rows])
+        phase = np.array([_from_rest(*row, self._held) for row in rows])
         moved = _over_a_period(amplitude, phase, self._bins)
         rate = np.gradient(moved, self._period / len(moved), axis=0)
         return phase, moved, np.abs(rate).max(axis=0)
@@ -241,11 +284,27 @@ def _bins(n: int, period: float, sample_time: float) -> Ints:
     return np.asarray(2 * n * middle + np.arange(n)[:, None])
 
 
-def _from_rest(amplitude: Floats, bins: Ints, phase: Floats) -> Floats:
+def _slow(n: int, period: float) -> Ints:
+    """Return two slow tones of each joint (n, 2)."""
+    first = round(_SLOW * period) - n + np.arange(n)
+    return np.column_stack((first, first + 2 * n))
+
+
+def _swings(n: int, period: float) -> Ints:
+    """Return two tones, of all joints alike (n, 2), that are `BEAT` apart.
+
+    They are odd multiples of n: so are those that friction, odd, makes of them, and lines
+    are none of these.
+    """
+    below = 2 * n * round(_SWING * period / (2 * n))
+    return np.tile([below - n, below + n], (n, 1))
+
+
+def _from_rest(amplitude: Floats, bins: Ints, phase: Floats, held: int) -> Floats:
     """Return phases near those given with which a joint begins at rest, in the middle.
 
     Position, velocity and acceleration at the start are zero, by Newton's method with
-    the least change of the phases.
+    the least change of the phases; those of the last `held` stay.
     """
     rates = bins / bins.max()
     weights = amplitude * np.stack((np.ones_like(rates), rates, rates**2))
@@ -256,6 +315,7 @@ def _from_rest(amplitude: Floats, bins: Ints, phase: Floats) -> Floats:
         if np.abs(value).max() < _AT_REST:
             break
         slope = -weights * np.sin(phase + turn)
+        slope[:, slope.shape[1] - held :] = 0.0
         phase = phase - np.linalg.lstsq(slope, value, rcond=None)[0]
     return phase
 

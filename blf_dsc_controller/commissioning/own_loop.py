@@ -23,10 +23,13 @@ from blf_dsc_controller.commissioning.commissioning import (
     postures_of,
 )
 from blf_dsc_controller.commissioning.motion import SLOW_TONES
-from blf_dsc_controller.commissioning.strength import strength
+from blf_dsc_controller.commissioning.strength import rubs_in, strength
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.run import Run
+
+REPEATS = 2
+"""Times that a posture is measured again, at most: with swings, and with more torque."""
 
 _WORTH = 1.2  # times the amplitude, for which a posture is measured again
 
@@ -111,29 +114,49 @@ class Commissioning:
         """
         return self._motion(posture, self._torque)
 
+    def sliding(self, posture: ArrayLike) -> Planned:
+        """Return the motion around a posture (n,) [rad] with swings that keep joints sliding.
+
+        Raises:
+            BlfDscError: as for `motion`.
+        """
+        return self._motion(posture, self._torque, sliding=True)
+
     def stronger(
         self, motion: Planned, run: Run, posture: ArrayLike | None = None
     ) -> Planned | None:
-        """Return a motion with more torque to repeat one with, if noise hides much in its run.
+        """Return a motion to repeat one with: with more torque, if noise hides much in its run.
 
-        It is around a posture (n,) [rad], or that of the motion.  None: enough is seen, or
-        the travel of the tool and the speeds permit no more.
+        With swings, if friction damps a joint more than its gains do.  It is around a posture
+        (n,) [rad], or that of the motion.  None: enough is seen, or the travel of the tool and
+        the speeds permit no more.
 
         Raises:
             BlfDscError: the run does not show the response.
         """
         factor = strength(run, motion.config)
-        if factor == 1.0:
+        slid = motion.excitation.sliding
+        sliding = slid or rubs_in(run, motion.config)
+        if factor == 1.0 and sliding == slid:
             return None
         around = motion.posture if posture is None else posture
-        again = self._motion(around, factor * self._torque)
+        again = self._motion(around, factor * self._torque, sliding=sliding)
+        if sliding != slid:
+            return again
         before, after = (each.excitation.amplitude for each in (motion, again))
         gained = float((after[:, :-SLOW_TONES] / before[:, :-SLOW_TONES]).max())
         return again if gained > _WORTH else None
 
-    def _motion(self, posture: ArrayLike, torque: float) -> Planned:
-        around = np.asarray(posture, float)[None]
-        (motion,) = plan(self.config, around, torque=torque, travel=self._travel)
+    def _motion(
+        self, posture: ArrayLike, torque: float, *, sliding: bool = False
+    ) -> Planned:
+        (motion,) = plan(
+            self.config,
+            np.asarray(posture, float)[None],
+            torque=torque,
+            travel=self._travel,
+            sliding=sliding,
+        )
         return motion
 
     def result(self, runs: Sequence[str | Path | Measured]) -> Commissioned:

@@ -81,15 +81,8 @@ def sentences(found: Commissioned) -> Iterator[str]:
             f'a torque takes {1e3 * arm.drive_lag:.2g} ms to its motion, sampling included, and '
             f'velocities are {1e3 * arm.velocity_lag:.2g} ms old'
         )
-    hidden = np.isnan(arm.inertia)
-    if hidden.any():
-        names = ', '.join(np.array(found.joints)[hidden])
-        yield (
-            f'friction hides the inertia of {names}: that of the URDF is used, and the margin is '
-            'that of joints that stick, not that of joints that slide: prove the gains (--prove), '
-            'or take half of feedback.stiffness and a wider bound'
-        )
     choice = found.choice
+    yield from _of_friction(found)
     limit = choice.margin
     joint = found.joints[limit.joint]
     yield (
@@ -101,6 +94,11 @@ def sentences(found: Commissioned) -> Iterator[str]:
         yield (
             f'NO GAINS HAVE THE MARGIN of {found.aim:g}: noise or friction hide the response. '
             'Measure again with a larger --torque or --travel'
+        )
+    if choice.by_inertia.any():
+        names = ', '.join(np.array(found.joints)[choice.by_inertia])
+        yield (
+            f'{names}: limited by inertia; with these delays a rigid joint bears no more'
         )
     doubt = _doubt_at(found)
     if doubt > LITTLE:
@@ -122,6 +120,24 @@ def sentences(found: Commissioned) -> Iterator[str]:
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'
     )
+
+
+def _of_friction(found: Commissioned) -> Iterator[str]:
+    """Yield of which joints friction hides the inertia, or adds damping that motion lacks."""
+    names = np.array(found.joints)
+    hidden = np.isnan(found.findings.inertia)
+    if hidden.any():
+        yield (
+            f'friction hides the inertia of {", ".join(names[hidden])}: that of the URDF is used, '
+            'and the margin is that of joints that stick, not that of joints that slide: prove '
+            'the gains (--prove), or take half of feedback.stiffness and a wider bound'
+        )
+    rubbing = ~hidden & (found.findings.damping > found.choice.gains.damping)
+    if rubbing.any():
+        yield (
+            f'friction damps {", ".join(names[rubbing])} more than the gains do while shaken, and '
+            'less in a steady motion: the true margin is smaller, so prove the gains (--prove)'
+        )
 
 
 def _of_bound(found: Commissioned) -> Iterator[str]:

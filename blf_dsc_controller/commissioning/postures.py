@@ -2,7 +2,7 @@
 """Commissioning of a robot from posture to posture: slowly to each, and the motion there.
 
     rest -> move -> rest -> motion -> rest      for each posture, and the motion once more if
-                                                noise hides much
+                                                noise or friction hide much, twice
 
 Moves and motions are runs that end at rest whatever happens, and have a bag each.  A motion
 is around the posture in which the arm rests by then, so it begins without an error.
@@ -21,7 +21,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.commissioning import Planned
-from blf_dsc_controller.commissioning.own_loop import Commissioning, measured_in
+from blf_dsc_controller.commissioning.own_loop import (
+    REPEATS,
+    Commissioning,
+    measured_in,
+)
 from blf_dsc_controller.commissioning.proof import Errors, Step, errors_of, start_of
 from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -193,13 +197,17 @@ class PostureByPosture(ABC):
             self._run(way.config, way.duration, f'move {k}')
             here = self._aside(self._commissioning.motion, self.position())
             bag = self._run(here.config, here.duration, name)
-            with _named(name):
-                again = self._aside(
-                    stronger, self._commissioning, here, bag, self.position()
-                )
-            if again is not None:
-                bag.rename(bag.with_name(f'weak_{bag.name}'))
+            for weak in ('weak', 'again_weak')[:REPEATS]:
+                with _named(name):
+                    again = self._aside(
+                        stronger, self._commissioning, here, bag, self.position()
+                    )
+                if again is None:
+                    break
+                bag.rename(bag.with_name(f'{weak}_{bag.name}'))
                 self._run(again.config, again.duration, name)
+                here = again
+            else:
                 with _named(name):
                     self._aside(check, bag)
             self._measured = k

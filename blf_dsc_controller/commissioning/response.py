@@ -72,7 +72,7 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
             'than a step of its encoders. Measure with a larger --torque and --travel'
         )
     inverse = np.linalg.inv(U_at)
-    between = _between(lines.bins, len(U))
+    between = _between(lines, len(U))
     noises = [
         _noise(measured, U, response, at, between)
         for measured, response in ((Y, Y_at @ inverse), (V, V_at @ inverse))
@@ -194,10 +194,11 @@ def _spectrum(values: Floats) -> Complex:
     return np.asarray(np.fft.rfft((values - drift)[:-1], axis=0) * (2.0 / count))
 
 
-def _between(bins: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+def _between(lines: Lines, count: int) -> NDArray[np.bool_]:
     """Return which waves (count,) of the spectrum the motion does not have."""
     free = np.ones(count, bool)
-    free[bins.ravel()] = False
+    free[lines.bins.ravel()] = False
+    free[lines.slow.ravel()] = False
     free[0] = False
     return free
 

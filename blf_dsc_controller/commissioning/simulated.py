@@ -9,7 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.commissioning.commissioning import Planned
-from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
+from blf_dsc_controller.commissioning.own_loop import (
+    REPEATS,
+    Commissioning,
+    Measured,
+)
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
@@ -61,16 +65,20 @@ def runs_of(
 ) -> Iterator[tuple[str, Measured | BlfDscError]]:
     """Yield the runs of all motions, then one with the rated payload, with their names.
 
-    Where noise hides much, it is the run of a stronger motion.  The last one may be beyond
+    Where noise or friction hide much, it is the run of another motion.  The last one may be beyond
     what soft gains hold: then it is the error.
     """
     strongest: list[Planned] = []
     planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):
-        run = measured(each, loop.plant)
-        again = commissioning.stronger(each, run[0])
-        strongest.append(again or each)
-        yield f'posture {k}', measured(again, loop.plant) if again else run
+        shaken, run = each, measured(each, loop.plant)
+        for _ in range(REPEATS):
+            again = commissioning.stronger(shaken, run[0])
+            if again is None:
+                break
+            shaken, run = again, measured(again, loop.plant)
+        strongest.append(shaken)
+        yield f'posture {k}', run
     payload = loop.controller.robot.payload
     name = f'posture 1 with {payload:g} kg'
     try:

@@ -3,7 +3,9 @@
 
 Noise is counted against the modulus margin, and falls as the torque of the motion grows.  A
 first, weak motion shows how much it takes; where that is much, the posture is measured again
-with the torque that makes it little, as far as `MOST` allows.
+with the torque that makes it little, as far as `MOST` allows.  Where friction damps a joint
+more than its gains do, it is measured again with swings that keep its joints sliding: one that
+sticks shows its friction, of which a steady motion has none.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import numpy as np
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning.choice import SLOWEST, Loops
 from blf_dsc_controller.commissioning.commissioning import measuring_gains
+from blf_dsc_controller.commissioning.findings import rubs
 from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.response import HiddenError, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
@@ -42,3 +45,16 @@ def strength(run: Run, config: ControllerConfig) -> float:
     counted = response.seen & (response.frequency >= SLOWEST)
     taken = value[counted].min() - (value - doubt)[counted].min()
     return float(np.clip(taken / LITTLE, 1.0, MOST))
+
+
+def rubs_in(run: Run, config: ControllerConfig) -> bool:
+    """Whether friction damps a joint more than its gains do in a run of a motion.
+
+    Raises BlfDscError if it is no whole run of the motion.
+    """
+    try:
+        response = response_of(run, lines_in(config), config.sample_time)
+    except HiddenError:
+        return False
+    arm, _ = design_of(config)
+    return rubs(response, measuring_gains(arm).damping)
