@@ -464,3 +464,12 @@ def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path, config
     assert all(len(panel.lines) <= 8 for panel in shown.values())
     of_links = {'torque error', 'errors of the estimates, by link'}
     assert set(shown) == (of_links if configured else {'relative parameter error'})
+
+
+def test_estimates_that_are_too_many_are_thinned_out_up_to_the_last(run, monkeypatch):
+    monkeypatch.setattr('blf_dsc_controller.analysis.estimates._MAX_SAMPLES', 7)
+    found = estimates_of(run)
+    assert found.time.size <= 7
+    assert found.time[-1] == run.time_of(run.monitor.stamp)[-1]
+    last = run.monitor.values[-1, run.monitor.indices(found.names)]
+    np.testing.assert_array_equal(found.estimate[-1], last)

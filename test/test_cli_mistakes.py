@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import recorded_run
@@ -408,3 +409,14 @@ def test_old_ros_and_missing_middleware_are_answered_in_one_line(
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
     assert re.search(answer, line)
+
+
+@pytest.mark.parametrize(
+    ('words', 'name', 'value'),
+    [
+        (['commission', '--config', 'panda'], 'out', Path('commissioned.yaml')),
+        (['precompile'], 'config', 'recommended'),
+    ],
+)
+def test_what_is_not_given_is_as_the_pages_say(words, name, value):
+    assert getattr(make_parser().parse_args(words), name) == value

@@ -759,3 +759,15 @@ def test_light_wrists_may_be_shaken_past_their_limit_of_acceleration():
     times = np.linspace(0.0, motions[0].duration, 5000)
     reached = np.abs(sampled(reference_of(motions[0].config), times)[:, 2])
     assert (reached <= motions[0].config.limits.acceleration).all()
+
+
+def test_response_of_a_free_arm_is_exact_between_the_lines():
+    """It is 1 / (M s^2), whose M does not depend on the frequency."""
+    M = np.array([[2.0, 0.3], [0.3, 0.5]])
+
+    def stiffness(f):
+        return (2j * np.pi * f)[:, None, None] ** 2 * M
+
+    fine = refined(lines_of(stiffness, 1e-9))
+    expected = np.linalg.inv(stiffness(fine.frequency))
+    np.testing.assert_allclose(fine.position, expected, rtol=1e-9)

@@ -407,3 +407,12 @@ def test_gains_that_are_not_proven_are_told(
     told = capsys.readouterr().err
     for each in (*printed, 'The gains are not proven'):
         assert each in told
+
+
+def test_move_takes_half_of_slower_limits(arm):
+    slow = change(blf.load_loop(arm).controller, {'limits.velocity': [0.2, 0.4]})
+    made = move(slow, np.array(BEGIN), np.array([-2.0, 0.9]))
+    times = np.linspace(0.0, made.duration, 2001)
+    _, dq, _ = sampled(reference_of(made.config), times).transpose(1, 0, 2)
+    share = np.abs(dq).max(axis=0) / [0.2, 0.4]
+    assert share.max() == pytest.approx(0.5, rel=1e-3)

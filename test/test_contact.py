@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from paper_case import configured
@@ -16,6 +18,7 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.table import table
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError, TareError
@@ -28,6 +31,7 @@ from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.simulation.compiled_loop import CompiledLoop
 from blf_dsc_controller.simulation.loop import (
     new_record,
     run_alone,
@@ -401,3 +405,13 @@ def test_tare_without_external_torque_says_what_to_set():
         pytest.raises(TareError, match=r'set contact\.enabled'),
     ):
         controller.tare()
+
+
+@pytest.mark.parametrize(('reaction', 'perceives'), [('none', False), ('yield', True)])
+def test_unobserved_run_looks_for_contacts_if_the_law_reacts(reaction, perceives):
+    """Else it would learn from what touches the arm."""
+    given = {'contact.enabled': True, 'contact.reaction': reaction}
+    loop = load_loop('panda', {CONTROLLER: given})
+    compiled = CompiledLoop(controller_of(loop.controller), plant_of(loop.plant))
+    span = SimpleNamespace(observed=False)
+    assert compiled._of_law(span).perceives == perceives

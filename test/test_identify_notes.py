@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import re
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from friction_laws import with_friction
@@ -27,7 +30,11 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.foresight import foresee, foresight_lines
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.recording import joined
-from blf_dsc_controller.identification.summary import notes_of, problems_of
+from blf_dsc_controller.identification.summary import (
+    load_table,
+    notes_of,
+    problems_of,
+)
 from blf_dsc_controller.identification.values import base_matrix
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
@@ -208,3 +215,14 @@ def test_plan_without_torques_is_foreseen_and_nothing_written(tmp_path, capsys):
     assert 'columns of rank 48 for 48 base parameters' in capsys.readouterr().out
     assert main([*words, '--out', str(tmp_path / 'new.urdf')]) == 1
     assert 'which columns are tau' in capsys.readouterr().err
+
+
+def test_load_is_in_kilograms_and_its_centre_in_millimetres():
+    load = np.array([1.5, 0.01, -0.02, 0.1]), np.full(4, 0.001)  # kg, m
+    found = SimpleNamespace(picked_up=2.0, load=load, chain=SimpleNamespace(tip='hand'))
+    (text,) = load_table(found)
+    assert re.fullmatch(
+        r'load from 2\.0 s on: 1\.500 \+- 0\.002 kg, its centre at 10\.0 \+- 2, '
+        r'-20\.0 \+- 2, 100\.0 \+- 2 mm in hand',
+        text,
+    )

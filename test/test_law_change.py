@@ -299,3 +299,19 @@ def test_factor_of_the_window_is_that_of_its_regularised_matrix(parts):
     cholesky_factor(expected)
     upper = np.triu(parts.sliding.work.factor)
     np.testing.assert_allclose(upper, np.triu(expected), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('least', 'residual', 'expected'),
+    [
+        (0.0, 0.0, 1.0),  # no window has been full
+        (1e3, 0.0, 1.0),  # the configured floor is an upper limit
+        (0.0, 2.0, 2.0),
+    ],
+)
+def test_floor_is_what_is_configured_or_less(least, residual, expected):
+    """All in units of the configured floor."""
+    floor = LATCHES.residual_floor
+    found = excitation.explained(LATCHES, least * floor, residual * floor)
+    assert found == pytest.approx(expected * floor)
+    assert excitation.explained(LATCHES, 1e-6 * floor, 0.0) < floor

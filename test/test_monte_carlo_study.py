@@ -154,6 +154,11 @@ def test_values_are_as_frequent_as_stated():
             r'initial.error: .* above -1 and below 1',
         ),
         (
+            'uniform(-0.9, 0.9)',
+            'uniform(-0.9, 1.0)',
+            r'initial.error: .* above -1 and below 1',
+        ),
+        (
             'integers(0, 3)',
             'uniform(0.0, 3.0)',
             r'delay: got .*: integers\(low, high\), choice',
@@ -467,3 +472,11 @@ def test_state_of_one_run_does_not_leak_into_the_next(tmp_path, changes):
             np.testing.assert_array_equal(
                 values, whole_study[name][run : run + 1], err_msg=name
             )
+
+
+def test_only_the_first_law_of_a_pair_learns(tmp_path):
+    pairs = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true\n    still: true')
+    laws = study(tmp_path, LOOP + pairs).laws().values()
+    first, *others = (law.learning.weight for law in laws)
+    assert first > 0.0
+    assert others == [0.0, 0.0, 0.0]

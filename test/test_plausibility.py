@@ -181,3 +181,15 @@ def test_value_that_may_be_of_another_unit_is_named_before_the_start(given, word
     assert [text for text in found if re.match(words, text)], found
     usual = config_warnings(build(ControllerConfig, UR5E))
     assert not [text for text in usual if re.match(words, text)]
+
+
+def test_times_are_compared_with_the_slowest_joint():
+    slow = UR5E | {'limits.velocity': [0.1, *each(3.0)[1:]]}
+    limits = build(ControllerConfig, slow).limits
+    crossed = (limits.position_upper[0] - limits.position_lower[0]) / 0.1
+    for share, named in ((0.9, False), (1.1, True)):
+        given = slow | {'safety.state_timeout': share * crossed}
+        found = config_warnings(build(ControllerConfig, given))
+        assert (
+            any(text.startswith('safety.state_timeout: in') for text in found) == named
+        )

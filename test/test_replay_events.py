@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
+from types import SimpleNamespace
 
 import pytest
 import recorded_run
@@ -28,6 +29,7 @@ from blf_dsc_controller.messages.topics import (
 )
 from blf_dsc_controller.reference.retargeting import Target
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
+from blf_dsc_controller.replay import rerun
 from blf_dsc_controller.replay.verify import verify
 
 # Messages show neither a corrupted state of the law nor the end of a process.
@@ -422,3 +424,20 @@ def test_event_that_cannot_be_repeated_is_named(tmp_path, kind, content, words):
     entry[3] = event.encode()
     with pytest.raises(BlfDscError, match=rf'event {event.number} .* {words}'):
         rig.verify(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'own'),
+    [
+        ('start', True),
+        ('contact', True),
+        ('oscillation', True),
+        ('torque_sensors', True),
+        ('reset', False),
+        ('tare', False),
+        ('silence', False),
+    ],
+)
+def test_only_what_messages_show_is_decided_by_the_controller_itself(kind, own):
+    event = SimpleNamespace(type=rerun.EventType[kind.upper()], content={})
+    assert rerun._is_own(event) == own

@@ -307,6 +307,7 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
 
     def change(content):
         del content['parameters']['learning.anchor_weight']
+        content['parameters'].pop('insist', None)
 
     configured(entries, change)
     of(entries, MONITOR)[7][3] = None
@@ -314,6 +315,7 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
     missed, newer = verify(path).remarks
     assert missed == f'the recorder missed messages of {MONITOR.resolved}: 1 missed'
     assert 'before the law had learning.anchor_weight' in newer
+    assert 'insist' not in newer
     monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
     (remark,) = verify(bag).remarks
     assert 'recorded by version 0.1.0 and replayed by 9.9.9' in remark

@@ -26,9 +26,11 @@ from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import LatePlanError
 from blf_dsc_controller.supervision.retuning import apply, apply_bumpless
+from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.stop_cause import chatter_of
+from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 Q, DQ = np.array([0.3, -0.4]), np.array([0.5, -2.0])
@@ -726,3 +728,32 @@ def test_measurement_of_another_shape_is_rejected(shape):
     law = Guard(ControllerConfig()).controller
     with pytest.raises(BlfDscError, match=r'2 joints need \(6,\)'):
         law.update(0.0, 1e-3, np.zeros(shape))
+
+
+def test_each_stop_counts_the_time_anew_for_which_the_arm_is_faster():
+    """0.3 s is longer than 0.2 s; each stop says so once."""
+    speed = StopSpeed()
+    for at_stop in (0.0, 1.0):
+        speed.begin(at_stop)
+        faster = 2.0 * at_stop + 0.51
+        found = [speed.observe(faster, 0.1) for _ in range(4)]
+        assert found == [False, False, True, False]
+
+
+def test_load_known_at_the_stop_is_that_of_the_last_ramp():
+    ramp = SafeTorque(2)
+    for load in ([1.0, -2.0], [3.0, 0.5]):
+        ramp.begin_ramp(0.0, np.array(load))
+        ramp.load[:] = 9.0  # observed since
+        ramp.stop_observing()
+        np.testing.assert_array_equal(ramp.load, load)
+
+
+@pytest.mark.parametrize(('settled', 'expected'), [(5.0, 2.0), (1.0, 1.0)])
+def test_approach_is_over_once_another_reference_is_followed(settled, expected):
+    controller = controller_of(ControllerConfig())
+    reference = RunningReference(controller)
+    reference.start_stamp, reference.last_stamp = 0, 2000 * MILLISECOND
+    reference.settled = settled
+    reference.follow(controller.reference_vector)
+    assert reference.settled == pytest.approx(expected)
