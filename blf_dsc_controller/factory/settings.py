@@ -393,31 +393,44 @@ def _weighing(
     )
     if not config.learning.weighing:
         return settings
+    loaded, D = _loaded_parameters(config)
+    p = len(loaded)
+    changed = _changed_friction(learned)
+    since = weighing.LOAD + changed.shape[1]
+    columns = np.zeros((p + len(learned) + 2 * n + 1, since))
+    columns[:p, : weighing.LOAD] = loaded
+    columns[p:, weighing.LOAD :][: len(learned)] = changed
+    scale = np.zeros((4, since))
+    scale[:, : weighing.LOAD] = D[:4]
+    return settings._replace(
+        size=len(columns),
+        inertial=p,
+        since=since,
+        unknowns=len(columns) - 1 + since,
+        breakaway=_unsure_breakaway(config) ** -2.0,
+        columns=columns,
+        scale=scale,
+    )
+
+
+def _loaded_parameters(config: ControllerConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return N D and D: base parameters (p, 10) and load phi (10, 10) by its deviations z."""
     robot = config.robot
     chain = robot.chain(config.joints)
     D = deviations(payload_inertia(max(robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE)
     T = chain.tip_placement
     K = parameters_of(robot, chain).K[:, -(ROTOR + 1) : -1]
     moves = [inertia_of(moved(pseudo_inertia(direction), T)) for direction in D.T]
-    changed = _changed_friction(learned)
-    since = weighing.LOAD + changed.shape[1]
-    columns = np.zeros((len(K) + len(learned) + 2 * n + 1, since))
-    columns[: len(K), : weighing.LOAD] = product(K, np.transpose(moves))
-    columns[len(K) :, weighing.LOAD :][: len(learned)] = changed
-    scale = np.zeros((4, since))
-    scale[:, : weighing.LOAD] = D[:4]
-    known = np.array(robot.friction(chain)['coulomb'])
-    usual = FRICTION * np.array(config.torque.limit)
-    unsure = _BREAKAWAY * np.where(known > 0.0, known, usual)
-    return settings._replace(
-        size=len(columns),
-        inertial=len(K),
-        since=since,
-        unknowns=len(columns) - 1 + since,
-        breakaway=unsure**-2.0,
-        columns=columns,
-        scale=scale,
+    return product(K, np.transpose(moves)), D
+
+
+def _unsure_breakaway(config: ControllerConfig) -> np.ndarray:
+    """Return the standard deviation (n,) [N m] of what friction has more at breakaway."""
+    known = np.array(
+        config.robot.friction(config.robot.chain(config.joints))['coulomb']
     )
+    usual = FRICTION * np.array(config.torque.limit)
+    return np.asarray(_BREAKAWAY * np.where(known > 0.0, known, usual))
 
 
 def _changed_friction(learned: Sequence[Column]) -> np.ndarray:
