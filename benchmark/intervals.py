@@ -7,10 +7,11 @@
 The arms are those of `identification.py arms`.  Each moves for 20 s, and for 20 s with a load of
 1 to 3 kg whose centre is up to 5 cm from the tip; states are recorded at 100 Hz.  A row has one
 kind of truth, which is random for each joint: laws of friction of `test/friction_laws.py`, gears
-that give way behind encoders at the motors (100 to 500 N m/rad per N m of the joint's limit), and
-gains of the torque sensors that are up to 20 % off.  A cell has the share of intervals that hold
-the truth, and their median half width: of base parameters relative to what the URDF leaves open,
-of the others relative to the value.
+that give way behind encoders at the motors (100 to 500 N m/rad per N m of the joint's limit),
+gains of the torque sensors that are up to 20 % off, and positions in steps of 0.38 mrad, as in
+the frames of Damiao's motors.  A cell has the share of intervals that hold the truth, and their
+median half width: of base parameters relative to what the URDF leaves open, of the others
+relative to the value.
 """
 
 from __future__ import annotations
@@ -47,6 +48,9 @@ from blf_dsc_controller.run import Floats
 
 _SECONDS = 20.0  # of each motion
 _EVERY = 10  # samples of 1 ms
+_COARSE = 25.0 / (
+    2**16 - 1
+)  # rad: 16 bits over 25 rad, as in the frames of Damiao's motors
 _COLUMNS = ('base parameters', 'viscous', 'Coulomb friction', 'rotors', 'payload')
 
 
@@ -57,6 +61,7 @@ class Kind(NamedTuple):
     every: int = _EVERY
     is_elastic: bool = False
     gain: float = 0.0  # largest relative error
+    encoder: float = 2.0 * np.pi / 2**20  # rad
 
 
 KINDS = {
@@ -69,6 +74,8 @@ KINDS = {
     'load-dependent friction': Kind('load'),
     'elastic joints': Kind(is_elastic=True),
     'gains': Kind(gain=0.2),
+    'coarse encoders': Kind(encoder=_COARSE),
+    'coarse, elastic': Kind(is_elastic=True, encoder=_COARSE),
 }
 """Rows of the table."""
 
@@ -133,7 +140,7 @@ class Arm:
             friction = self.truth.viscous, self.truth.coulomb
             states = with_friction(kind.law, motion, *friction, self._seed)
             states[:, 2] *= 1.0 + kind.gain * self._gain
-            seen = measured(states, self._seed + 77 * k)[:: kind.every]
+            seen = measured(states, self._seed + 77 * k, kind.encoder)[:: kind.every]
             period = kind.every * PERIOD
             recordings.append(recording_of(seen, self._joints, period))
         together, (boundary,) = joined(*recordings)

@@ -127,6 +127,12 @@ def test_what_cannot_be_done_is_refused_with_the_reason_and_the_arm_holds(arm):
         arm.stream([np.nan] * 7)
     with pytest.raises(DriveError, match='speed: got 1'):
         arm.move_to(before, speed=1.5)
+    for wrong in ('home', [[0.1, 0.2], [0.3]], {'elbow': 0.1}):
+        with pytest.raises(DriveError, match='7 finite values are needed'):
+            arm.move_to(wrong)
+    for wrong in ([1.0, 2.0], [('now', [0.1] * 7)], 1.0):
+        with pytest.raises(DriveError, match='must be a time and positions'):
+            arm.follow(wrong)
     with pytest.raises(DriveError, match='points: got none'):
         arm.follow([])
     with pytest.raises(MotionFailedError, match=r"panda_joint\d' would be .* rad"):

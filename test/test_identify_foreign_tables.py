@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
+from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
@@ -13,9 +15,11 @@ from random_arm import PANDA, PANDA_TEXT, UR5E, UR5E_TEXT
 from scipy.io import savemat
 
 from blf_dsc_controller.bags.content import NameMap
+from blf_dsc_controller.bags.sources import next_record
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_table import read_table
+from blf_dsc_controller.identification.reading import read_recording
 
 PERIOD = 0.01  # s
 TIME = np.arange(300) * PERIOD
@@ -405,3 +409,92 @@ def test_damaged_arrays_are_refused_in_one_line(tmp_path, suffix):
             messages.append(str(error))
     assert len(messages) > 30
     assert '\n' not in ''.join(messages)
+
+
+@pytest.mark.parametrize('number', ['1.234,5', '1,234.5', '1 234,5', '-12.345.678,9'])
+@pytest.mark.parametrize('row', [0, 150])
+def test_separators_of_thousands_are_refused_and_not_taken_for_gaps(
+    tmp_path, number, row
+):
+    path = written(
+        tmp_path / 'a.csv', ['t', *numbered('q'), *numbered('tau')], (TIME, Q, TAU), ';'
+    )
+    lines = path.read_text().splitlines()
+    cells = lines[1 + row].split(';')
+    lines[1 + row] = ';'.join([*cells[:-1], number])
+    path.write_text('\n'.join(lines))
+    assert f'line {2 + row}: {number!r} has a separator of thousands' in refused(path)
+
+
+@pytest.mark.parametrize('which', ['names', 'numbers', 'both'])
+def test_separators_at_the_ends_of_lines_are_no_columns(tmp_path, which):
+    path = written(
+        tmp_path / 'a.csv', ['t', *numbered('q'), *numbered('tau')], (TIME, Q, TAU)
+    )
+    names, *rows = path.read_text().splitlines()
+    ends = [',' if which != 'numbers' else '', ',' if which != 'names' else '']
+    path.write_text('\n'.join([names + ends[0], *(row + ends[1] for row in rows)]))
+    is_read(path)
+
+
+def test_time_in_minutes_is_not_read_as_seconds(tmp_path):
+    names = ['time [min]', *numbered('q'), *numbered('tau')]
+    is_read(written(tmp_path / 'a.csv', names, (TIME / 60.0, Q, TAU)))
+
+
+def test_minus_of_typesetting_is_no_gap(tmp_path):
+    path = tmp_path / 'a.csv'
+    names = ['t', *numbered('q'), *numbered('tau')]
+    written(path, names, (TIME, Q, TAU))
+    path.write_text(path.read_text().replace('-', '\u2212'), encoding='utf-8')
+    is_read(path)
+
+
+def test_a_row_for_each_joint_is_refused(tmp_path):
+    """It has one column of positions, and would be an arm of one joint."""
+    stamps = np.repeat(TIME, 6)
+    path = written(
+        tmp_path / 'a.csv', ['t', 'q', 'tau'], (stamps, Q.ravel(), TAU.ravel())
+    )
+    assert 'is there one for each joint?' in refused(path)
+    columns = [np.repeat(values, 2, axis=0) for values in (TIME, Q, TAU)]
+    names = ['t', *numbered('q'), *numbered('tau')]
+    is_read(written(path, names, columns))  # the same rows twice are no fault
+
+
+@pytest.mark.parametrize('rate', ['0Hz', '1.2.3Hz'])
+def test_rate_that_is_none_is_refused(tmp_path, rate):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
+    assert 'time' in refused(path, f'time={rate}')
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'words'),
+    [
+        ('a.csv', b'\x1f\x8b\x08 packed', 'is gzip, not text: unpack it'),
+        ('a.csv', b'PK\x03\x04 packed', 'is a zip archive or a spreadsheet'),
+        ('a.csv.gz', b'\x1f\x8b\x08 packed', 'got .gz, but bags and tables end with'),
+        ('a.npy', b'\x93NUMPY', 'got .npy, but bags and tables end with'),
+        ('folder/a.csv', b't\n1\n', 'is a folder of tables: give the files, as'),
+    ],
+)
+def test_files_of_another_kind_are_refused_by_what_they_are(
+    tmp_path, name, content, words
+):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+    given = path.parent if path.parent != tmp_path else path
+    with pytest.raises(BlfDscError, match=re.escape(words)):
+        read_recording(given, UR5E_TEXT)
+
+
+def test_name_that_no_file_can_have_is_refused(tmp_path):
+    assert 'File name too long' in refused(tmp_path / ('a' * 300 + '.csv'))
+
+
+def test_hole_in_a_bag_is_no_record():
+    """Nine zeros would be a record without content: two gigabytes are read for hours."""
+    with pytest.raises(ValueError, match='zeros instead of a record'):
+        next_record(BytesIO(bytes(100)), 100, {})

@@ -142,6 +142,8 @@ def next_record(stream: BinaryIO, size: int, kinds: Mapping[int, Any]) -> Any:
     opcode, length = HEAD.unpack(head)
     if stream.tell() + length > size:
         raise ValueError('cut off')
+    if opcode == 0:  # of a hole in the file: each is a record without content
+        raise ValueError('zeros instead of a record')
     if length > LARGEST and (opcode == Opcode.MESSAGE or opcode in kinds):
         raise ValueError(f'a record has {length} bytes')
     if opcode == Opcode.MESSAGE:

@@ -161,10 +161,15 @@ class Drive:
         Raises:
             MotionFailedError, NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        given = [
-            [float(time), *(np.asarray(each, float).tolist() for each in values)]
-            for time, *values in points
-        ]
+        try:
+            given = [
+                [float(time), *(np.asarray(each, float).tolist() for each in values)]
+                for time, *values in points
+            ]
+        except (TypeError, ValueError) as error:
+            raise DriveError(
+                f'points: {error}; each must be a time and positions, as in (1.0, [0.1, 0.2])'
+            ) from error
         if not given:
             raise DriveError('points: got none; stop() brakes the arm')
         wanted = {'points': given, 'joints': list(joints or self.joints)}
@@ -476,8 +481,14 @@ class Drive:
     # What the script wants.
 
     def _checked(self, positions: ArrayLike) -> np.ndarray:
-        values = np.asarray(positions, float)
         n = len(self.joints)
+        try:
+            values = np.asarray(positions, float)
+        except (TypeError, ValueError):  # text, names, lists of different lengths
+            raise DriveError(
+                f'positions: got {positions!r}, but {n} finite values are needed, one for each of '
+                f'{", ".join(self.joints)}'
+            ) from None
         if values.shape != (n,) or not np.isfinite(values).all():
             raise DriveError(
                 f'positions: got {values.tolist()}, but {n} finite values are needed, one for '

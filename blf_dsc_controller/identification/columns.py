@@ -38,7 +38,7 @@ _RATES = {'dot', 'ddot', 'vel', 'velocity', 'speed', 'acc', 'acceleration'}
 _SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
 _NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
 _SHOWN = 60  # names of columns in a message
-_RATE = re.compile(r'([\d.]+)\s*Hz', re.IGNORECASE)
+_RATE = re.compile(r'(\d*\.?\d+|\d+\.)\s*Hz', re.IGNORECASE)
 _RANGE = re.compile(r'(\d+):(\d+)')
 _NUMBER = re.compile(r'\d+')
 
@@ -104,6 +104,10 @@ def choose_columns(
     words = set().union(*(_meaning(name, joints) for name in tau))
     units = [_unit_of(name, 'tau', given['tau']) for name in tau]
     rate = _RATE.fullmatch(given['time'])
+    if rate and not float(rate[1]):
+        raise BlfDscError(
+            f'--map time={given["time"]}: the rate of the rows must be above 0'
+        )
     return Columns(
         time=[] if rate else _time(path, names, given['time']),
         rate=float(rate[1]) if rate else 0.0,

@@ -74,6 +74,7 @@ def read_table(
         )
     time, q, tau, theta = _values(path, table, columns)
     q[~np.isfinite(time)] = np.nan
+    _check_rows(path, time, q)
     stamp, runs = _one_clock(path, time)
     source = f'{path.name}: {columns.text}'
     if runs > 1:
@@ -82,6 +83,17 @@ def read_table(
     turning = tree.turning(arm[:n])
     recording = resampled(arm[:n], stamp, q, tau, source, turning, motors)
     return recording._replace(currents=columns.has_currents)
+
+
+def _check_rows(path: Path, time: Floats, q: Floats) -> None:
+    """Raise BlfDscError if most rows have the time of others, at other positions."""
+    same = np.diff(time) == 0.0
+    moved = same & (np.diff(q, axis=0) != 0.0).any(axis=1)
+    if 2 * moved.sum() > time.size:
+        raise BlfDscError(
+            f'{path}: {moved.sum()} rows have the time of the row before, but other positions. '
+            'A row must have all joints at a time: is there one for each joint?'
+        )
 
 
 def _values(

@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_bag import read_bag
 from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.table_files import TABLES
+
+_BAGS = ('.mcap', '.db3', '.bag', '.yaml')
 
 
 def read_recording(
@@ -34,4 +37,20 @@ def read_recording(
     """
     if path.suffix.lower() in TABLES:
         return read_table(path, text, joints, names, planned=planned)
+    _check_file(path)
     return read_bag(path, text, joints, namespace, names, commanded)
+
+
+def _check_file(path: Path) -> None:
+    """Raise BlfDscError if this is neither a table nor what may be a bag."""
+    if path.is_file() and path.suffix.lower() not in _BAGS:
+        raise BlfDscError(
+            f'{path}: got {path.suffix or "no suffix"}, but bags and tables end with '
+            f'{", ".join((*_BAGS[:-1], *TABLES))}: unpack it, or write it as CSV'
+        )
+    if path.is_dir() and not any(path.glob('*.yaml')):
+        tables = sorted(each for each in path.iterdir() if each.suffix in TABLES)
+        if tables:
+            raise BlfDscError(
+                f'{path} is a folder of tables: give the files, as {tables[0]}'
+            )

@@ -48,7 +48,11 @@ _LEFT_OUT = (
     'joints that give way behind their encoders',
 )  # of KINDS
 _REMEDIES = {
-    'gain': ', but not for an error that all gains have in common: check them',
+    'gain': (
+        ', but hold less often than they say. MASSES AND FRICTION ARE KNOWN UP TO THESE GAINS '
+        'ONLY: what all gains have in common cannot be known from torques. Calibrate the sensors, '
+        'as with a known weight'
+    ),
     'elasticity': '; positions of motors and links, --map theta=, would show their stiffness',
 }
 

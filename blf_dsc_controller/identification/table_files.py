@@ -50,16 +50,21 @@ def open_table(path: Path) -> Table:
     Raises:
         BlfDscError: it cannot be read as such.
     """
-    if path.exists() and not path.is_file():
-        raise BlfDscError(f'{path} is not a regular file, so it is no table')
     suffix = path.suffix.lower()
     try:
+        _check_regular(path)
         return _TABLES[suffix](path)
     except BlfDscError:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
         reason = ' '.join(str(error).split()) or type(error).__name__
         raise BlfDscError(f'{path} cannot be read as {suffix[1:]}: {reason}') from error
+
+
+def _check_regular(path: Path) -> None:
+    """Raise BlfDscError if there is something else than a file."""
+    if path.exists() and not path.is_file():
+        raise BlfDscError(f'{path} is not a regular file, so it is no table')
 
 
 class _Arrays:

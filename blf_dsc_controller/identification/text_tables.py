@@ -30,8 +30,22 @@ _HEAD = 200  # lines, in which the numbers begin
 _LONGEST = 1 << 20  # characters of a line
 _BLOCK = 4096  # lines that are read at once
 _DECIMAL_COMMA = re.compile(r'[+-]?\d*,\d+(?:[eE][+-]?\d+)?')
+# 1.234,5 or 1,234.5 or 1 234,5, where a number must not be taken for a smaller one
+_GROUPED = re.compile(
+    r"""[+-]?\d{1,3}(?:([., '’\u00a0\u202f])\d{3})(?:\1\d{3})*[.,]\d+"""
+)
+_PACKED = {
+    b'\x1f\x8b': 'gzip',
+    b'PK\x03\x04': 'a zip archive or a spreadsheet',
+    b'BZh': 'bzip2',
+    b'\xfd7zXZ': 'xz',
+    b'\x28\xb5\x2f\xfd': 'zstandard',
+    b'\x89HDF': 'HDF5',
+    b'PAR1': 'parquet',
+}
 _NUMBERED = re.compile(r'(.*)name\D?\d+\D?')
 _FIELDS = ('position', 'velocity', 'effort')
+_MINUS = '\u2212'  # of typesetting
 _STAMP = 2  # cells of the stamp in `ros2 topic echo --csv`
 
 
@@ -111,6 +125,7 @@ class _Layout(NamedTuple):
         for number, line in block:
             cells = self.cells(line)
             if len(cells) == width:
+                _check_groups(path, number, [cells[k] for k in at])
                 found.append([self.number(cells[k]) for k in at])
             elif number != block[-1][0]:  # a file may end within a line
                 raise BlfDscError(
@@ -124,6 +139,16 @@ class _Layout(NamedTuple):
         return text if self.delimiter == ',' else text.replace(',', '.')
 
 
+def _check_groups(path: Path, number: int, cells: Sequence[str]) -> None:
+    """Raise BlfDscError if numbers of a line have separators of thousands."""
+    grouped = next(filter(_GROUPED.fullmatch, cells), None)
+    if grouped:
+        raise BlfDscError(
+            f'{path}, line {number}: {grouped!r} has a separator of thousands: write numbers '
+            'without it'
+        )
+
+
 def text_table(path: Path) -> TextTable:
     """Return a table in a text file.
 
@@ -134,6 +159,8 @@ def text_table(path: Path) -> TextTable:
         head = list(islice(_lines(stream, path), _HEAD))
     first = next((k for k, line in enumerate(head) if _has_numbers(line)), None)
     if first is None:
+        for number, line in enumerate(head, 1):
+            _check_groups(path, number, _layout_of(line).cells(line))
         raise BlfDscError(
             f'{path} has no numbers in its first {len(head)} lines, so it is no table: a '
             'row begins with a number, and dates and lists in cells are not read'
@@ -152,7 +179,13 @@ def _opened(path: Path) -> TextIO:
         raise BlfDscError(f'{path} is not a regular file, so it is no table')
     try:
         with path.open('rb') as raw:
-            encoding = _encoding_of(raw.read(_LONGEST))
+            begin = raw.read(_LONGEST)
+        packed = next((_PACKED[each] for each in _PACKED if begin.startswith(each)), '')
+        if packed:
+            raise BlfDscError(
+                f'{path} is {packed}, not text: unpack it, or write it as CSV'
+            )
+        encoding = _encoding_of(begin)
         return path.open(encoding=encoding)
     except OSError as error:
         raise BlfDscError(f'{path} cannot be read: {error}') from error
@@ -175,7 +208,7 @@ def _lines(stream: TextIO, path: Path) -> Iterator[str]:
         while line := stream.readline(_LONGEST):
             if len(line) == _LONGEST:
                 raise BlfDscError(f'{path} has a line of a million characters or more')
-            yield line.rstrip('\n')
+            yield line.rstrip('\n').replace(_MINUS, '-')
     except ValueError as error:
         raise BlfDscError(f'{path} cannot be read as text: {error}') from error
 
@@ -218,6 +251,11 @@ def _header(before: Sequence[str], layout: _Layout, cells: Sequence[str]) -> lis
         if not line.strip():
             continue
         words = layout.cells(line.lstrip('#% \t'))
+        # a separator may end the lines of the numbers only, or of the names only
+        if len(words) == len(cells) - 1 and not cells[-1]:
+            words.append('')
+        elif len(words) == len(cells) + 1 and not words[-1]:
+            words.pop()
         if len(words) != len(cells):
             break
         fitting.insert(0, [word.strip('"') for word in words])

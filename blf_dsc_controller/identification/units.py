@@ -15,6 +15,8 @@ _TIME = {
     **dict.fromkeys(('us', 'usec', 'microsecond', 'microseconds'), 1e-6),
     **dict.fromkeys(('ns', 'nsec', 'nsecs', 'nanosec', 'nanosecs'), 1e-9),
     **dict.fromkeys(('nanosecond', 'nanoseconds'), 1e-9),
+    **dict.fromkeys(('min', 'mins', 'minute', 'minutes'), 60.0),
+    **dict.fromkeys(('h', 'hr', 'hour', 'hours'), 3600.0),
 }
 _POSITION = {
     **dict.fromkeys(('rad', 'radian', 'radians', 'm'), 1.0),
@@ -37,7 +39,7 @@ _CURRENT = {
 }
 _OF = {'time': _TIME, 'q': _POSITION, 'tau': {**_TORQUE, **_CURRENT}}
 _EXPECTED = {
-    'time': 's, ms, us or ns',
+    'time': 's, ms, us, ns, min or h',
     'q': 'rad, mrad, deg, rev (or m, cm, mm)',
     'tau': 'N m, N cm, N mm, kN m (or N, kN), or A, mA or % with --gains',
 }

@@ -11,6 +11,9 @@ The covariance is that of the wider model, and what it adds to the values, d:
     (I + sum_i A_i^T A_i / l_i)^-1 + d d^T
 
 with the rows A_i of each joint, of which one in a correlation length l_i counts.
+
+A gain of a joint's torque multiplies all its values, so that the model is not linear in
+both.  It is linearised about the last solution, again and again.
 """
 
 from __future__ import annotations
@@ -29,13 +32,15 @@ from blf_dsc_controller.identification.regression import (
     correlation_length,
     to_z,
 )
-from blf_dsc_controller.identification.windows import HOP
+from blf_dsc_controller.identification.windows import HOP, Indices
 from blf_dsc_controller.run import Floats
 
 _FIRST = 0.3  # size of each kind, at first
 _LEAST = 1e-5  # size of each kind, at last
 _ROUNDS = 5  # of residuals ...
-_STEPS = 3  # ... and in each, of sizes
+_MOST_ROUNDS = 10  # ... if gains still change ...
+_AGREE = 0.01  # ... by more than this
+_STEPS = 3  # in each, of sizes
 _FLOOR = 1e-4  # of a joint's torque, least residual
 
 
@@ -60,20 +65,40 @@ def doubt(problem: Problem, prior: Prior, fit: Fit, distances: Floats) -> Doubt:
     # the size of what the model has is that of its prior
     sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
     narrow, _ = _solved(products, (kinds == len(KINDS)) * 1.0, deviation**2)
-    to_rest = np.eye(len(products[0]))
-    to_rest[:-1, -1] = -narrow
-    products = to_rest.T @ products @ to_rest
-    for _ in range(_ROUNDS):
+    of_gains = k + np.flatnonzero(columns.kind == KINDS.index('gain'))
+    z = np.zeros(narrow.size)
+    for turn in range(_MOST_ROUNDS):
+        about = _linearised(narrow, z, k, of_gains)
+        before = z[of_gains]
+        linear = np.swapaxes(about, 1, 2) @ products @ about
         for _ in range(_STEPS):
-            z, H = _solved(products, sizes[kinds], deviation**2 * lengths)
+            z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
             sizes[:-1] = _sizes(kinds, z, H, sizes)
-        blocks = _blocks(problem, prior, fit, columns)
-        left = np.concatenate([each @ np.append(narrow + z, -1.0) for each in blocks])
+        left = _left(problem, prior, fit, columns, about @ np.append(z, -1.0))
         deviation, lengths = _residual(problem, prior, fit, left)
-    z, H = _solved(products, sizes[kinds], deviation**2 * lengths)
+        change = np.abs(z[of_gains] - before).max()
+        if turn >= _ROUNDS - 1 and change < _AGREE:
+            break
+    z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
     d = prior.D @ z[:k]
     covariance = prior.D @ H[:k, :k] @ prior.D.T + np.outer(d, d)
     return Doubt(covariance, _torques(problem, columns, z[k:]))
+
+
+def _linearised(narrow: Floats, z: Floats, k: int, of_gains: Indices) -> Floats:
+    """Return T (n, c, c): columns of each joint, times T, are linear about the solution z.
+
+    They are of k values relative to `narrow`, and of what is left out, which has gains:
+    the torque over the gain of joint i is (1 + gain) A_i z.
+    """
+    size = narrow.size + 1
+    T = np.tile(np.eye(size), (of_gains.size, 1, 1))
+    T[:, :-1, -1] = -narrow
+    for at, own in zip(of_gains, T, strict=True):
+        own[:k, :k] *= 1.0 + z[at]
+        own[:k, at] = z[:k]
+        own[:k, -1] += z[at] * z[:k]
+    return T
 
 
 def _blocks(
@@ -89,6 +114,14 @@ def _blocks(
         A, b = np.split(own @ T, (prior.mean.size,), axis=2)
         others = rows.weight[windows][:, :, None] * columns.matrix(windows)
         yield np.concatenate((A, others, b), axis=2)
+
+
+def _left(
+    problem: Problem, prior: Prior, fit: Fit, columns: LeftOut, weights: Floats
+) -> Floats:
+    """Return the sums (., n) of the columns of `_blocks`, times the weights (n, c)."""
+    blocks = _blocks(problem, prior, fit, columns)
+    return np.concatenate([np.einsum('kic,ic->ki', each, weights) for each in blocks])
 
 
 def _products(blocks: Iterator[Floats]) -> Floats:
