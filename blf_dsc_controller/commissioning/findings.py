@@ -105,12 +105,12 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
 
 
 def rubs(response: Response, damping: Floats) -> bool:
-    """Whether friction hides the inertia of a joint, or damps it more than its gains do.
+    """Whether friction damps a joint more than its gains do.
 
     Those with which it was measured have `damping` (n,) [N m s/rad].
     """
-    inertia, found, _ = _rigid_fit(response, _resonances(response, 0))
-    return bool((_is_hidden(inertia, found) | (found > damping)).any())
+    _, found, _ = _rigid_fit(response, _resonances(response, 0))
+    return bool((found > damping).any())
 
 
 def _is_hidden(inertia: Floats, damping: Floats) -> NDArray[np.bool_]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commissioning of a robot from posture to posture: slowly to each, and the motion there.
 
-    rest -> move -> rest -> motion -> rest      for each posture, and the motion once more if
-                                                noise or friction hide much, twice
+    rest -> move -> rest -> motion -> rest      for each posture, and the motion again, up to
+                                                twice, if noise or friction hide much
 
 Moves and motions are runs that end at rest whatever happens, and have a bag each.  A motion
 is around the posture in which the arm rests by then, so it begins without an error.
