@@ -4,8 +4,10 @@
 They are k = lambda w, with the largest lambda for which the tool keeps its bound at
 every posture.  w are the errors to expect of the joints: a loop whose gains follow from
 the arm turns a torque d that its model lacks into errors in proportion to M^-1 d, with
-friction and the residual floor in d, or the weight of the rated payload.  So all joints
-use about the same part of their bounds, which leaves the most room.
+friction and the residual floor in d, or the weight of the rated payload.  Where each
+joint has a stiffness of its own, it is d over that, with the torque of a payload that
+moves: a first joint bears no weight, but a load that is accelerated.  So all joints use
+about the same part of their bounds, which leaves the most room.
 """
 
 from __future__ import annotations
@@ -81,7 +83,10 @@ def joint_bounds(
     )
     region = _region(values, n) or (lower, upper)
     stiffness = _stiffness(values)
-    expected = _expected(base, P0, robot.payload, unmodelled, stiffness, *region)
+    acceleration = tuple(values['limits.acceleration']) if stiffness else (0.0,) * n
+    expected = _expected(
+        base, P0, robot.payload, unmodelled, stiffness, acceleration, *region
+    )
     k = _scaled(
         _tool(chain, lower, upper),
         np.array(expected),
@@ -130,18 +135,21 @@ def _expected(
     payload: float,
     unmodelled: tuple[float, ...],
     stiffness: tuple[float, ...],
+    acceleration: tuple[float, ...],
     lower: tuple[float, ...],
     upper: tuple[float, ...],
 ) -> tuple[float, ...]:
-    """Return w (n,), the largest |M^-1 d|, or |d| over a stiffness, between two postures."""
+    """Return w (n,), the largest |M^-1 d|, or |d| over a stiffness, between two postures.
+
+    `acceleration` (n,) [rad/s^2] is the largest with which the payload is moved.
+    """
     n = len(unmodelled)
     random = np.random.default_rng(0)
     q = random.uniform(lower, np.maximum(lower, upper), (_POSTURES, n))
     load = payload * base.load
     zero = np.zeros_like(q)
-    weight = product(
-        regressors_at(base.model, q, zero, zero, zero), load[:, np.newaxis]
-    )
+    ddq = random.uniform(-1.0, 1.0, q.shape) * np.array(acceleration)
+    weight = product(regressors_at(base.model, q, zero, zero, ddq), load[:, np.newaxis])
     friction = np.broadcast_to(np.array(unmodelled)[:, np.newaxis], weight.shape)
     found = np.zeros(n)
     for P, d in ((np.array(P0), friction), (np.array(P0) + load, weight)):
