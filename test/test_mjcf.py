@@ -316,6 +316,21 @@ def arm(**parts):
     return ARM.format(**{'upper': '', 'lower': '', 'beyond': '', 'more': ''} | parts)
 
 
+def test_dynamics_of_joints_are_their_own_behind_a_free_body(tmp_path):
+    """It has one joint, but six degrees of freedom."""
+    ball = (
+        '<body name="ball"><freejoint/>'
+        '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body>'
+    )
+    path = tmp_path / 'arm.xml'
+    text = arm(lower='frictionloss="0.7" damping="0.9" armature="0.3"')
+    path.write_text(text.replace('<worldbody>', f'<worldbody>{ball}'))
+    robot, chain = robot_of({'robot.urdf': str(path), 'robot.tip': 'tool'})
+    assert [each.friction for each in chain.joints] == [0.2, 0.7]
+    assert [each.damping for each in chain.joints] == [0.5, 0.9]
+    assert tuple(robot.rotors(chain)) == (0.1, 0.3)
+
+
 @pytest.mark.parametrize(
     ('parts', 'effort'),
     [

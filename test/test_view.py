@@ -343,6 +343,8 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     ros.until(lambda: view.past and view.past[-1].time > 7.5)
     assert view.past[-1].felt_at is None
     assert np.isfinite(view.past[-1].external).all()
+    assert len(events_with(view, 'latched')) == 1
+    assert not events_with(view, 'restarts')
     assert contact_status().message == 'nothing touches the arm'
     assert values(contact_status())['contacts'] == '0'
     ros.until(lambda: view.past[-1].touched)
