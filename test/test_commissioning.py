@@ -35,7 +35,7 @@ from blf_dsc_controller.commissioning.response import (
     refined,
     response_of,
 )
-from blf_dsc_controller.commissioning.strength import MOST, strength
+from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import load_loop, read
@@ -708,15 +708,15 @@ def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
     commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=0.05)
     (weak,) = commissioning.motions
     clear = simulated.measured(weak, ARM)
-    assert strength(*clear) == 1.0
+    assert shown_by(*clear).factor == 1.0
     assert commissioning.stronger(weak, clear[0]) is None
     run = simulated.measured(weak, coarse(5e-5))
-    factor = strength(*run)
+    factor = shown_by(*run).factor
     assert 2.0 < factor < MOST
     again = commissioning.stronger(weak, run[0])
     shares = again.excitation.amplitude / weak.excitation.amplitude
     np.testing.assert_allclose(shares[:, :-2], factor, rtol=1e-9)
-    assert strength(*simulated.measured(again, coarse(5e-5))) == 1.0
+    assert shown_by(*simulated.measured(again, coarse(5e-5))).factor == 1.0
 
 
 def coarse(resolution):
@@ -741,7 +741,7 @@ def test_a_posture_is_measured_twice_at_most_and_motion_that_is_hidden_is_an_err
     commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=1e-5)
     (weak,) = commissioning.motions
     hidden = simulated.measured(weak, coarse(1e-4))
-    assert strength(*hidden) == MOST
+    assert shown_by(*hidden).factor == MOST
     again = commissioning.stronger(weak, hidden[0])
     assert again.excitation.travel <= 1e-5
     still = simulated.measured(again, coarse(1e-4))

@@ -23,7 +23,7 @@ from blf_dsc_controller.commissioning.commissioning import (
     postures_of,
 )
 from blf_dsc_controller.commissioning.motion import SLOW_TONES
-from blf_dsc_controller.commissioning.strength import rubs_in, strength
+from blf_dsc_controller.commissioning.strength import shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.run import Run
@@ -134,13 +134,13 @@ class Commissioning:
         Raises:
             BlfDscError: the run does not show the response.
         """
-        factor = strength(run, motion.config)
         slid = motion.excitation.sliding
-        sliding = slid or rubs_in(run, motion.config)
-        if factor == 1.0 and sliding == slid:
+        shown = shown_by(run, motion.config)
+        sliding = slid or shown.rubs
+        if shown.factor == 1.0 and sliding == slid:
             return None
         around = motion.posture if posture is None else posture
-        again = self._motion(around, factor * self._torque, sliding=sliding)
+        again = self._motion(around, shown.factor * self._torque, sliding=sliding)
         if sliding != slid:
             return again
         before, after = (each.excitation.amplitude for each in (motion, again))

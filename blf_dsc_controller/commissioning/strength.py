@@ -10,6 +10,8 @@ sticks shows its friction, of which a steady motion has none.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from blf_dsc_controller.arms.model import inertia_matrices
@@ -28,33 +30,31 @@ LITTLE = 0.1
 """Of the modulus margin, that noise may take."""
 
 
-def strength(run: Run, config: ControllerConfig) -> float:
-    """Return the factor, from 1 to `MOST`, on the torque of a motion that hides little.
+class Shown(NamedTuple):
+    """What a run of a motion shows through noise and friction."""
+
+    factor: float  # from 1 to `MOST`, on the torque of a motion that hides little
+    rubs: bool  # friction damps a joint more than its gains do
+
+
+def shown_by(run: Run, config: ControllerConfig) -> Shown:
+    """Return what a run of a motion shows.
 
     Raises BlfDscError if it is no whole run of the motion.
     """
     try:
         response = response_of(run, lines_in(config), config.sample_time)
     except HiddenError:
-        return MOST
+        return Shown(MOST, rubs=False)
     arm, _ = design_of(config)
     P = arm.parameters.of(arm.chain.inertias, arm.rotors)
     (M,) = inertia_matrices(arm.parameters.model, P, response.posture[None])
+    gains = measuring_gains(arm)
     loops = Loops((response,), np.diagonal(M), config.sample_time)
-    ((value, doubt),) = loops.singular_values(measuring_gains(arm))
+    ((value, doubt),) = loops.singular_values(gains)
     counted = response.seen & (response.frequency >= SLOWEST)
     taken = value[counted].min() - (value - doubt)[counted].min()
-    return float(np.clip(taken / LITTLE, 1.0, MOST))
-
-
-def rubs_in(run: Run, config: ControllerConfig) -> bool:
-    """Whether friction damps a joint more than its gains do in a run of a motion.
-
-    Raises BlfDscError if it is no whole run of the motion.
-    """
-    try:
-        response = response_of(run, lines_in(config), config.sample_time)
-    except HiddenError:
-        return False
-    arm, _ = design_of(config)
-    return rubs(response, measuring_gains(arm).damping)
+    return Shown(
+        factor=float(np.clip(taken / LITTLE, 1.0, MOST)),
+        rubs=rubs(response, gains.damping),
+    )

@@ -38,6 +38,9 @@ _POSTURES = 40
 REVERSAL = 0.75
 """Of Coulomb friction, an error of it: half of it too much at breakaway, with either sign."""
 
+_MEAN = 0.5
+"""Of the limit of acceleration, on average: an error of soft gains takes time to grow."""
+
 _DOWN = 0.9995  # four digits of a joint bound round up by less
 _FINEST = 1e-6  # rad, a sixth of a step of a 20 bit encoder
 _ROUNDED = 1.0 + 1e-9
@@ -83,7 +86,8 @@ def joint_bounds(
     )
     region = _region(values, n) or (lower, upper)
     stiffness = _stiffness(values)
-    acceleration = tuple(values['limits.acceleration']) if stiffness else (0.0,) * n
+    limits = values['limits.acceleration']
+    acceleration = tuple(_MEAN * a for a in limits) if stiffness else (0.0,) * n
     expected = _expected(
         base, P0, robot.payload, unmodelled, stiffness, acceleration, *region
     )
