@@ -30,11 +30,15 @@ OLDER = {
 }
 """Variables by which C library, BLAS and numpy take this processor for an older one."""
 COMMAND = (sys.executable, '-m', 'blf_dsc_controller', 'run')
+_PLACES = str(Path(__file__).with_name('no_pictures')), os.environ.get('PYTHONPATH')
+NO_PICTURES = {'PYTHONPATH': os.pathsep.join(filter(None, _PLACES))}
+"""Variable by which commands write empty pictures."""
 
 
-def closed_loop(*arguments, **options):
+def closed_loop(*arguments, pictures=False):
     """Run the command to completion."""
-    return finished(*COMMAND, *arguments, **options)
+    environment = os.environ | ({} if pictures else NO_PICTURES)
+    return finished(*COMMAND, *arguments, env=environment)
 
 
 def finished(*command, **options):
@@ -66,6 +70,7 @@ class Running:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            env=os.environ | NO_PICTURES,
         )
         bag = out / 'bag' / 'bag_0.mcap'
         # 500 kB: some 200 samples have been recorded, each about 2 kB with all topics.

@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import hypothesis
+import node_garbage
 import pytest
 from cpu_times import (  # noqa: F401 - hooks
     pytest_addoption,
@@ -87,6 +88,7 @@ def bare_node():
     from rclpy.node import Node
     from rclpy.parameter import Parameter
 
+    node_garbage.begin()
     context, nodes = Context(), []
     context.init()
 
@@ -106,9 +108,10 @@ def bare_node():
         return node
 
     yield make
-    for node in nodes:
-        node.destroy_node()
+    while nodes:
+        nodes.pop().destroy_node()
     context.shutdown()
+    node_garbage.end()
 
 
 @pytest.fixture

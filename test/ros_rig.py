@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import gc
 import time
 from functools import partial
 
+import node_garbage
 import numpy as np
 import rclpy
 from lifecycle_msgs.msg import Transition
@@ -51,6 +51,7 @@ class RosRig:
     """A ROS context of its own; call `close` at the end."""
 
     def __init__(self, args=None):
+        node_garbage.begin()
         self.context = _joined(args)
         self.executor = EventsExecutor(context=self.context)
         self.nodes = []
@@ -70,11 +71,9 @@ class RosRig:
         while self.nodes:
             self.kill(self.nodes[-1])
         rclpy.try_shutdown(context=self.context)
-        # A node's services keep its participant, visible to others, until it is
-        # collected.
         self.tester = self.executor = None
         self._clients.clear()
-        gc.collect()
+        node_garbage.end()
 
     def kill(self, node):
         """Destroy a node without notifying the others."""

@@ -14,7 +14,16 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import COMMAND, COMPILED, PATIENT, Running, closed_loop, finished, wait_for
+from command import (
+    COMMAND,
+    COMPILED,
+    NO_PICTURES,
+    PATIENT,
+    Running,
+    closed_loop,
+    finished,
+    wait_for,
+)
 from recorded_run import small_disk
 from ros_rig import simulated
 from rosbags.highlevel import AnyReader
@@ -41,7 +50,7 @@ def out(tmp_path_factory):
     out = folder / 'results' / 'first'
     config.write_text(f'blf_dsc_controller:\n  ros__parameters: {json.dumps(HALF)}\n')
     arguments = ('--config', config, '--mode', 'lockstep', '--duration', DURATION)
-    run = closed_loop(*arguments, '--out', out)
+    run = closed_loop(*arguments, '--out', out, pictures=True)
     assert run.returncode == 0, run.stderr
     (out / 'output.txt').write_text(run.stdout + run.stderr)
     return out
@@ -210,9 +219,8 @@ def test_run_without_a_network_is_refused_at_once(tmp_path):
     assert '127.0.0.1, which cannot be reached (Network is unreachable)' in run.stderr
     assert 'ip link set lo up' in run.stderr
     assert not out.exists()
-    offline = finished(
-        *alone, '--offline', '--duration', 0.1, '--out', tmp_path / 'off'
-    )
+    words = ('--offline', '--duration', 0.1, '--out', tmp_path / 'off')
+    offline = finished(*alone, *words, env=os.environ | NO_PICTURES)
     assert offline.returncode == 0, offline.stderr
 
 
