@@ -571,7 +571,7 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
             *('new.urdf', 'identify', bag, '--urdf', 'panda.urdf'),
             *('--out', tmp_path / 'new.urdf'),
         ),
-        ('out', 'excite', tmp_path / 'out', '--config', 'panda'),
+        ('out.yaml', 'excite', tmp_path / 'out.yaml', '--config', 'panda'),
     ):
         out = tmp_path / name
         kept = tmp_path / 'kept'

@@ -59,16 +59,18 @@ def test_unwritable_output_path_is_reported(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'file').touch()
-    (tmp_path / 'full.csv').symlink_to('/dev/full')
-    if command == 'export':
-        place = {'/dev/full': 'full.csv'}.get(place, f'{place}.csv')
+    suffix = {'export': '.csv', 'excite': '.yaml'}.get(command)
+    if suffix:
+        (tmp_path / f'full{suffix}').symlink_to('/dev/full')
+        place = {'/dev/full': f'full{suffix}'}.get(place, f'{place}{suffix}')
     words = [str(bag)] if command in ('report', 'plot', 'recover', 'export') else []
     options = [place, '--config', 'panda'] if command == 'excite' else ['--out', place]
     assert main([*command.split(), *words, *options]) == 1
     lines = capfd.readouterr().err.splitlines()
     (error,) = (line for line in lines if COMPILING not in line)
     assert error.startswith(f'blf_dsc {command.split()[0]}: ')
-    assert '[Errno ' in error or 'choose another' in error
+    assert 'choose another' in error or 'is needed' in error
+    assert '[Errno ' not in error
 
 
 @pytest.mark.parametrize(
@@ -95,18 +97,93 @@ def test_file_of_another_kind_or_place_is_answered_with_what_to_give(
     assert [path.name for path in tmp_path.iterdir()] == ['table.csv']
 
 
+@pytest.mark.parametrize(
+    ('words', 'answer'),
+    [
+        ('run --ofline', 'run: no option --ofline, did you mean --offline?'),
+        ('run --out=x --seeed=3', 'no option --seeed, did you mean --seed?'),
+        ('run panda', 'no argument panda: a file or preset is --config panda'),
+        ('plot bag pictures', 'plot: no argument pictures; for example: blf_dsc plot'),
+        ('--verison', 'blf_dsc: no option --verison, did you mean --version?'),
+        ('run --duration ten', "invalid float value: 'ten'; for example: blf_dsc run"),
+        ('plot', 'required: bag; for example: blf_dsc plot run1/bag --out pictures ('),
+        ('helpp', 'no command helpp; there are run, '),
+        ('excite e.urdf --config ur5e', 'got e.urdf, but it will be a parameter file'),
+        ('excite e.yaml --config ur5e --harmonics 0', 'got 0: give a whole number'),
+        ('excite e.yaml --config ur5e --starts -1', 'got -1: give a whole number'),
+        ('monte-carlo --workers two', 'got two: give a whole number above 0'),
+        ('commission --config ur5e --out a.png', 'got a.png, but it will be a param'),
+        ('commission --config ur5e --write a.txt', 'got a.txt, but it will be a param'),
+        ('commission --config ur5e --margin 1', 'got 1: give a number above 0 and be'),
+        ('commission --config ur5e --torque 5', 'got 5: give a number above 0 and be'),
+        ('commission --config ur5e --torque ?', 'got ?: give a number above 0 and be'),
+    ],
+)
+def test_wrong_option_is_one_line_with_what_to_type(words, answer, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert answer in line
+    assert line.split(': ')[0] in ('blf_dsc', f'blf_dsc {words.split()[0]}')
+
+
+@pytest.mark.parametrize(
+    ('words', 'answer'),
+    [
+        ('run --config pandaa', 'pandaa does not exist, did you mean panda?'),
+        ('run --config Ur5e.yml', 'Ur5e.yml does not exist, did you mean ur5e?'),
+        (
+            'run --config quadruped',
+            'quadruped does not exist: give a parameter file, o',
+        ),
+        ('run --config section.yaml', 'unknown node blf_dsc_controler, did you mean b'),
+        ('plot bgs', 'bgs cannot be read as a bag: there is none, did you mean bags?'),
+        ('report nothing', 'there is none: give the folder of a bag, such as out/'),
+        ('report no/where', 'there is none: give the folder of a bag, such as out/'),
+        ('report robot.urdf', 'a bag is a folder, or a file in .mcap, .db3 or .bag'),
+        ('recover notes.md', 'notes.md cannot be read as a bag: give its folder, or'),
+        ('export BAG --out bags', 'bags ends in neither .csv nor .parquet'),
+        ('export BAG --out a.csv --namespace left', "called '/left/joint_states'"),
+        ('plot BAG --out notes.md', 'notes.md is no folder: choose another path'),
+        ('report BAG --out bags --force', 'bags is a folder: choose the path of a fi'),
+        ('export BAG --out no/a.csv', 'there is no no/a.csv: make its folder, or cho'),
+        ('arms --laws propsed', 'no such law or file, did you mean proposed?'),
+        ('excite e.yaml --config paper', 'such as ur5e'),
+        ('commission --config paper', 'needs an arm from a URDF'),
+        ('identify BAG --urdf ur5 --out c.urdf', 'no /CWD/ur5, nor'),
+        ('identify BAG --urdf ur5e --out c.urdf', 'did you mean ur5e.urdf?'),
+        ('identify no.csv --urdf robot.urdf --out c.urdf', 'No such file'),
+    ],
+)
+def test_wrong_name_is_answered_with_what_may_be_meant(
+    words, answer, bag, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'bags').mkdir()
+    (tmp_path / 'notes.md').write_text('mine')
+    urdf = Path(__file__).parents[1] / 'config' / 'two_link.urdf'
+    (tmp_path / 'robot.urdf').symlink_to(urdf)
+    (tmp_path / 'section.yaml').write_text(
+        '/**/blf_dsc_controler: {ros__parameters: {law: blf_dsc}}\n'
+    )
+    before = {path.name for path in tmp_path.iterdir()}
+    given = [str(bag) if word == 'BAG' else word for word in words.split()]
+    assert main([*given, '--offline'] if given[0] == 'run' else given) == 1
+    error = capsys.readouterr().err
+    assert answer.replace('/CWD', str(tmp_path)) in error
+    assert 'Errno' not in error
+    assert error.count('warning') == 0
+    assert {path.name for path in tmp_path.iterdir()} == before
+    assert (tmp_path / 'notes.md').read_text() == 'mine'
+
+
 def test_study_of_an_arm_that_is_none_leaves_no_folder(tmp_path, capsys):
     out = tmp_path / 'arms'
     for config, problem in (('nothing', 'does not exist'), ('paper', 'model two_link')):
         assert main(['arms', '--config', config, '--out', str(out)]) == 1
         assert problem in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_commissioned_file_is_not_written_over_its_picture(tmp_path, capsys):
-    words = ['commission', '--config', 'ur5e', '--out', str(tmp_path / 'found.png')]
-    assert main(words) == 1
-    assert 'would be the picture' in capsys.readouterr().err
 
 
 def test_run_says_that_its_simulated_arm_is_ideal_and_that_nothing_moves(tmp_path):

@@ -267,9 +267,10 @@ def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> 
         }
         states = found[topics.JOINT_STATES]
         if states is None:
-            raise _missing_topic(
-                topics.JOINT_STATES.name, topics.JOINT_STATES.type, bag.held
-            )
+            wanted = topics.JOINT_STATES.name
+            if namespace:
+                wanted = f'/{namespace.strip("/")}/{wanted}'
+            raise _missing_topic(wanted, topics.JOINT_STATES.type, bag.held)
         if not bag.counts[states]:
             raise BagError(f'{path} is empty: it holds no message of {states}')
         found[topics.MOTOR_STATES] = _beside(states, topics.MOTOR_STATES, bag.held)

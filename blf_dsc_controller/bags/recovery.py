@@ -26,6 +26,7 @@ from zstandard import FRAME_HEADER, ZstdError
 
 from blf_dsc_controller.bags.sources import (
     CDR,
+    FILES,
     MAGIC_SIZE,
     BagError,
     check_regular,
@@ -62,6 +63,10 @@ def recover(path: Path, out: Path) -> Recovery:
         BlfDscError: `out` cannot be written; nothing of it is left.
     """
     check_regular(path)
+    if path.is_file() and path.suffix not in FILES:
+        raise BagError(
+            f'{path} cannot be read as a bag: give its folder, or its file in .mcap'
+        )
     candidates = path.glob('*.mcap') if path.is_dir() else [path]
     files = [file for file in candidates if file.is_file()]
     if not files:

@@ -9,6 +9,7 @@ flipped, shows in the number of messages.
 
 from __future__ import annotations
 
+import difflib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -29,6 +30,8 @@ from blf_dsc_controller.messages.codecs import typestore
 
 METADATA = 'metadata.yaml'
 _ROS1 = '.bag'
+FILES = {'.mcap', '.db3', '.bag'}
+"""Suffixes of the files of a bag."""
 _TABLES = {'.csv', '.txt', '.npz', '.mat', '.parquet'}
 CDR = 'cdr'
 MAGIC_SIZE = 8
@@ -233,7 +236,7 @@ def check_regular(path: Path) -> None:
 
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
-        return 'there is no such folder'
+        return f'there is none{_near(path)}'
     if path.suffix in _TABLES:
         return 'it is a table, which only blf_dsc identify reads: give a bag'
     files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
@@ -245,12 +248,25 @@ def _reason(path: Path, error: Exception) -> str:
             return text + _instead_of(path)
         text += ', as after an interrupted recording'
     elif isinstance(error, OSError) or not is_mcap:
-        return text
+        is_other = path.is_file() and path.suffix not in FILES
+        return (
+            'a bag is a folder, or a file in .mcap, .db3 or .bag' if is_other else text
+        )
     for file in files:
         encoding = other_encoding(file)
         if encoding:
             return f'its messages are {encoding}, not CDR of ROS 2: {_remedy(encoding)}'
     return f'{text}; to save the undamaged part: blf_dsc recover {path}'
+
+
+def _near(path: Path) -> str:
+    """Return what may be meant by a path at which there is nothing."""
+    folder = path.parent
+    names = [each.name for each in folder.iterdir()] if folder.is_dir() else []
+    close = difflib.get_close_matches(path.name, names, n=1)
+    if close:
+        return f', did you mean {folder / close[0]}?'
+    return ': give the folder of a bag, such as out/demo/bag'
 
 
 def _instead_of(path: Path) -> str:

@@ -88,6 +88,14 @@ def _unit(name: str, run: Run) -> str:
     return known[0] if known else '1' if run.arm is not None else _PARAMETER
 
 
+def check_format(path: Path) -> None:
+    """Raise BlfDscError if the suffix of a table is neither .csv nor .parquet."""
+    if path.suffix not in ('.csv', '.parquet'):
+        raise BlfDscError(
+            f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
+        )
+
+
 def export(run: Run, path: Path) -> int:
     """Write the table as CSV or Parquet, by suffix; return the number of columns.
 
@@ -98,10 +106,7 @@ def export(run: Run, path: Path) -> int:
         BlfDscError: the suffix is neither .csv nor .parquet.
         MissingExtraError: pyarrow is not installed.
     """
-    if path.suffix not in ('.csv', '.parquet'):
-        raise BlfDscError(
-            f'{path} ends in neither .csv nor .parquet: the file extension selects the format'
-        )
+    check_format(path)
     blocks = (slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS))
     with writing(path):
         (_write_csv if path.suffix == '.csv' else _write_parquet)(

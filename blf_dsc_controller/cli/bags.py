@@ -53,6 +53,7 @@ def _run(options: Namespace) -> Run:
 
 def export(options: Namespace) -> None:
     """Write a bag as a table."""
+    table.check_format(options.out)  # before a large bag is read
     make_room(options.out, force=options.force)
     run = _run(options)
     columns = table.export(run, options.out)

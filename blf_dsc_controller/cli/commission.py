@@ -72,10 +72,6 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         _write_motions(options, path, commissioning)
         return 0
     picture = options.out.with_suffix('.png')
-    if picture == options.out:
-        raise BlfDscError(
-            f'{picture} would be the picture: give the parameter file a name in .yaml'
-        )
     make_room(options.out, picture, force=options.force)
     try:
         names, runs = _all_runs(options, path, commissioning)

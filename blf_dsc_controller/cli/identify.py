@@ -203,7 +203,8 @@ def excite(options: Namespace) -> None:
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     if config.model != 'urdf':
         raise BlfDscError(
-            f'{options.config}: got model {config.model}, but a URDF is needed'
+            f'{options.config}: got model {config.model}, but a URDF is needed: set robot.urdf, '
+            'or choose a preset with one, such as ur5e'
         )
     problem = ExcitationProblem(
         config, options.harmonics, options.radius, options.floor

@@ -18,7 +18,12 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from blf_dsc_controller.cli.parser import check_command, check_text, make_parser
+from blf_dsc_controller.cli.parser import (
+    check_command,
+    check_text,
+    make_parser,
+    parse,
+)
 from blf_dsc_controller.cli.result_folder import discard_unrecorded
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
@@ -38,8 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     check_command(parser, words)
     check_text(parser, words)
-    options = parser.parse_args(
-        words, argparse.Namespace(line=shlex.join(['blf_dsc', *words]))
+    options = parse(
+        parser, words, argparse.Namespace(line=shlex.join(['blf_dsc', *words]))
     )
     keep_to_one_thread()
     if options.command is None:
@@ -68,8 +73,11 @@ def _code_of(options: argparse.Namespace) -> int:
         code: int | None = command(options)
     except BrokenPipeError:
         return 1  # nobody reads any more
-    except (BlfDscError, OSError) as error:
+    except BlfDscError as error:
         print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f'blf_dsc {options.command}: {_place_text(error)}', file=sys.stderr)
         return 1
     except UnicodeEncodeError as error:
         print(
@@ -83,6 +91,23 @@ def _code_of(options: argparse.Namespace) -> int:
         print(f'blf_dsc {options.command}: interrupted', file=sys.stderr)
         return INTERRUPTED
     return code or 0
+
+
+def _place_text(error: OSError) -> str:
+    """Return what is wrong with the place of a file, and what to do."""
+    path = error.filename
+    match error:
+        case OSError(filename=None):
+            return f'{error}'
+        case FileNotFoundError():
+            return f'there is no {path}: make its folder, or choose another path'
+        case PermissionError():
+            return f'{path} may not be read or written by you: choose another path'
+        case IsADirectoryError():
+            return f'{path} is a folder: choose the path of a file'
+        case FileExistsError() | NotADirectoryError():
+            return f'{path} is no folder: choose another path'
+    return f'{path}: {error.strerror}: choose another path'
 
 
 def _lost_output() -> str:

@@ -5,21 +5,60 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import math
 import os
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 from blf_dsc_controller import __version__
 
 _BAG = 'folder of the bag, or its .mcap, .db3 or .bag file'
 _CONFIG = 'parameter file, or a preset (recommended)'
+_OF_URDF = 'parameter file of an arm from a URDF, or a preset, such as ur5e'
 _WIDTH = 88
 _MOVED = {'paper': 'paper', 'tool': 'tool-bound', 'contacts': 'contacts'}
 """Commands of earlier versions, by their tables of `benchmark`."""
 _Command: TypeAlias = Callable[..., Callable[..., Any]]
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser whose errors are one line, with an example of what to type."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2."""
+        help_line = f'{self.prog} --help'
+        examples = (self.epilog or '').partition('Example:')[2].split('\n')[1:]
+        if examples:
+            help_line = f'for example: {examples[0].strip()} ({help_line})'
+        else:
+            help_line = f'see {help_line}'
+        self.exit(2, f'{self.prog}: {message}; {help_line}\n')
+
+    def refuse(self, unknown: str) -> NoReturn:
+        """Exit with code 2 because of a word that this command does not take."""
+        options = self._option_string_actions
+        name = unknown.partition('=')[0]
+        if name.startswith('-'):
+            close = difflib.get_close_matches(name, options, n=1)
+            guess = f', did you mean {close[0]}?' if close else ''
+            self.error(f'no option {name}{guess}')
+        if '--config' in options:
+            self.error(f'no argument {unknown}: a file or preset is --config {unknown}')
+        self.error(f'no argument {unknown}')
+
+
+def parse(
+    parser: argparse.ArgumentParser, words: Sequence[str], given: argparse.Namespace
+) -> argparse.Namespace:
+    """Add the options of a command line to those given, or exit with what is wrong."""
+    options, unknown = parser.parse_known_args(words, given)
+    if unknown:
+        of_command = parser.get_default('commands').get(options.command, parser)
+        of_command.refuse(unknown[0])
+    return options
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -27,7 +66,7 @@ def make_parser() -> argparse.ArgumentParser:
 
     The option `handler` is the (module, function) of a sub-command.
     """
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog='blf_dsc',
         description='Track a trajectory within a bound, with a robot arm whose masses are '
         'unknown: run the controller, examine bags, identify arms, study laws.',
@@ -45,7 +84,7 @@ def make_parser() -> argparse.ArgumentParser:
         name: str,
         about: str,
         example: str,
-        *shared: argparse.ArgumentParser,
+        *shared: _Parser,
     ) -> Callable[..., Any]:
         """Add a command with these shared options, and return what adds its own."""
         made = commands.add_parser(
@@ -59,7 +98,7 @@ def make_parser() -> argparse.ArgumentParser:
         made.set_defaults(handler=(module, name.replace('-', '_')))
         return made.add_argument
 
-    names, force = (argparse.ArgumentParser(add_help=False) for _ in range(2))
+    names, force = (_Parser(add_help=False) for _ in range(2))
     theirs = (
         'what a topic or a joint is called in the bag, such as joint1=shoulder; or which '
         'columns of a table are the time=, q= and tau=, and theta= of motors; can be repeated'
@@ -78,7 +117,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_identification(partial(command, 'identify'), names, force)
     _add_studies(partial(command, 'studies'))
     _add_doctor(partial(command, 'doctor'))
-    parser.set_defaults(commands=tuple(commands.choices))
+    parser.set_defaults(commands=commands.choices)
     return parser
 
 
@@ -217,10 +256,10 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
         force,
     )
     option('bags', type=Path, nargs='*', metavar='BAG', help='runs of the motions')
-    option('--config', required=True, help=_CONFIG)
+    option('--config', required=True, help=_OF_URDF)
     option(
         '--out',
-        type=Path,
+        type=_parameter_file,
         default=Path('commissioned.yaml'),
         help='parameter file to write, and a picture beside it (commissioned.yaml)',
     )
@@ -258,7 +297,7 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
     )
     option(
         '--write',
-        type=Path,
+        type=_parameter_file,
         metavar='MOTION.yaml',
         help='measure nothing, but write MOTION_1.yaml and so on, one for each posture',
     )
@@ -271,11 +310,11 @@ def _add_commissioning(command: _Command, force: argparse.ArgumentParser) -> Non
         help='angles of all joints [rad]; can be repeated (three along the reference)',
     )
     torque = 'rms torque of the motion, as a share of the rated one (0.03)'
-    option('--torque', type=float, default=0.03, help=torque)
+    option('--torque', type=_share, default=0.03, help=torque)
     travel = 'farthest that the tool travels from its middle [m] (0.01)'
     option('--travel', type=float, default=0.01, help=travel)
     margin = 'modulus margin of the gains (0.5)'
-    option('--margin', type=float, default=0.5, help=margin)
+    option('--margin', type=_share, default=0.5, help=margin)
 
 
 def _add_identification(
@@ -290,14 +329,17 @@ def _add_identification(
         'exciting.yaml --config my.yaml',
         force,
     )
-    option('out', type=Path, help='parameter file to write')
-    option('--config', required=True, help=_CONFIG)
+    option('out', type=_parameter_file, help='parameter file to write')
+    option('--config', required=True, help=_OF_URDF)
     option(
-        '--harmonics', type=int, default=3, help='number of harmonics of the window (3)'
+        '--harmonics',
+        type=_positive,
+        default=3,
+        help='number of harmonics of the window (3)',
     )
     option(
         '--starts',
-        type=int,
+        type=_positive,
         default=4,
         help='number of searches; the best result is kept (4)',
     )
@@ -391,7 +433,7 @@ def _add_studies(command: _Command) -> None:
         '--config',
         nargs='+',
         default=['panda_rigid', 'ur5e_rigid'],
-        help='presets or files (panda ur5e)',
+        help='presets or files (panda_rigid ur5e_rigid)',
     )
     laws = (
         'laws of the study by name, or Python files with more laws (all of the study)'
@@ -441,10 +483,34 @@ def _add_doctor(command: _Command) -> None:
 
 
 def _positive(text: str) -> int:
-    value = int(text)
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
     if value < 1:
-        raise argparse.ArgumentTypeError(f'{text} is not above 0')
+        raise argparse.ArgumentTypeError(f'got {text}: give a whole number above 0')
     return value
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 1.0:
+        raise argparse.ArgumentTypeError(
+            f'got {text}: give a number above 0 and below 1'
+        )
+    return value
+
+
+def _parameter_file(text: str) -> Path:
+    path = Path(text)
+    if path.suffix not in ('.yaml', '.yml'):
+        raise argparse.ArgumentTypeError(
+            f'got {text}, but it will be a parameter file: give a name in .yaml'
+        )
+    return path
 
 
 def check_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:

@@ -113,21 +113,13 @@ def _configuration(options: Namespace) -> LoopConfig:
     Prints configuration warnings, and raises StartError or MotionError if the
     controller would reject the true start.
     """
-    path = locate(options.config)
-    ignored = ignored_sections(read(path), (PLANT, CONTROLLER))
-    if ignored:
-        print_notice(f'warning: {path}: {ignored}')
-    if load(path, DRIVE, DriveConfig).feedback == 'motor':
-        print_notice(
-            f'warning: {path}: drive.feedback is motor, but this simulates torques over the '
-            f'bus, with the same gains; blf_dsc drive --robot simulated --config '
-            f'{options.config} simulates the motors'
-        )
     names = ('duration', 'mode', 'seed', 'physics')
     chosen = {name: getattr(options, name) for name in names}
     given = {name: value for name, value in chosen.items() if value is not None}
     recorded: dict[str, Any] = {'wait_for_subscribers': 1}
     config = load_loop(options.config, {PLANT: given | recorded, CONTROLLER: recorded})
+    for warning in _unused(options.config):
+        print_notice(f'warning: {warning}')
     if options.duration == 0.0 and options.offline:
         raise BlfDscError(
             '--duration 0 is no limit, which --offline cannot have: give a duration in s'
@@ -152,6 +144,18 @@ def _configuration(options: Namespace) -> LoopConfig:
     if end := end_of_waypoints(controller):
         print(end)
     return config
+
+
+def _unused(given: str) -> Iterator[str]:
+    """Yield what a file says that this command does not use."""
+    path = locate(given)
+    if ignored := ignored_sections(read(path), (PLANT, CONTROLLER)):
+        yield f'{path}: {ignored}'
+    if load(path, DRIVE, DriveConfig).feedback == 'motor':
+        yield (
+            f'{path}: drive.feedback is motor, but this simulates torques over the bus, with the '
+            f'same gains; blf_dsc drive --robot simulated --config {given} simulates the motors'
+        )
 
 
 def _ideal(config: LoopConfig) -> Iterator[str]:

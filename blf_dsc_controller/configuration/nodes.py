@@ -201,10 +201,9 @@ def locate(given: str | Path) -> Path:
     what = 'is a folder' if path.is_dir() else 'does not exist'
     if path.exists() and not path.is_dir():
         what = 'is no regular file'
-    remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
-    raise ConfigurationError(
-        [f'{name or "an empty name"} {what}{suggestion(stem, presets) or ":"} {remedy}']
-    )
+    guess = suggestion(stem.removesuffix('.yml').lower(), presets)
+    remedy = guess or f': give a parameter file, or a preset: {", ".join(presets)}'
+    raise ConfigurationError([f'{name or "an empty name"} {what}{remedy}'])
 
 
 def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:

@@ -25,12 +25,18 @@ from blf_dsc_controller.configuration.description import (
     gravity_of,
     rotors_of,
 )
-from blf_dsc_controller.configuration.files import places_of, read_text, resolve
+from blf_dsc_controller.configuration.files import (
+    places_of,
+    read_text,
+    resolve,
+    share_folder,
+)
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Vector,
     non_negative,
     parameter,
+    suggestion,
 )
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
@@ -297,6 +303,8 @@ def read_urdf(given: str) -> str:
         text = read_text(path)
     except FileNotFoundError as error:
         problem = f'{given!r} cannot be read: there is no {places_of(given)}'
+        known = [each.name for each in (share_folder() / 'config').glob('*.urdf')]
+        problem += suggestion(given, known) or '; give the path of a URDF or MJCF'
         raise BlfDscError(problem) from error
     # no text, no path, no user
     except (OSError, ValueError, RuntimeError) as error:

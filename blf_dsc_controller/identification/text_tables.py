@@ -188,7 +188,7 @@ def _opened(path: Path) -> TextIO:
         encoding = _encoding_of(begin)
         return path.open(encoding=encoding)
     except OSError as error:
-        raise BlfDscError(f'{path} cannot be read: {error}') from error
+        raise BlfDscError(f'{path} cannot be read: {error.strerror}') from error
 
 
 def _encoding_of(begin: bytes) -> str:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import change, suggestion
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.inertia import joint_inertia
 from blf_dsc_controller.law.samples import sample_columns
@@ -327,8 +327,8 @@ def chosen_laws(given: Sequence[str]) -> list[str]:
     for name in given:
         if name not in LAWS and not Path(name).is_file():
             raise BlfDscError(
-                f'--laws {name}: expected a law of the study ({", ".join(LAWS)}), or a '
-                'Python file with LAWS'
+                f'--laws {name}: there is no such law or file{suggestion(name, LAWS)}; '
+                f'expected a law of the study ({", ".join(LAWS)}), or a Python file with LAWS'
             )
         names += [name] if name in LAWS else load_laws(Path(name).resolve())
     return list(dict.fromkeys(names))
