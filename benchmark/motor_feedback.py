@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedback through a bus, and inside motors with a PD of their own: OpenArm, YAM.
 
-    python -m benchmark motor-feedback [--arm openarm | yam] [LAW...]
+    python -m benchmark motor-feedback [--arm openarm | yam] [--gears rigid elastic] [LAW...]
 
 The arm of the preset runs its motion for 14 s and picks up 0.5 kg at 8 s.  Its links are
 10 % off, its rotors 20 %.  The motors run at 4 kHz, frames go at 250 or 500 Hz with the
-ranges and bits of Damiao's, and arrive a period after the state behind them.  Gears are
-rigid, or give way with the encoders at the motors: OpenArm's as planetary gears may
-(nothing is published of them), 4000, 2000 and 800 N m/rad at shoulder, elbow and wrist;
-YAM's as the preset has them, with their play.
+ranges and bits of Damiao's, and arrive a period after the state behind them.  So in all
+columns the host gets positions in steps of 0.38 mrad.  Gears are
+
+    rigid      and the motors' own encoders have steps of 0.043 mrad
+    elastic    with the encoders at the motors: OpenArm's as planetary gears may give way
+               (nothing is published of them), 4000, 2000 and 800 N m/rad at shoulder,
+               elbow and wrist; YAM's as the preset has them, with their play
+    coarse     elastic, and the motors know their positions and velocities only as they
+               report them, in steps of 0.38 mrad
 
 A cell has the largest error [mrad] of a link from 4 s on, and at the pick-up; the weight
 found [kg]; and how far the arm moves in 2 s [rad] once the host is dead.  The laws are
@@ -85,7 +90,7 @@ RIGID: _Changes = {
     'joint.backlash': None,
     'sensor.side': 'link',
 }
-KINDS = ('rigid', 'elastic')
+KINDS = ('rigid', 'elastic', 'coarse')
 
 
 class Result(NamedTuple):
@@ -181,7 +186,8 @@ def run(arm: str, law: str, feedback: str, kind: str, period: float) -> Result:
     controller = ArmController(loop.controller)
     n = len(controller.joints)
     ranges = ranges_of(arm, n)
-    plant = MotorPlant(change(loop.plant, {'duration': 0.0}), ranges, RATE)
+    config = change(loop.plant, {'duration': 0.0})
+    plant = MotorPlant(config, ranges, RATE, as_reported=kind == 'coarse')
     latency = loop.plant.actuator.delay * period
     frame_of = frames_of(law, feedback, controller, ranges, latency)
     errors = []
@@ -213,8 +219,10 @@ def position(plant: MotorPlant, n: int) -> np.ndarray:
     return np.array(plant.plant.truth()[-2 * n : -n])
 
 
-def rows(arm: str, laws: Collection[str]) -> Iterator[tuple[str, ...]]:
-    """Yield a row for each law."""
+def rows(
+    arm: str, laws: Collection[str], kinds: Collection[str]
+) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each law, with some KINDS of gears."""
     cases = [
         ('maker', 'motor'),
         *product(LAWS[1:], ('host', 'motor')),
@@ -224,7 +232,7 @@ def rows(arm: str, laws: Collection[str]) -> Iterator[tuple[str, ...]]:
             continue
         cells = [
             str(run(arm, law, feedback, kind, period))
-            for kind, period in product(KINDS, (0.004, 0.002))
+            for kind, period in product(kinds, (0.004, 0.002))
         ]
         yield f'{law}, {feedback}', *cells
 
@@ -232,10 +240,12 @@ def rows(arm: str, laws: Collection[str]) -> Iterator[tuple[str, ...]]:
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument('--arm', choices=GEARS, default='openarm')
+    parser.add_argument('--gears', nargs='+', choices=KINDS, default=KINDS)
     parser.add_argument('laws', nargs='*', metavar='LAW', help=', '.join(LAWS))
 
 
 def main(options: argparse.Namespace) -> None:
     """Print the table."""
-    heads = [f'{kind}, {rate} Hz' for kind, rate in product(KINDS, (250, 500))]
-    print_table(['law', *heads], rows(options.arm, options.laws or LAWS))
+    kinds = options.gears
+    heads = [f'{kind}, {rate} Hz' for kind, rate in product(kinds, (250, 500))]
+    print_table(['law', *heads], rows(options.arm, options.laws or LAWS, kinds))

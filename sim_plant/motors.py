@@ -40,8 +40,17 @@ class MotorPlant:
         frames: frames so far, which is the time in periods of the host.
     """
 
-    def __init__(self, config: PlantConfig, ranges: Ranges, rate: float = RATE) -> None:
+    def __init__(
+        self,
+        config: PlantConfig,
+        ranges: Ranges,
+        rate: float = RATE,
+        *,
+        as_reported: bool = False,
+    ) -> None:
         """Build the arm of a configuration, at the sample time of its host.
+
+        `as_reported`: the motors know no more than they report, rounded to a frame.
 
         Raises:
             BlfDscError: the motors' rate is no multiple of the host's.
@@ -56,6 +65,7 @@ class MotorPlant:
         self.config = change(config, own)
         self.plant = plant_of(self.config)
         self.ranges = ranges
+        self._as_reported = as_reported
         n = len(config.joints)
         self._last = Frame(*np.zeros((5, n)))
         self._on_the_bus = deque([self._last] * config.actuator.delay)
@@ -63,7 +73,7 @@ class MotorPlant:
 
     def measure(self) -> Vector:
         """Return [q, dq, torque] (3, n) as the motors report them: rounded, and cut."""
-        q, dq, effort = self.plant.measure().reshape(3, -1)
+        q, dq, effort = self._own()
         ranges = self.ranges
         return np.array(
             [
@@ -87,5 +97,9 @@ class MotorPlant:
     def advance(self, frame: Frame, samples: int) -> None:
         """Advance by samples of the motors, in which they have a frame."""
         for _ in range(samples):
-            q, dq, _ = self.plant.measure().reshape(3, -1)
+            q, dq, _ = self.measure() if self._as_reported else self._own()
             self.plant.step(self.ranges.torque.cut(frame.torque_at(q, dq)))
+
+    def _own(self) -> Vector:
+        """Return [q, dq, torque] (3, n) as the motors know them."""
+        return np.asarray(self.plant.measure().reshape(3, -1))

@@ -77,11 +77,17 @@ def test_simulators_of_the_peers_run_the_same_arm():
 def test_feedback_in_motors_is_compared_with_the_hosts(monkeypatch, arm):
     sizes = {'SECONDS': 0.2, 'PICK_UP': 0.1, 'SETTLED': 0.05, 'DEAD': 0.1}
     motors = importlib.import_module('benchmark.motor_feedback')
-    for name, value in {'KINDS': ('rigid',), **sizes}.items():
+    for name, value in sizes.items():
         monkeypatch.setattr(motors, name, value)
-    table = {first: cells for first, *cells in motors.rows(arm, ['maker', 'whole'])}
+    rows = motors.rows(arm, ['maker', 'whole'], ['rigid'])
+    table = {first: cells for first, *cells in rows}
     assert list(table) == ['maker, motor', 'whole, host', 'whole, motor']
     assert all(len(cells) == 2 and 'stops' not in cells[0] for cells in table.values())
+    finer, coarse = (
+        motors.run(arm, 'maker', 'motor', kind, 0.004) for kind in ('elastic', 'coarse')
+    )
+    assert finer.late != coarse.late
+    assert coarse.late == pytest.approx(finer.late, abs=1e-3)  # rad: steps of 0.38 mrad
 
 
 def test_node_compared_with_null_node(monkeypatch):

@@ -23,7 +23,7 @@ from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import DriverError, Facts, disagreements
-from blf_dsc_controller.drive.drivers import driver_of, find_driver
+from blf_dsc_controller.drive.drivers import driver_of, find_driver, is_nearly_simulated
 from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.load_teller import LoadTeller
 from blf_dsc_controller.drive.loop import DriveLoop, End
@@ -501,5 +501,8 @@ def test_a_driver_is_a_file_with_a_class(content, problem, tmp_path):
 def test_simulated_misspelt_is_no_host():
     path = blf.share_folder() / 'config' / 'fr3_direct.yaml'
     config = blf.load_loop('fr3_direct').controller
-    with pytest.raises(BlfDscError, match='no robot simulatd, did you mean simulated'):
-        driver_of('simulatd', path, config)
+    for word in ('simulatd', 'simulation', 'Simulated', 'sim'):
+        message = f'no robot {word}, did you mean simulated'
+        with pytest.raises(BlfDscError, match=message):
+            driver_of(word, path, config)
+    assert not any(map(is_nearly_simulated, ('localhost', 'can0', 's', '172.16.0.2')))

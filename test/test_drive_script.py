@@ -6,12 +6,14 @@ The simulated arm waits for its torques: on a slow computer it is slow, and all 
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +25,7 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import PLANT
+from blf_dsc_controller.drive.arguments import checked_overrides
 from blf_dsc_controller.drive.driver import ReflexError
 from blf_dsc_controller.drive.script import Script
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
@@ -135,12 +138,121 @@ def test_what_cannot_be_done_is_refused_with_the_reason_and_the_arm_holds(arm):
             arm.follow(wrong)
     with pytest.raises(DriveError, match='points: got none'):
         arm.follow([])
+    with pytest.raises(DriveError, match='the last one is at 0 s'):
+        arm.follow([(0.0, before + 0.1)])
     with pytest.raises(MotionFailedError, match=r"panda_joint\d' would be .* rad"):
         arm.move_to(before + 9.0)
     with pytest.raises(MotionFailedError, match='elbow'):
         arm.follow([(1.0, [0.0])], ['elbow'])
     np.testing.assert_array_equal(arm.state.reference, before)
     assert not arm.is_moving
+
+
+def test_arguments_that_are_none_are_refused_before_the_arm_moves(arm):
+    before = arm.state.reference
+    there = before + 0.1
+    for wrong in (0.0, 1.5, np.nan, 'fast', [0.1] * 7, None):
+        with pytest.raises(DriveError, match=r'speed: got .* above 0, up to 1'):
+            arm.move_to(there, speed=wrong)
+    for wrong in (-1.0, np.nan, '5', [1.0]):
+        for order in (
+            arm.move_to,
+            lambda q, timeout: arm.follow([(1.0, q)], timeout=timeout),
+        ):
+            with pytest.raises(DriveError, match=r'timeout: got .* or None: for ever'):
+                order(there, timeout=wrong)
+        with pytest.raises(DriveError, match='timeout: got'):
+            arm.stop(timeout=wrong)
+    for wrong in ('panda_joint1', 1, [1, 2]):
+        with pytest.raises(DriveError, match=r'joints: got .*, but a list of names'):
+            arm.follow([(1.0, there)], wrong)
+    for wrong in (
+        ('2 kg',),
+        (1.0, 0.1),
+        (1.0, 'tip'),
+        (np.nan,),
+        (1.0, [0.0, np.inf, 0.0]),
+    ):
+        with pytest.raises(DriveError, match=r'load: got .* three coordinates'):
+            arm.load(*wrong)
+    np.testing.assert_array_equal(arm.state.reference, before)
+    assert not arm.is_moving
+
+
+def test_degrees_are_refused_with_the_hint_that_they_may_be_some(arm):
+    degrees = [0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0]
+    with pytest.raises(
+        MotionFailedError, match=r'past its limit .*give np\.deg2rad of them'
+    ):
+        arm.move_to(degrees)
+    with pytest.raises(MotionFailedError, match='past its limit') as raised:
+        arm.move_to([9.0] * 7)
+    assert 'deg2rad' not in str(raised.value)
+
+
+def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):
+    before = arm.state.reference
+    for _ in range(5):
+        arm.stream(np.rad2deg(before))
+    wait_for(lambda: 'degrees' in caplog.text)
+    assert rests(arm)
+    np.testing.assert_array_equal(arm.state.reference, before)
+    assert re.search(
+        r'panda_joint\d is to be at .* its limits are .*deg2rad', caplog.text
+    )
+    assert caplog.text.count('deg2rad') == 1
+    assert not arm.ended
+
+
+def test_a_pose_that_is_none_is_refused(arm):
+    for wrong in ('home', [0.1, [0.2], 0.3], arm.pose):
+        with pytest.raises(
+            DriveError, match=r'position: got .* such as pose\.position'
+        ):
+            arm.move_to_pose(wrong)
+    with pytest.raises(DriveError, match=r'rotation: got str.* such as pose\.rotation'):
+        arm.move_to_pose(arm.pose.position, 'down')
+
+
+@pytest.mark.parametrize(
+    ('given', 'message'),
+    [
+        ({'config': None}, 'config: got NoneType, but a parameter file or'),
+        ({'config': DriveConfig()}, 'config: got DriveConfig.*overrides take values'),
+        ({'robot': None}, "robot: got None, but its address is needed, or 'simulated'"),
+        ({'robot': ' '}, "or 'simulated'"),
+        ({'record': True}, 'record: got True, but a new folder is needed'),
+        ({'overrides': ['a']}, "overrides: got list: give them by node .* {'drive'"),
+        (
+            {'overrides': {'controller': {'a': 1}}},
+            "got 'controller', but the nodes of a",
+        ),
+        ({'overrides': {'barrier.bound': [0.1]}}, "got 'barrier.bound', but the nodes"),
+        ({'overrides': {'drive': 'motor'}}, 'overrides: drive: got str: give them by'),
+        (
+            {'overrides': {'drive': {'feedback': {1}}}},
+            'feedback: got set, but a number',
+        ),
+    ],
+)
+def test_what_no_drive_can_be_made_of_is_refused_in_one_line(
+    given, message, monkeypatch
+):
+    def start(_self):
+        raise AssertionError('a process was started')
+
+    monkeypatch.setattr(blf.Drive, '_start', start)
+    arguments = {'config': 'panda', 'robot': 'simulated', **given}
+    with pytest.raises(DriveError, match=message) as raised:
+        blf.Drive(**arguments)
+    assert '\n' not in str(raised.value)
+
+
+def test_values_of_overrides_may_be_paths_and_arrays():
+    given = {'bound': np.full(2, 0.5), 'few': (np.float32(0.5), True), 'at': Path('a')}
+    found = checked_overrides({'drive': given})
+    assert json.loads(json.dumps(found)) == found
+    assert found == {'drive': {'bound': [0.5, 0.5], 'few': [0.5, True], 'at': 'a'}}
 
 
 def test_a_motion_is_waited_for_stopped_and_given_up(arm):
@@ -245,10 +357,40 @@ def test_a_block_does_not_end_silently_with_an_arm_that_has_stopped():
         wait_for(lambda: arm.ended)
 
 
+def test_a_drive_that_was_closed_says_so():
+    with drive() as arm:
+        start = arm.state.q
+    orders = (
+        lambda: arm.state,
+        lambda: arm.is_moving,
+        lambda: arm.move_to(start),
+        arm.stop,
+    )
+    for order in orders:
+        with pytest.raises(
+            LoopEndedError, match=r'this Drive was closed.*make another'
+        ):
+            order()
+    arm.wait()
+    arm.close()
+
+
+def test_two_threads_that_move_one_arm_both_return(arm):
+    """The result of a motion is kept while another begins: nobody waits for ever."""
+    start = arm.state.q
+    arm.move_to(start, speed=1.0)
+    first = arm._number
+    for _ in range(2):
+        arm.move_to(start, speed=1.0)
+    arm._await_result(first, timeout=1.0)
+
+
 def test_a_process_that_is_killed_is_an_error_and_another_can_be_started(tmp_path):
     with drive(tmp_path / 'bag') as arm:
         os.kill(arm._process.pid, signal.SIGKILL)
-        with pytest.raises(LoopEndedError, match='ended by signal 9, without bringing'):
+        with pytest.raises(
+            LoopEndedError, match=r'ended by signal 9, without .* recover\(\) starts'
+        ):
             arm.move_to(arm.state.q)
         arm.recover()
         assert rests(arm)

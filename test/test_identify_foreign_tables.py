@@ -282,6 +282,73 @@ def test_percentages_and_currents_need_gains(tmp_path, unit):
     np.testing.assert_allclose(recording.torque[:9], factor * TAU[:9], atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ('names', 'pattern'),
+    [
+        (numbered('q'), 'q_*'),
+        (named('position'), 'position *'),
+        ([f'{joint} position' for joint in UR5E], '*_joint position'),
+        (
+            ['pan pos', 'lift pos', 'elbow pos', 'wrist pos 1', 'pos 2', 'a pos 3'],
+            '1:7',
+        ),
+    ],
+)
+def test_degrees_without_a_unit_are_refused_with_what_to_type(tmp_path, names, pattern):
+    """180 deg of a joint that turns by 360 deg are 29 times a turn in rad."""
+    degrees = 180.0 * Q
+    path = written(
+        tmp_path / 'a.csv', ['t', *names, *numbered('tau')], (TIME, degrees, TAU)
+    )
+    message = refused(path)
+    assert f"If it is in degrees: --map 'q={pattern}[deg]'" in message
+    assert f'{names[0]!r} goes to 180 rad, but shoulder_pan_joint turns by' in message
+    recording = read_table(path, UR5E_TEXT, names=NameMap.parse([f'q={pattern}[deg]']))
+    np.testing.assert_allclose(recording.q[:290], np.pi * Q[:290], atol=1e-6)
+    kept = read_table(path, UR5E_TEXT, names=NameMap.parse([f'q={pattern}[rad]']))
+    np.testing.assert_allclose(kept.q[:290][:, 0], degrees[:290, 0], atol=1e-6)
+
+
+def test_joint_without_limits_may_turn_as_often_as_it_does(tmp_path):
+    text = UR5E_TEXT.replace('type="revolute"', 'type="continuous"')
+    turned = Q + 100.0 * TIME[:, None] / TIME[-1]
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (TIME, turned, TAU))
+    recording = read_table(path, text)
+    np.testing.assert_allclose(recording.q[:290], turned[:290], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('entries', 'message'),
+    [
+        (
+            ['tau=q_*'],
+            "'q_1' was chosen as tau, but is q: choose others, as in --map 'tau=tau_*'",
+        ),
+        (['tau=1:7'], "as in --map 'tau=tau_*'"),
+        (
+            ['q=tau_*'],
+            "'tau_1' was chosen as q, but is tau: choose others, as in --map 'q=q_*'",
+        ),
+        (['q=tau_*', 'tau=q_*'], "as in --map 'q=q_*'"),
+        (['q=7:13', 'tau=1:7'], "as in --map 'q=q_*'"),
+    ],
+)
+def test_positions_chosen_as_torques_are_refused_and_vice_versa(
+    tmp_path, entries, message
+):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
+    assert message in refused(path, *entries)
+
+
+def test_columns_whose_names_say_nothing_else_may_be_chosen_as_anything(tmp_path):
+    """Q is the torque of a textbook, theta the position."""
+    names = ['t', *numbered('theta'), *numbered('Q')]
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
+    is_read(path, 'q=theta_*', 'tau=Q_*')
+
+
 def test_words_in_brackets_that_are_no_units_belong_to_the_name(tmp_path):
     names = ['t', *numbered('q', ' (measured)'), *numbered('tau', ' (filtered)')]
     is_read(written(tmp_path / 'a.csv', names, (TIME, Q, TAU)))
@@ -344,6 +411,116 @@ def test_wrapped_positions_are_unwrapped_and_said(tmp_path):
     )
     np.testing.assert_allclose(recording.q[:280], turning[:280], atol=1e-6)
     assert 'positions of wrist_3_joint are wrapped' in recording.source
+
+
+# Numbers that are none.
+
+
+@pytest.mark.parametrize('stand_in', [-999.0, 1e10, 1.7e308])
+@pytest.mark.parametrize('column', [0, 3, 9])
+@pytest.mark.parametrize('rows', [[70], [0, 70, 71, 150], range(100, 299)])
+def test_stand_ins_for_missing_values_are_missing_and_said(
+    tmp_path, stand_in, column, rows
+):
+    """Of a time, a position and a torque; one, some, or two thirds of the rows."""
+    table = np.column_stack((TIME, Q, TAU))
+    table[rows, column] = stand_in
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, [table])
+    recording = read_table(path, UR5E_TEXT)
+    said = f'{names[column]!r} is {stand_in:g} in {len(rows)} row(s), read as missing'
+    assert said in recording.source
+    begin = 1 if rows[0] == 0 else 0
+    samples = len(recording.q)
+    assert recording.period == pytest.approx(PERIOD)
+    times = np.arange(begin, begin + samples) * PERIOD
+    there = ~recording.gap[:samples] & (times < times[-1] - 3 * PERIOD)
+    wanted = np.sin(np.multiply.outer(times, NUMBERS))
+    # over two rows that are missing, the fastest is off by (6 rad/s x 30 ms)^2 / 8
+    np.testing.assert_allclose(recording.q[:][there], wanted[there], atol=5e-3)
+
+
+def test_several_stand_ins_in_several_columns_are_missing(tmp_path):
+    table = np.column_stack((TIME, Q, TAU))
+    table[40:45, 2], table[60, 2], table[60, 8] = -9999.0, 1e10, -9999.0
+    path = written(tmp_path / 'a.csv', ['t', *numbered('q'), *numbered('tau')], [table])
+    source = read_table(path, UR5E_TEXT).source
+    for said in ("'q_2' is 1e+10 in 1", "'q_2' is -9999 in 5", "'tau_2' is -9999 in 1"):
+        assert said in source
+
+
+def test_hits_pauses_and_coarse_clocks_are_no_stand_ins(tmp_path):
+    names = ['t', *numbered('q'), *numbered('tau', ' [Nmm]')]
+    heavy = 1e4 * TAU
+    heavy[:, 5] *= 1e-3
+    heavy[50, 5] = 900.0  # N mm, a hit on a wrist that has 100 otherwise
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, heavy))
+    recording = read_table(path, UR5E_TEXT)
+    assert 'missing' not in recording.source
+    assert recording.torque[50:51][0, 5] == pytest.approx(0.9)
+    # ms, with a pause of 100 s after a third
+    time = 1e3 * TIME + 1e5 * (TIME > 1.0)
+    path = written(path, ['t_ms', *names[1:]], (time, Q, TAU))
+    recording = read_table(path, UR5E_TEXT)
+    assert 'missing' not in recording.source
+    assert recording.duration == pytest.approx(100.0 + TIME[-1], abs=0.03)
+
+
+@pytest.mark.parametrize('value', [0.0, -9999.0])
+def test_torques_that_are_the_same_in_all_rows_are_refused(tmp_path, value):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    some = TAU.copy()
+    some[:, [3, 5]] = value
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, some))
+    message = refused(path)
+    assert f"'tau_4', 'tau_6': {value:g} in all rows" in message
+    assert 'wrist_1_joint, wrist_3_joint was not recorded' in message
+    assert 'as in --map tau=effort_*' in message
+    path = written(path, names, (TIME, Q, np.full_like(TAU, value)))
+    assert message.split(':')[0] in refused(path)
+    assert 'in all rows' in refused(path)
+
+
+def test_rows_in_which_torques_are_exactly_zero_for_long_are_missing(tmp_path):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    for rows, column in (
+        (range(40), range(6)),  # before anything was heard of the drives
+        (range(150, 200), range(6)),
+        (range(40), [1]),
+        (range(150, 200), [1]),
+        ([100], range(6)),
+    ):
+        torque = TAU.copy()
+        torque[np.ix_(rows, column)] = 0.0
+        path = written(tmp_path / 'a.csv', names, (TIME, Q, torque))
+        recording = read_table(path, UR5E_TEXT)
+        said = f'torques are exactly 0 in {len(rows)} row(s), read as missing'
+        assert said in recording.source
+        offset = len(rows) if rows[0] == 0 else 0
+        times = np.arange(offset, offset + len(recording.q)) * PERIOD
+        there = ~recording.gap & (times < 2.9)
+        wanted = 10.0 * np.cos(np.multiply.outer(times, NUMBERS))
+        # (6 rad/s x 20 ms)^2 / 8 x 10 N m between two rows
+        np.testing.assert_allclose(recording.torque[:][there], wanted[there], atol=0.02)
+
+
+def test_torques_in_steps_of_which_some_are_zero_are_kept(tmp_path):
+    """A coarse current sensor, at an eighth of the range."""
+    torque = 2.5 * np.round(TAU / 2.5)
+    torque[:, 0] = np.where(np.abs(TAU[:, 0]) < 5.0, 0.0, torque[:, 0])
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, torque))
+    recording = read_table(path, UR5E_TEXT)
+    assert 'missing' not in recording.source
+    np.testing.assert_allclose(recording.torque[:290], torque[:290], atol=1e-6)
+
+
+def test_column_without_numbers_is_named(tmp_path):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    torque = TAU.copy()
+    torque[:, 5] = np.nan
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, torque))
+    assert "'tau_6' has no numbers" in refused(path)
 
 
 # Files that take the machine.

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from motor_arm import ELASTIC, LEROBOT, RANGES, TORQUE, MotorDriver, loop_of
@@ -22,7 +24,13 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.field import Field
-from blf_dsc_controller.motors.frame import Gains, Motion, split, torque_alone
+from blf_dsc_controller.motors.frame import (
+    Frame,
+    Gains,
+    Motion,
+    split,
+    torque_alone,
+)
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.supervision.supervisor import Phase
@@ -132,6 +140,27 @@ def run(loop, feedback, duration, dies_after=2.0, loses=0):
         plant.coast()
     travel = np.abs(plant.plant.truth()[-14:-7] - died).max()
     return controller, worst, travel
+
+
+@pytest.mark.parametrize('as_reported', [False, True])
+def test_motors_report_positions_rounded_and_act_on_their_own(as_reported):
+    """Own steps of 0.043 mrad, of which a frame carries those of 0.38; 100 N m/rad."""
+    plant = MotorPlant(loop_of(SLOW).plant, RANGES, as_reported=as_reported)
+    own = damiao.ENCODER * np.arange(1000, 1007)
+    torques = []
+    plant.plant = SimpleNamespace(
+        measure=lambda: np.concatenate((own, np.zeros(14))), step=torques.append
+    )
+    seen = plant.measure()[0]
+    step = RANGES.position.step
+    np.testing.assert_allclose(seen, RANGES.position.nearest(own), atol=1e-12)
+    off = np.abs(seen - own)
+    assert (off <= 0.5 * step + 1e-12).all()
+    assert off.max() > 0.5 * damiao.ENCODER
+    q = np.zeros(7)
+    plant.advance(Frame(q, q, np.full(7, 100.0), q, q), 1)
+    known = seen if as_reported else own
+    np.testing.assert_allclose(torques[0], -100.0 * known, atol=1e-9)
 
 
 def test_a_dead_host_leaves_an_arm_that_its_motors_hold():

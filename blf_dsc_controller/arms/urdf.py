@@ -289,6 +289,11 @@ class Tree(NamedTuple):
         kinds = [self.joints[name].get('type') for name in joints]
         return np.array([kind != 'prismatic' for kind in kinds])
 
+    def reaches(self, joints: Sequence[str]) -> np.ndarray:
+        """Return the largest position (n,) of some joints, to either side [rad or m]."""
+        ranges = [_range(self.joints[name]) for name in joints]
+        return np.array([max(-lower, upper) for lower, upper in ranges])
+
     def only_chain(self) -> tuple[str, ...]:
         """Return the moving joints, which must be one chain."""
         moving = _moving([*self.joints.values()])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
 import os
 import signal
 import socket
@@ -27,6 +26,18 @@ from numpy.typing import ArrayLike
 from blf_dsc_controller import child
 from blf_dsc_controller.control import goal_messages
 from blf_dsc_controller.control.goal_messages import Answer, Outcome
+from blf_dsc_controller.drive.arguments import (
+    checked_config,
+    checked_joints,
+    checked_load,
+    checked_overrides,
+    checked_positions,
+    checked_record,
+    checked_robot,
+    checked_speed,
+    checked_timeout,
+    hint_at_degrees,
+)
 from blf_dsc_controller.errors import (
     DriveError,
     LoopEndedError,
@@ -44,6 +55,7 @@ _PROCESS = 'blf_dsc_controller.drive.script_process'
 _ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 _POLL = 0.1  # s
 _SILENCE = 60.0  # s without a word of a loop that runs
+_KEPT = 100  # results of motions
 _END = 5.0  # s, for a process that was told to end at once
 _LOG = logging.getLogger('blf_dsc_controller')
 
@@ -88,17 +100,15 @@ class Drive:
             DriveError: file, robot or arm are not as they should be.
         """
         self.joints: tuple[str, ...] = ()
-        self._config = str(config)
-        self._overrides = {
-            node: {name: _plain(value) for name, value in each.items()}
-            for node, each in (overrides or {}).items()
-        }
-        self._robot = robot
-        self._record = None if record is None else Path(record)
+        self._config = checked_config(config)
+        self._overrides = checked_overrides(overrides)
+        self._robot = checked_robot(robot)
+        self._record = checked_record(record)
         self._starts = 0
         self._news = threading.Condition()
         self._number = 0
         self._last = 0  # number of the last motion
+        self._hint = 0, ''  # of which motion, and what its error ends with
         self._start()
 
     def __enter__(self) -> Drive:
@@ -138,9 +148,10 @@ class Drive:
             NotInTimeError: after `timeout`.
             LoopEndedError: the loop has ended.
         """
-        values = self._checked(positions)
-        wanted = {'positions': values.tolist(), 'speed': _checked_speed(speed)}
-        self._begin(script_link.MOVE, wanted, wait=wait, timeout=timeout)
+        values = checked_positions(positions, self.joints)
+        wanted = {'positions': values.tolist(), 'speed': checked_speed(speed)}
+        hint = hint_at_degrees(values)
+        self._begin(script_link.MOVE, wanted, wait=wait, timeout=timeout, hint=hint)
 
     def follow(
         self,
@@ -172,7 +183,15 @@ class Drive:
             ) from error
         if not given:
             raise DriveError('points: got none; stop() brakes the arm')
-        wanted = {'points': given, 'joints': list(joints or self.joints)}
+        if given[-1][0] == 0.0:
+            raise DriveError(
+                'points: the last one is at 0 s, but the arm needs time to be there: give times '
+                'from now on, as in (1.0, [0.1, 0.2])'
+            )
+        wanted = {
+            'points': given,
+            'joints': checked_joints(joints) or list(self.joints),
+        }
         self._begin(script_link.FOLLOW, wanted, wait=wait, timeout=timeout)
 
     def move_to_pose(
@@ -201,7 +220,7 @@ class Drive:
             MissingExtraError: pink is not installed.
         """
         begin = np.array(self.state.reference)
-        line = self._poses.line(begin, position, rotation, _checked_speed(speed))
+        line = self._poses.line(begin, position, rotation, checked_speed(speed))
         points = list(zip(line.times, line.positions, strict=True))
         self.follow(points, wait=wait, timeout=timeout)
 
@@ -209,12 +228,13 @@ class Drive:
         """Give the next positions (n,) [rad] of a stream, and return at once.
 
         Call it at a steady rate, such as 30 Hz.  The reference is there an interval later,
-        and brakes if nothing follows.  A target that cannot be followed is logged.
+        and brakes if nothing follows.  A target that cannot be followed is logged, and so is
+        one far beyond the limits, such as degrees, which is not followed.
 
         Raises:
             LoopEndedError: the loop has ended.
         """
-        values = self._checked(positions)
+        values = checked_positions(positions, self.joints)
         self._put(script_link.POSITIONS, values.tobytes())
 
     def wait(self, timeout: float | None = None) -> None:
@@ -254,13 +274,7 @@ class Drive:
             MotionFailedError: these drives cannot be told, or refuse.
             NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        at = np.asarray(centre, float)
-        if not 0.0 <= mass < math.inf or at.shape != (3,) or not np.isfinite(at).all():
-            raise DriveError(
-                f'load: got {mass} kg at {list(centre)} m, but a mass of at least 0 and three '
-                'coordinates are needed'
-            )
-        wanted = {'mass': float(mass), 'centre': at.tolist()}
+        wanted = checked_load(mass, centre)
         self._ask(
             script_link.LOAD, lambda number: {'number': number, **wanted}, timeout
         )
@@ -311,7 +325,12 @@ class Drive:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the last `move_to` or `follow` is not over."""
+        """Whether the last `move_to` or `follow` is not over.
+
+        Raises:
+            LoopEndedError: the loop has ended.
+        """
+        self._check()
         return self._last != 0 and self._last not in self._results
 
     @property
@@ -340,6 +359,7 @@ class Drive:
 
     def close(self) -> None:
         """Bring the arm to rest, and end its loop; a second Ctrl-C ends it at once."""
+        self._closed = True
         if self._process.poll() is None:
             try:
                 self._close_softly()
@@ -353,6 +373,7 @@ class Drive:
 
     def _start(self) -> None:
         self._starts += 1
+        self._closed = False
         record = self._record
         if record is not None and self._starts > 1:
             record = record.with_name(f'{record.name}_{self._starts}')
@@ -480,29 +501,24 @@ class Drive:
 
     # What the script wants.
 
-    def _checked(self, positions: ArrayLike) -> np.ndarray:
-        n = len(self.joints)
-        try:
-            values = np.asarray(positions, float)
-        except (TypeError, ValueError):  # text, names, lists of different lengths
-            raise DriveError(
-                f'positions: got {positions!r}, but {n} finite values are needed, one for each of '
-                f'{", ".join(self.joints)}'
-            ) from None
-        if values.shape != (n,) or not np.isfinite(values).all():
-            raise DriveError(
-                f'positions: got {values.tolist()}, but {n} finite values are needed, one for '
-                f'each of {", ".join(self.joints)}'
-            )
-        return values
-
     def _begin(
-        self, kind: int, wanted: dict[str, Any], *, wait: bool, timeout: float | None
+        self,
+        kind: int,
+        wanted: dict[str, Any],
+        *,
+        wait: bool,
+        timeout: float | None,
+        hint: str = '',
     ) -> None:
+        """Begin a motion; `hint` is what its error ends with."""
+        checked_timeout(timeout)
+        self._check()
         self._number += 1
         self._last = number = self._number
-        with self._news:
-            self._results.clear()  # nobody asks for those of earlier motions
+        self._hint = number, hint
+        with self._news:  # another thread may still ask for that of the last motion
+            for each in [each for each in self._results if each < number - _KEPT]:
+                del self._results[each]
         if kind == script_link.FOLLOW:
             content = script_link.HEAD.pack(number) + topic_link.encode(wanted)
         else:
@@ -521,6 +537,7 @@ class Drive:
     def _ask(
         self, kind: int, wanted: Callable[[int], Any], timeout: float | None
     ) -> None:
+        checked_timeout(timeout)
         self._number += 1
         number = self._number
         self._put(kind, topic_link.encode(wanted(number)))
@@ -535,11 +552,12 @@ class Drive:
         self._until(lambda: number in self._results, timeout)
         error, text = self._results[number]
         if error is not None:
-            raise error(text)
+            of, hint = self._hint
+            raise error(text + hint if number == of else text)
 
     def _until(self, condition: Callable[[], bool], timeout: float | None) -> None:
         """Wait until a condition holds; the link is flushed meanwhile."""
-        end = math.inf if timeout is None else time.monotonic() + timeout
+        end = time.monotonic() + checked_timeout(timeout)
         with self._news:
             while not condition():
                 self._check()
@@ -550,27 +568,20 @@ class Drive:
 
     def _check(self) -> None:
         """Raise LoopEndedError if the loop has ended, or says nothing any more."""
+        if self._ended and self._closed:
+            raise LoopEndedError(
+                'this Drive was closed, as at the end of its block: make another one, or '
+                'recover() starts it again'
+            )
         if self._ended:
-            remedy = '; recover() takes command again' if self._waits else ''
+            again = 'takes command again' if self._waits else 'starts another loop'
+            remedy = f'; recover() {again}' if self._runs else ''
             raise LoopEndedError(f'{self._ended}{remedy}')
         silent = time.monotonic() - self._heard
         if self._runs and silent > _SILENCE:
             raise LoopEndedError(
                 f'the loop has said nothing for {silent:.0f} s: look at the arm, then close()'
             )
-
-
-def _checked_speed(speed: float) -> float:
-    if not 0.0 < speed <= 1.0:
-        raise DriveError(
-            f'speed: got {speed:g}, but a share of the limits is needed: above 0, up to 1'
-        )
-    return float(speed)
-
-
-def _plain(value: object) -> object:
-    """Return a value as JSON has it."""
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def _death(code: int) -> str:

@@ -184,7 +184,7 @@ def disagreements(facts: Facts, config: ControllerConfig) -> list[str]:
     if len(config.joints) != facts.joints:
         problems.append(
             f'joints: got {len(config.joints)}, but the robot has {facts.joints}: give the URDF of '
-            'this robot'
+            'this robot, or in drive.driver the driver of another'
         )
         return problems
     if config.sample_time_ns != round(facts.period * 1e9):

@@ -17,6 +17,9 @@ from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.extras import import_extra
 
+_SHORTEST = 3  # letters of an address that may mean `simulated`
+_LIKE = 0.7  # likeness of such an address
+
 
 def driver_of(
     address: str,
@@ -37,14 +40,24 @@ def driver_of(
         plant = load(path, PLANT, PlantConfig, given.get(PLANT))
         made: type[Driver] = simulated(plant, settings.feedback)
     else:
-        if close := suggestion(address, [SIMULATED], cutoff=0.9):
-            raise BlfDscError(f'--robot: there is no robot {address}{close}')
+        if is_nearly_simulated(address):
+            raise BlfDscError(
+                f'there is no robot {address}, did you mean {SIMULATED}? The host of a robot that '
+                'is called so has an address in numbers, too'
+            )
         made = find_driver(settings.driver)
     check_feedback(made, settings)
     problems = disagreements(made.facts_for(config), config)
     if problems:
         raise ConfigurationError(problems, str(path))
     return made(address, config, settings)
+
+
+def is_nearly_simulated(address: str) -> bool:
+    """Return whether `simulated` was meant, as by sim, simulation or Simulated."""
+    word = address.lower()
+    is_begin = len(word) >= _SHORTEST and SIMULATED.startswith(word)
+    return is_begin or bool(suggestion(word, [SIMULATED], cutoff=_LIKE))
 
 
 def find_driver(name: str) -> type[Driver]:

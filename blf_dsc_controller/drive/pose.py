@@ -152,7 +152,20 @@ def _model(pin: Any, chain: Chain, config: ControllerConfig) -> Any:
 
 
 def _checked(position: ArrayLike, rotation: ArrayLike) -> Pose:
-    at, turned = np.asarray(position, float), np.asarray(rotation, float)
+    try:
+        at = np.asarray(position, float)
+    except (TypeError, ValueError):
+        raise DriveError(
+            f'position: got {type(position).__name__}, but three finite values in m are needed, '
+            'such as pose.position'
+        ) from None
+    try:
+        turned = np.asarray(rotation, float)
+    except (TypeError, ValueError):
+        raise DriveError(
+            f'rotation: got {type(rotation).__name__}, but an orthonormal matrix (3, 3) is needed, '
+            'such as pose.rotation'
+        ) from None
     if at.shape != (3,) or not np.isfinite(at).all():
         raise DriveError(
             f'position: got {at.tolist()}, but three finite values in m are needed'

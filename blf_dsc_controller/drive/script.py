@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.goal_messages import End, Goal, Message, encode
 from blf_dsc_controller.control.goals import Goals
@@ -32,6 +33,8 @@ from blf_dsc_controller.supervision.drive_load import DriveLoad
 _PERIOD = 0.005  # s of the robot's time between two samples
 _SHORTEST = 0.1  # s, of a move
 _SOURCE = 'the script'
+_TURN = 2.0 * math.pi  # rad
+_BEYOND = 2.0  # times what a joint reaches, and at least turns: no target
 
 
 class Script(Beside):
@@ -51,6 +54,7 @@ class Script(Beside):
         self._closes = 0
         self._rests_at = math.nan  # s, when the loop may end
         self._tells_running = False
+        self._has_told_problem = False  # of the last target of a stream
 
     def begin(self, loop: DriveLoop) -> None:
         """Begin a loop."""
@@ -99,7 +103,7 @@ class Script(Beside):
 
     def _take(self, kind: int, content: bytes) -> None:
         if kind == script_link.POSITIONS:
-            self._inputs.stream(self._guard, np.frombuffer(content), _SOURCE)
+            self._stream(np.frombuffer(content))
             return
         if kind == script_link.FOLLOW:
             (number,) = script_link.HEAD.unpack_from(content)
@@ -118,6 +122,15 @@ class Script(Beside):
                 self._tare(wanted)
             case script_link.CLOSE:
                 self._close()
+
+    def _stream(self, positions: np.ndarray) -> None:
+        """Follow positions (n,) [rad], unless they cannot be meant; say so once."""
+        problem = _far_beyond(positions, self._guard.config)
+        if not problem:
+            self._inputs.stream(self._guard, positions, _SOURCE)
+        elif not self._has_told_problem:
+            self.log.warning(problem)
+        self._has_told_problem = bool(problem)
 
     def _begin_goal(self, number: int, make: Callable[[], Trajectory]) -> None:
         goal = Goal(number, b'', (), (), 0.0)
@@ -220,6 +233,23 @@ class Script(Beside):
                 return  # the loop ends, and says why
             self._tell_sample()
         self._link.put(script_link.GOAL, encode(message))
+
+
+def _far_beyond(positions: np.ndarray, config: ControllerConfig) -> str:
+    """Return why positions (n,) [rad] are no target of a stream, such as degrees; or empty.
+
+    Others beyond the limits are a target, on the way to which the reference brakes.
+    """
+    lower, upper = config.limits.position_lower, config.limits.position_upper
+    reach = np.maximum(np.negative(lower), upper)
+    beyond = np.flatnonzero(np.abs(positions) > _BEYOND * np.maximum(reach, _TURN))
+    if not beyond.size:
+        return ''
+    k = int(beyond[0])
+    return (
+        f'stream: {config.joints[k]} is to be at {positions[k]:.4g} rad, and its limits are '
+        f'{lower[k]:g} to {upper[k]:g}: not followed. If these are degrees, give np.deg2rad of them'
+    )
 
 
 def _trajectory(content: bytes) -> Trajectory:

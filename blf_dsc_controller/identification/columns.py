@@ -30,6 +30,7 @@ _WORDS = {
     },
     'theta': {'theta', 'motor', 'motors'},
 }
+_UNIT_OF = {'q': 'q', 'tau': 'tau', 'theta': 'q'}
 _SIDES = {
     *('d', 'des', 'desired', 'target', 'ref', 'reference', 'cmd', 'command'),
     *('ext', 'external', 'error', 'err', 'offset'),
@@ -101,6 +102,7 @@ def choose_columns(
                 f'({", ".join(tau)}): choose as many, as in --map tau=tau_*'
             )
     theta = [] if planned else _of_motors(path, names, given['theta'], joints, q)
+    _check_meanings(path, names, {'q': q, 'tau': tau, 'theta': theta}, joints)
     words = set().union(*(_meaning(name, joints) for name in tau))
     units = [_unit_of(name, 'tau', given['tau']) for name in tau]
     rate = _RATE.fullmatch(given['time'])
@@ -169,6 +171,59 @@ def _of_motors(
         f'{path} has {len(q)} positions ({", ".join(q)}) and {len(theta)} of motors '
         f'({", ".join(theta)}): choose as many, as in --map theta=theta_*'
     )
+
+
+def _check_meanings(
+    path: Path,
+    names: Sequence[str],
+    chosen: Mapping[str, Sequence[str]],
+    joints: Sequence[str],
+) -> None:
+    """Raise BlfDscError if a column is chosen twice, or positions as torques, or vice versa."""
+    kinds: dict[str, str] = {}
+    for kind, columns in chosen.items():
+        by_name = [name for name in names if _is_named(name, kind, joints)]
+        for name in columns:
+            other = kinds.setdefault(name, kind)
+            if kind != 'theta' and by_name and name not in by_name:
+                other = _kind_of(name, joints) or other
+            if other != kind:
+                pattern = pattern_of(names, by_name) if by_name else f'{kind}_*'
+                raise BlfDscError(
+                    f'{path}: {name!r} was chosen as {kind}, but is {other}: choose others, as in '
+                    f"--map '{kind}={pattern}'"
+                )
+
+
+def _kind_of(name: str, joints: Sequence[str]) -> str:
+    """Return whether a column is q or tau by its name; empty if it has no such name."""
+    return next((kind for kind in ('q', 'tau') if _is_named(name, kind, joints)), '')
+
+
+def _is_named(name: str, kind: str, joints: Sequence[str]) -> bool:
+    """Return whether a column is q, tau or theta by its name."""
+    words = _meaning(split_unit(name, _UNIT_OF[kind]).stem, joints)
+    return bool(_WORDS[kind] & words) and not words & _RATES
+
+
+def pattern_of(names: Sequence[str], columns: Sequence[str]) -> str:
+    """Return what chooses exactly these columns: a pattern or numbers."""
+    first = names.index(columns[0])
+    for found in (
+        f'{_begin(columns)}*',
+        f'*{_begin([name[::-1] for name in columns])[::-1]}',
+        f'{first}:{first + len(columns)}',
+    ):
+        if set(_matching(names, found, 'q')) == set(columns):
+            return found
+    return '...'
+
+
+def _begin(names: Sequence[str]) -> str:
+    """Return the letters with which all names begin."""
+    first, last = min(names), max(names)
+    differs = (k for k in range(len(first)) if first[k] != last[k : k + 1])
+    return first[: next(differs, len(first))]
 
 
 def _is_of_motor(name: str, joints: Sequence[str]) -> bool:

@@ -21,6 +21,7 @@ from blf_dsc_controller.identification.columns import (
     Column,
     Columns,
     choose_columns,
+    pattern_of,
 )
 from blf_dsc_controller.identification.recording import (
     LONGEST_PERIOD,
@@ -28,9 +29,17 @@ from blf_dsc_controller.identification.recording import (
     resampled,
 )
 from blf_dsc_controller.identification.table_files import Table, open_table
+from blf_dsc_controller.identification.table_values import (
+    blank_stand_ins,
+    constant,
+    unrecorded,
+)
+from blf_dsc_controller.identification.turns import TURN
+from blf_dsc_controller.identification.units import split_unit
 from blf_dsc_controller.run import Floats, Stamps
 
 _LEAST = 2  # rows
+_BEYOND = 2.0  # times what a joint reaches, and at least turns: no angle in rad
 _BETWEEN = 1.0  # s, least pause between runs in one table
 _MOST_RUNS = 100
 _BACK = 10.0  # intervals that the time falls back where another run begins
@@ -72,15 +81,26 @@ def read_table(
             f'{path} has the positions of {n} joints ({listed}), but from base to '
             f'tip there are {len(arm)}: {", ".join(arm)}'
         )
-    time, q, tau, theta = _values(path, table, columns)
+    time, q, tau, theta, said = _values(path, table, columns)
     q[~np.isfinite(time)] = np.nan
     _check_rows(path, time, q)
     stamp, runs = _one_clock(path, time)
-    source = f'{path.name}: {columns.text}'
     if runs > 1:
-        source += f'; the time starts again {runs - 1} times: read as {runs} runs'
-    motors = theta if columns.theta else None
+        said.append(f'the time starts again {runs - 1} times: read as {runs} runs')
     turning = tree.turning(arm[:n])
+    if not split_unit(given['q'], 'q').unit:
+        reach = np.where(turning, tree.reaches(arm[:n]), np.inf)
+        _check_angles(path, table.names, arm, q, columns, reach)
+    if not planned:
+        _check_torques(path, arm, tau, columns)
+        dropped = unrecorded(tau)
+        tau[dropped] = np.nan
+        if dropped.any():
+            said.append(
+                f'torques are exactly 0 in {dropped.sum()} row(s), read as missing'
+            )
+    source = '; '.join([f'{path.name}: {columns.text}', *said])
+    motors = theta if columns.theta else None
     recording = resampled(arm[:n], stamp, q, tau, source, turning, motors)
     return recording._replace(currents=columns.has_currents)
 
@@ -96,26 +116,80 @@ def _check_rows(path: Path, time: Floats, q: Floats) -> None:
         )
 
 
+def _check_angles(
+    path: Path,
+    names: Sequence[str],
+    joints: Sequence[str],
+    q: Floats,
+    columns: Columns,
+    reach: Floats,
+) -> None:
+    """Raise BlfDscError if positions are far beyond what the joints can reach (n,) [rad]."""
+    largest = np.max(np.abs(q), axis=0, initial=0.0, where=np.isfinite(q))
+    beyond = np.flatnonzero(largest > _BEYOND * np.maximum(reach, TURN))
+    if beyond.size:
+        k = int(beyond[0])
+        pattern = pattern_of(names, [column.name for column in columns.q])
+        raise BlfDscError(
+            f'{path}: {columns.q[k].name!r} goes to {largest[k]:.3g} rad, but {joints[k]} turns by '
+            f"at most {reach[k]:.3g} rad. If it is in degrees: --map 'q={pattern}[deg]'; if it "
+            f"is in rad nevertheless: --map 'q={pattern}[rad]'"
+        )
+
+
+def _check_torques(
+    path: Path, joints: Sequence[str], tau: Floats, columns: Columns
+) -> None:
+    """Raise BlfDscError if the torques (N, n) of joints are the same in all rows."""
+    same = constant(tau)
+    if same.size:
+        listed = ', '.join(repr(columns.tau[k].name) for k in same)
+        moved = ', '.join(joints[k] for k in same)
+        value = tau[np.isfinite(tau[:, same[0]]), same[0]][0]
+        raise BlfDscError(
+            f'{path}: {listed}: {value:g} in all rows, so the torque of {moved} was not recorded '
+            'there: choose the columns that have it, as in --map tau=effort_*'
+        )
+
+
 def _values(
     path: Path, table: Table, columns: Columns
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return time (N,) [s], positions and torques (N, n), and positions of motors, if any."""
+) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
+    """Return time (N,) [s], positions and torques (N, n), positions of motors, if any, and remarks.
+
+    Raises:
+        BlfDscError: there are hardly any.
+    """
     groups = columns.time, columns.q, columns.tau, columns.theta
     values = table.read([column.name for group in groups for column in group])
     if len(values) < _LEAST:
         raise BlfDscError(f'{path} has fewer than {_LEAST} rows of numbers')
     ends = np.cumsum([len(group) for group in groups])[:-1]
-    time, q, tau, theta = (
-        _scaled(part, group)
-        for part, group in zip(np.split(values, ends, axis=1), groups, strict=True)
-    )
+    said = []
+    scaled = []
+    for part, group in zip(np.split(values, ends, axis=1), groups, strict=True):
+        if group:
+            said += blank_stand_ins(part, [column.name for column in group])
+        scaled.append(_scaled(part, group))
+    time, q, tau, theta = scaled
+    _check_known(path, values, [column.name for group in groups for column in group])
     if columns.rate:
         seconds = np.arange(len(values)) / columns.rate
     else:
         first = time[np.isfinite(time).all(axis=1)][:1]
         seconds = np.sum(time - first, axis=1)
         seconds *= _unnamed_unit(path, columns.time, first, seconds)
-    return seconds, q, tau if columns.tau else np.zeros_like(q), theta
+    return seconds, q, tau if columns.tau else np.zeros_like(q), theta, said
+
+
+def _check_known(path: Path, values: Floats, names: Sequence[str]) -> None:
+    """Raise BlfDscError if a column (N, k) has no numbers."""
+    empty = np.flatnonzero(~np.isfinite(values).any(axis=0))
+    if empty.size:
+        raise BlfDscError(
+            f'{path}: {names[int(empty[0])]!r} has no numbers: choose another column, as in '
+            '--map tau=effort_*'
+        )
 
 
 def _scaled(values: Floats, columns: Sequence[Column]) -> Floats:

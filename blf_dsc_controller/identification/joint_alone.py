@@ -28,7 +28,8 @@ SIMPLE = ('viscous', 'Coulomb', 'offset')
 _WEAK = 100.0  # times the deviations of the prior
 _DELAY = 0.05  # s, deviation of the delay
 _PASSES = 5  # of fit and residual
-_FLOOR = 1e-3  # of the torque, least residual
+_FLOOR = 1e-3  # of the torque, least residual of a fit
+_MODEL = 0.02  # of the torque, least residual of a whole arm: models are no better
 _TINY = 1e-9  # N m or N
 _CLEAR = 0.05  # of the torque, least friction that shows a sign ...
 _CERTAIN = 5.0  # ... and standard deviations of its Coulomb part
@@ -47,6 +48,11 @@ class Alone(NamedTuple):
     def delay(self) -> float:
         """Delay of the torques: the median over the joints [s]."""
         return float(np.median(self.values[:, -1]))
+
+    @property
+    def deviation(self) -> Floats:
+        """What a model of the whole arm leaves of each torque (n,) at best [N m or N]."""
+        return np.maximum(self.residual, _MODEL * self.torque)
 
 
 def fit_alone(

@@ -17,7 +17,6 @@ from blf_dsc_controller.identification.plausibility import inertial_torques
 from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows
 from blf_dsc_controller.run import Floats
 
-_RESIDUAL = 0.02  # of the torque, least residual: models are no better
 _UNSEEN = 1e-3  # of its deviation, what a component of gravity counts that is not shown
 _APART = np.cos(
     np.deg2rad(30.0)
@@ -56,7 +55,7 @@ def _shown_gravity(
     _, inertial = inertial_torques(rows, fit, P)
     u = rows.u(alone.delay)[fit]
     n = u.shape[1]
-    deviation = np.maximum(alone.residual, _RESIDUAL * alone.torque)
+    deviation = alone.deviation
     # what friction does not show is taken to be as in most joints
     most = np.sign(np.sum(alone.friction))
     signs = np.where(alone.friction == 0.0, most or 1.0, alone.friction)

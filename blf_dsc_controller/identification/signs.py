@@ -23,7 +23,6 @@ from blf_dsc_controller.identification.physical import solve
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.run import Floats
 
-_RESIDUAL = 0.02  # of the torque, least residual: models are no better
 _AS_GOOD = 1.02  # times the least cost
 _MOST_UNCLEAR = 12  # joints whose signs are combined
 _MOST = 16  # combinations with physical bodies
@@ -71,8 +70,7 @@ class _Fit:
     """The fit of the whole arm to torques with given signs, without their delay."""
 
     def __init__(self, alone: Alone, G: Floats, prior: Prior) -> None:
-        deviation = np.maximum(alone.residual, _RESIDUAL * alone.torque)
-        R = alone.triangles / deviation[:, None, None]
+        R = alone.triangles / alone.deviation[:, None, None]
         self._prior = prior
         self._A = R[:, :, :-2] @ (G @ prior.D)[:-1]  # (n, m + 2, k)
         self._mean = R[:, :, :-2] @ (G @ prior.mean)[:-1]  # (n, m + 2)
