@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.stats import multivariate_normal, multivariate_t
 
 from blf_dsc_controller.law.innovation import (
     CORRELATION,
     State,
     begin,
+    doubted_alarm,
     forget_recent,
     has_begun,
     noise_of,
@@ -140,3 +143,28 @@ def test_rows_of_a_correlated_residual_count_as_fewer():
     """With a correlation of 0.2 s and a row each 10 ms, twenty as one."""
     state = begun()
     assert row_variance(state, PERIOD) == pytest.approx(20.0 * 0.1)
+
+
+def as_improbable(rows, n=6):
+    """The F of n innovations, t by so many independent rows, as improbable as normal 8."""
+
+    def fall(distribution, square):
+        x = np.full(n, np.sqrt(square))
+        return distribution.logpdf(np.zeros(n)) - distribution.logpdf(x)
+
+    known = fall(multivariate_normal(np.zeros(n)), 8.0)
+    doubted = multivariate_t(np.zeros(n), df=n * rows)
+    return brentq(lambda F: fall(doubted, F) - known, 1.0, 100.0)
+
+
+@pytest.mark.parametrize('rows', [0.0, 50.0, 200.0, MOST])
+def test_change_by_a_noise_of_few_rows_is_as_improbable_as_by_that_of_a_window(rows):
+    """By scipy; a hundred assumed rows count, fewer as the window fills."""
+    state = begun()
+    state.rows[0] = rows
+    counted = rows + 100.0 * (1.0 - rows / MOST)
+    few, window = (
+        as_improbable(each * PERIOD / CORRELATION) for each in (counted, MOST)
+    )
+    expected = 8.0 * 0.1 * few / window
+    assert doubted_alarm(state, PERIOD, MOST) == pytest.approx(expected)

@@ -258,6 +258,18 @@ def test_change_in_the_first_window_ends_the_rows_before_if_they_are_enough(
     assert weighing.held_mass(arm.state) == (0.0, np.inf if complete else 0.0)
 
 
+@pytest.mark.parametrize(('seconds', 'ends'), [(0.5, False), (6.0, True)])
+def test_noise_of_half_a_second_is_doubted(seconds, ends):
+    """Rows with 8.4 times the noise so far end a part after a window, and not at first."""
+    arm = Arm()
+    arm.moves(seconds)
+    noise = arm.state.innovation.noise[0]
+    arm.state.innovation.recent[0] = 9.3 * noise
+    arm.moves(DT)
+    assert 8.0 < arm.state.innovation.recent[0] / noise < 9.0 or ends
+    assert (arm.state.wait[0] > 0.0) == ends
+
+
 @pytest.mark.parametrize(
     'friction', [{}, {'lost': LOST}, {'changed': CHANGED}, {'changed': -CHANGED}]
 )

@@ -26,6 +26,8 @@ The arm has changed where the mean over 0.1 s of motion exceeds eight times s^2.
 
 s^2 is assumed at first, and measured as the mean.  Rows that fit ever worse, as under a
 disturbance that lasts, raise it as they come, and contradict nothing.
+
+A s^2 of few rows may be too small (`doubted_alarm`).
 """
 
 from typing import NamedTuple
@@ -33,6 +35,7 @@ from typing import NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
+from blf_dsc_controller.numerics.elementary import exp
 
 CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
@@ -133,6 +136,30 @@ def update(
         state.mean[0] += (usual - share * state.mean[0]) / state.rows[0]
     state.noise[0] = noise_of(state.mean[0], state.rows[0], unmodelled, most)
     return bool(has_changed)
+
+
+@inner
+def doubted_alarm(state: State, period: float, most: float) -> float:
+    """Return the mean square [(N m)^2] that is a change although s^2 may be of few rows.
+
+    It is 8 s^2 of a window, of `most` rows, and more of fewer, as s^2 may be too small.
+    """
+    rows = state.rows[0] + _ASSUMED_ROWS * (1.0 - state.rows[0] / most)
+    excess = _excess(rows * period / CORRELATION)
+    usual = _excess(most * period / CORRELATION)
+    return float(_ALARM * state.noise[0] * excess / usual)
+
+
+@inner
+def _excess(rows: float) -> float:
+    """Return the F whose F s^2 is as improbable as 8 s^2 if s^2 were known, not of `rows`.
+
+    These are independent.  The innovations of n joints are then multivariate t with
+    nu = n `rows` degrees of freedom, so that
+
+        (nu + n) / 2 log(1 + n F / nu) = 8 n / 2
+    """
+    return float(rows * (exp(_ALARM / (rows + 1.0)) - 1.0))
 
 
 @inner

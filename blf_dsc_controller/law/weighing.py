@@ -369,6 +369,8 @@ def update_innovation(
     """Compare a row with the solution; return whether the last ones contradict it."""
     e = work.torque
     x = state.solution
+    now = state.innovation
+    alarm = innovation.doubted_alarm(now, period, settings.window)
     fill_rows(settings, not is_first(state), row, work.rows)
     for i in range(e.size):
         e[i] = row[i, row.shape[1] - 1]
@@ -378,9 +380,8 @@ def update_innovation(
         work.rows, e, state.factor, period, work.covariance
     )
     share = counted_share(dqr, settings.motion_scale)
-    return innovation.update(
-        state.innovation, square, share, settings.unmodelled, period, settings.window
-    )
+    innovation.update(now, square, share, settings.unmodelled, period, settings.window)
+    return bool(now.recent[0] > alarm)
 
 
 @inner
