@@ -2,11 +2,15 @@
 """What gains that elastic joints bear leave of the error: this law, its rivals, and the goals.
 
     python -m benchmark soft-arms [goals] [--truths N] [--arms NAME...] [--laws LAW...]
+                                  [--links] [--keep FILE]
     python -m benchmark soft-arms integrator [--truths N] [--arms NAME...]
     python -m benchmark soft-arms observers [--truths N] [--arms NAME...]
 
-`goals`: each arm moves as its preset does and picks up 2 kg at 8 s.  A row has the worst of N arms
-whose links deviate differently from their URDF:
+`goals`: each arm moves as its preset does and picks up 2 kg at 8 s.  A row has the median and the
+worst of the N true arms on which a law holds, the same for all laws.  Around those of the row
+they have other links, gears, motors and friction, falling and load-dependent, drawn
+independently of the controller (`drawn`), or with `--links` other links alone; gains are those of
+the arm that is assumed:
 
     in motion, pick-up, later   the largest error [mrad] from 4 s to the pick-up, from then on, and
                                 from 3.5 s after it on, at the encoders; where these are at the
@@ -28,11 +32,15 @@ The laws:
     computed torque    with an integral, through the inertia matrix of the URDF
     DOB                that PD over the URDF's model along the reference, and a disturbance
                        observer by momentum, fed forward
+    RISE               that PD over that model, and the integral of the error's sign (`rise.py`)
 
-The last three have the gains with which the linear loop (`random_arms`) has the modulus margin
-of this law on this arm, the largest factor or rate; of the DOB's, the pair of factor and pole
-with the largest integral gain.  The margin is without the load observer.  The UR5e whose
-gears do not bear the gains of its maker has those that leave a margin of 0.5.
+The last four have the gains with which the linear loop (`random_arms`) has the modulus margin
+of this law on this arm, the largest factor or rate; of the DOB's and RISE's, the pair of factor
+and pole with the largest integral gain.  RISE's sign has the half of this rate, at the amplitude
+SIGN of the error by its describing function.  The margin is without the load observer.  The UR5e
+whose gears do not bear the gains of its maker has those that leave a margin of 0.5.
+
+`--keep` appends each run to a file, from which the same command goes on.
 
 `integrator`: this law with multiples of `disturbance.gain`, and of each the least factor by which
 the slow oscillation of the outstretched arm with its rated payload is damped in `joint_gains.py`
@@ -47,7 +55,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -64,17 +73,32 @@ from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 
-NO_SENSORS, NO_LEARNING, DOB = 'without sensors', 'without learning', 'DOB'
-LAWS = (THIS, NO_SENSORS, NO_LEARNING, PD, CT, DOB)
+NO_SENSORS, NO_LEARNING = 'without sensors', 'without learning'
+DOB, RISE = 'DOB', 'RISE'
+RIVALS = (PD, CT, DOB, RISE)
+LAWS = (THIS, NO_SENSORS, NO_LEARNING, *RIVALS)
 MOMENTUM = str(Path(__file__).with_name('momentum_observer.py').resolve())
+ROBUST = str(Path(__file__).with_name('rise.py').resolve())
 MARGIN = 0.5  # of gains that are chosen
 FACTORS = 0.01, 1.0  # on the maker's gains, among them
 POLES = 0.1, 100.0  # rad/s, of the DOB
 SHARES = (0.5, 0.75, 1.0)  # of the PD's factor, in the DOB
 POSTURES = 3
+SIGN = 1e-2  # rad, amplitude of the error at which the sign is half of RISE's integral
+
+SPREADS = {  # of each joint, over what the arm of a row has
+    'joint.stiffness': 1.25,
+    'truth.rotor_inertia': 1.25,
+    'disturbance.viscous': 2.0,
+    'disturbance.coulomb': 1.6,
+}
+FALLING = (0.0, 1.0)  # friction at rest in excess of that in motion, relative
+FALLS_OVER = (0.05, 0.2)  # rad/s
+OF_LOAD = (0.0, 0.08)  # friction, of the torque that a gear carries
 
 _Changes = Mapping[str, object]
 
@@ -202,7 +226,27 @@ def loop_with(arm: Arm, gains: _Changes, law: str = THIS, truth: int = 0) -> Loo
     return load_observer.loop_of(preset, own, {**arm.plant, **seeds}, gains)
 
 
-_Pair = tuple[float, float]  # of a DOB: factor, and pole in rad/s
+def drawn(arm: Arm, number: int) -> _Changes:
+    """Return what a true arm has instead of the arm of a row, beside its links."""
+    plant = loop_with(arm, {}).plant
+    seed = np.random.SeedSequence([number, len(plant.joints)])
+    random = np.random.Generator(np.random.PCG64(seed))
+    given = flatten(plant)
+    changes: dict[str, object] = {}
+    for name, most in SPREADS.items():
+        factor = most ** random.uniform(-1.0, 1.0, len(plant.joints))
+        changes[name] = (factor * np.array(given[name])).tolist()
+    slowest, fastest = FALLS_OVER
+    over = slowest * (fastest / slowest) ** random.uniform()
+    return {
+        **changes,
+        'disturbance.stribeck': random.uniform(*FALLING),
+        'disturbance.stribeck_velocity': float(over),
+        'disturbance.load_share': random.uniform(*OF_LOAD),
+    }
+
+
+_Pair = tuple[float, float]  # of a DOB or RISE: factor, and pole in rad/s
 
 
 class Equal(NamedTuple):
@@ -212,11 +256,17 @@ class Equal(NamedTuple):
     PD: float  # factor
     rate: float  # of computed torque, 1/s
     observers: tuple[_Pair, ...]
+    integrals: tuple[_Pair, ...] = ()  # of RISE
 
     @property
     def DOB(self) -> _Pair:
         """The pair with the largest integral gain."""
         return max(self.observers, key=lambda pair: pair[0] * pair[1])
+
+    @property
+    def RISE(self) -> _Pair:
+        """The pair with the largest integral gain."""
+        return max(self.integrals, key=lambda pair: pair[0] * pair[1])
 
 
 def dob(arm: Arm, M0: np.ndarray, factor: float, pole: float) -> Feedback:
@@ -226,6 +276,23 @@ def dob(arm: Arm, M0: np.ndarray, factor: float, pole: float) -> Feedback:
     K = factor * np.array(robot.stiffness) * one
     D = factor * np.array(robot.damping) * one
     return random_arms.pid(K + pole * D, D + pole * M0, pole * K)
+
+
+def rise(arm: Arm, M0: np.ndarray, factor: float, rate: float) -> Feedback:
+    """Return RISE at errors of the amplitude SIGN: its sign is the half of the integral."""
+    return dob(arm, 0.0 * M0, factor, rate)
+
+
+def rise_gains(pair: _Pair) -> dict[str, float]:
+    """Return the gains of RISE.
+
+    A sign of a sine with amplitude A is 4 / (pi A) times this sine, and the amplitude of e2 is
+    at low frequencies D^-1 K times that of the error.
+    """
+    factor, rate = pair
+    half = 0.5 * rate
+    sign = 0.25 * np.pi * half * SIGN
+    return {'gains.scale': factor, 'gains.rate': half, 'gains.sign': float(sign)}
 
 
 @cache
@@ -246,14 +313,17 @@ def equal(arm_name: str) -> Equal:
             ),
         )
 
-    def pole(share: float) -> float:
-        return random_arms.largest(
-            POLES, lambda pole: of.margin(dob(arm, of.M0, share, pole)) >= aim
-        )
-
     factor = rival(PD)
-    pairs = tuple((share * factor, pole(share * factor)) for share in SHARES)
-    return Equal(margin, factor, rival(CT), pairs)
+
+    def pairs(feedback: Callable[..., Feedback]) -> tuple[_Pair, ...]:
+        def pole(own: float) -> float:
+            return random_arms.largest(
+                POLES, lambda pole: of.margin(feedback(arm, of.M0, own, pole)) >= aim
+            )
+
+        return tuple((share * factor, pole(share * factor)) for share in SHARES)
+
+    return Equal(margin, factor, rival(CT), pairs(dob), pairs(rise))
 
 
 def law_of(
@@ -268,6 +338,8 @@ def law_of(
     if law == CT:
         own = random_arms.computed_torque_gains(gains.rate)
         return random_arms.rival(config, robot, COMPUTED_TORQUE, own)
+    if law == RISE:
+        return random_arms.rival(config, robot, ROBUST, rise_gains(gains.RISE))
     factor, pole = pair or gains.DOB
     own = {'gains.scale': factor, 'gains.bandwidth': pole}
     return random_arms.rival(config, robot, MOMENTUM, own)
@@ -279,11 +351,17 @@ def figures(
     truth: int,
     changes: _Changes | None = None,
     pair: _Pair | None = None,
+    true: _Changes | None = None,
 ) -> Figures:
-    """Run a law on an arm, with `changes` of its gains, or a DOB's `pair`, if they are given."""
-    loop = loop_with(ALL[name], {**gains_of(name), **(changes or {})}, law, truth)
+    """Run a law on an arm.
+
+    `changes` of its gains, a DOB's `pair`, and what a `true` arm has instead, are optional.
+    """
+    arm = ALL[name]
+    arm = arm._replace(plant={**arm.plant, **(true or {})})
+    loop = loop_with(arm, {**gains_of(name), **(changes or {})}, law, truth)
     controller = loop.controller
-    if law in (PD, CT, DOB):
+    if law in RIVALS:
         controller = law_of(controller, name, law, pair)
     record = simulate(controller, loop.plant)
     run = record.run()
@@ -313,44 +391,94 @@ def laws_of(name: str) -> tuple[str, ...]:
         loop_with(ALL[name], gains_of(name)).controller.disturbance.observer_bandwidth
         > 0.0
     )
-    return (THIS, *((NO_SENSORS,) if observes else ()), NO_LEARNING, PD, CT, DOB)
+    return (THIS, *((NO_SENSORS,) if observes else ()), NO_LEARNING, *RIVALS)
 
 
 def row(name: str, law: str, found: list[Figures], others: list[Figures]) -> list[str]:
-    """Return the worst of some arms with a law; `others`, if any, are those without learning."""
+    """Return what becomes of some arms with a law; `others`, if any, are without learning."""
     heads = [ALL[name].label, law]
-    stops = [each.stop for each in found if each.stop]
-    if stops:
-        return [*heads, f'{len(stops)} of {len(found)} stop, {stops[0]}', *['-'] * 6]
-    worst = np.max([each.errors for each in found], axis=0)
-    known = max(each.known if law == THIS else np.nan for each in found)
-    rms = max(each.rms for each in found)
-    ratios = [b.rms / a.rms for a, b in zip(found, others, strict=False)]
+    holding = [each for each in found if not each.stop]
+    fate = fate_of(found)
+    if not holding:
+        return [*heads, fate, *['-'] * 6]
+    known = [each.known for each in holding if law == THIS]
+    pairs = zip(found, others, strict=False)
+    ratios = [b.rms / a.rms for a, b in pairs if not (a.stop or b.stop)]
+    shaking = 100.0 * max(each.shaking for each in holding)
     return [
         *heads,
-        *(f'{each:.2f}' for each in worst),
-        f'{known:.2f} s' if np.isfinite(known) else '-',
-        f'{rms:.2f}',
-        f'{min(ratios):.2g}' if ratios else '-',
-        f'{100.0 * max(each.shaking for each in found):.1f} %'
-        + (', oscillates' if any(each.is_softened for each in found) else ''),
+        *(spread(values) for values in np.transpose([e.errors for e in holding])),
+        spread(known, unit=' s') if known and np.isfinite(known).all() else '-',
+        spread([each.rms for each in holding]),
+        spread(ratios, worst=min, digits='.2g') if ratios else '-',
+        f'{shaking:.1f} %' + (f', {fate}' if fate else ''),
     ]
 
 
-def rows(name: str, truths: int, laws: Sequence[str]) -> Iterator[list[str]]:
-    """Compute the rows of an arm with some laws."""
+def fate_of(found: Sequence[Figures]) -> str:
+    """Return how many of some arms stop, and how many of the others oscillate."""
+    stops = [each.stop for each in found if each.stop]
+    softened = sum(each.is_softened for each in found)
+    return ', '.join(
+        f'{count} of {len(found)} {what}'
+        for count, what in (
+            (len(stops), f'stop, {stops[0]}' if stops else ''),
+            (softened, 'oscillate'),
+        )
+        if count
+    )
+
+
+def spread(
+    values: Sequence[float],
+    worst: Callable[[Sequence[float]], float] = max,
+    digits: str = '.2f',
+    unit: str = '',
+) -> str:
+    """Return the median of values, and the worst of them if there are several."""
+    middle = f'{np.median(values):{digits}}{unit}'
+    return f'{middle} ({worst(values):{digits}})' if len(values) > 1 else middle
+
+
+class Kept:
+    """Figures by arm, law and number of the true arm, in a file of JSON lines if one is named."""
+
+    def __init__(self, path: Path | None, *, links: bool = False) -> None:
+        """Read those that the file has; with `links`, only these differ."""
+        self.path = path
+        self.links = links
+        self.found: dict[tuple[str, str, int], Figures] = {}
+        if path is not None and path.exists():
+            for line in path.read_text(encoding='utf-8').splitlines():
+                (name, law, number), values = json.loads(line)
+                self.found[name, law, number] = Figures(*values)
+
+    def of(self, name: str, law: str, number: int) -> Figures:
+        """Return the figures of a run, from the file or computed now."""
+        key = name, law, number
+        if key not in self.found:
+            true = {} if self.links else drawn(ALL[name], number)
+            self.found[key] = figures(name, law, number, true=true)
+            if self.path is not None:
+                with self.path.open('a', encoding='utf-8') as file:
+                    file.write(json.dumps([key, self.found[key]]) + '\n')
+        return self.found[key]
+
+
+def rows(
+    name: str, truths: int, laws: Sequence[str], kept: Kept
+) -> Iterator[list[str]]:
+    """Compute the rows of an arm with some laws, that without learning first."""
     arm = ALL[name]
     yield [arm.label, 'goal', *arm.goal, f'{arm.known} s', '-', '8', '-']
-    found = {
-        law: [figures(name, law, k) for k in range(1, truths + 1)]
-        for law in laws_of(name)
-        if law in laws
-    }
-    others = found.get(NO_LEARNING, [])
-    for law, each in found.items():
-        yield row(name, law, each, others)
+    asked = [each for each in laws_of(name) if each in laws]
+    others: list[Figures] = []
+    for law in sorted(asked, key=lambda each: each != NO_LEARNING):
+        found = [kept.of(name, law, k) for k in range(1, truths + 1)]
+        others = found if law == NO_LEARNING else others
+        yield row(name, law, found, others)
         if 'sensor.side' in arm.plant:
-            at_links = [of._replace(errors=of.links, known=np.nan) for of in each]
+            at_links = [of._replace(errors=of.links, known=np.nan) for of in found]
             cells = row(name, f'{law}, links', at_links, others)
             yield [*cells[:5], *['-'] * 4]
 
@@ -411,6 +539,7 @@ def gains_row(name: str) -> list[str]:
         f'{of.PD:.2g}',
         f'{of.rate:.2g} 1/s',
         f'{of.DOB[0]:.2g}, {of.DOB[1]:.2g} rad/s',
+        f'{of.RISE[0]:.2g}, {of.RISE[1]:.2g} 1/s',
     ]
 
 
@@ -420,7 +549,7 @@ _HEADS = (
 )
 _INTEGRATOR = (*_HEADS[:1], 'factor', *_HEADS[2:5], _HEADS[8], 'damped')
 _OBSERVERS = (*_HEADS[:1], 'factor and pole', *_HEADS[2:5], _HEADS[8])
-_GAINS = ('arm', 'margin', 'this law, factor', 'PD', 'computed torque', 'DOB')
+_GAINS = ('arm', 'margin', 'this law, factor', *RIVALS)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -431,6 +560,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--truths', type=positive, default=5, help=about)
     parser.add_argument('--arms', nargs='+', choices=ALL, default=list(ARMS))
     parser.add_argument('--laws', nargs='+', choices=LAWS, default=list(LAWS))
+    about = 'true arms differ from the assumed ones in their links alone'
+    parser.add_argument('--links', action='store_true', help=about)
+    parser.add_argument('--keep', type=Path, help='file of the runs that are made')
 
 
 def main(given: argparse.Namespace) -> None:
@@ -445,5 +577,6 @@ def main(given: argparse.Namespace) -> None:
         return
     print_table(_GAINS, map(gains_row, given.arms))
     print()
-    of_arms = (rows(name, given.truths, given.laws) for name in given.arms)
+    kept = Kept(given.keep, links=given.links)
+    of_arms = (rows(name, given.truths, given.laws, kept) for name in given.arms)
     print_table(_HEADS, itertools.chain.from_iterable(of_arms))

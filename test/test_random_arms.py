@@ -13,9 +13,16 @@ from benchmark import (
     many_arms,
     momentum_observer,
     random_arms,
+    rise,
     soft_arms,
+    two_encoders,
 )
-from blf_dsc_controller.arms.linear_loop import Timing, law_response
+from blf_dsc_controller.arms.linear_loop import (
+    Loop,
+    Timing,
+    arm_response,
+    law_response,
+)
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.supervision.model_torque import model_torque
@@ -235,14 +242,162 @@ def test_rivals_at_rest_have_the_gains_that_they_have_in_motion(monkeypatch):
 def test_table_of_soft_arms_has_the_laws_that_are_asked_for(monkeypatch):
     none = [0.0] * 3
 
-    def figures(*run):
+    def figures(*run, true):
         rms = 2.0 if run[1] == soft_arms.NO_LEARNING else 1.0
         return soft_arms.Figures('', none, none, rms, np.nan, 0.0, is_softened=False)
 
     monkeypatch.setattr(soft_arms, 'figures', figures)
     asked = soft_arms.DOB, soft_arms.THIS
-    rows = list(soft_arms.rows('ur5e', 1, asked))
+    rows = list(soft_arms.rows('ur5e', 1, asked, soft_arms.Kept(None)))
     assert [row[1] for row in rows] == ['goal', soft_arms.THIS, soft_arms.DOB]
     assert {row[7] for row in rows[1:]} == {'-'}  # nothing to compare with
-    rows = list(soft_arms.rows('ur5e', 1, (soft_arms.NO_LEARNING, *asked)))
-    assert [row[7] for row in rows[1:]] == ['2', '1', '2']
+    asked = soft_arms.NO_LEARNING, *asked
+    rows = list(soft_arms.rows('ur5e', 1, asked, soft_arms.Kept(None)))
+    assert [row[1] for row in rows[1:]] == [
+        soft_arms.NO_LEARNING,
+        soft_arms.THIS,
+        soft_arms.DOB,
+    ]
+    assert [row[7] for row in rows[1:]] == ['1', '2', '2']
+
+
+def figures_of(worst, stop='', *, is_softened=False):
+    errors = [worst] * 3
+    return soft_arms.Figures(stop, errors, errors, worst, np.nan, 0.02, is_softened)
+
+
+def test_rows_of_soft_arms_say_median_worst_and_what_does_not_hold():
+    stopped = figures_of(np.nan, '2.00 s: oscillation')
+    found = [*map(figures_of, (1.0, 2.0, 6.0)), stopped]
+    others = [*map(figures_of, (2.0, 8.0, 6.0)), figures_of(1.0)]
+    found[0] = found[0]._replace(is_softened=True)
+    row = soft_arms.row('ur5e', soft_arms.DOB, found, others)
+    assert row[2:5] == ['2.00 (6.00)'] * 3
+    assert row[7] == '2 (1)'  # 2 / 1, 8 / 2 and 6 / 6, of arms that go on
+    assert row[8] == '2.0 %, 1 of 4 stop, 2.00 s: oscillation, 1 of 4 oscillate'
+    gone = soft_arms.row('ur5e', soft_arms.DOB, [stopped], [])
+    assert gone[2] == '1 of 1 stop, 2.00 s: oscillation'
+    assert len(gone) == len(row)
+
+
+def test_true_arms_are_the_same_for_all_laws_and_spread_about_that_of_the_row():
+    arm = soft_arms.ARMS['panda']
+    arms = [soft_arms.drawn(arm, number) for number in range(1, 6)]
+    other = arm._replace(gains={'feedback.stiffness': 0.5})
+    assert [soft_arms.drawn(other, number) for number in range(1, 6)] == arms
+    nominal = soft_arms.flatten(soft_arms.loop_with(arm, {}).plant)
+    for name, most in soft_arms.SPREADS.items():
+        factors = np.array([each[name] for each in arms]) / nominal[name]
+        assert 1.0 / most <= factors.min() < 1.0 < factors.max() <= most
+        assert np.unique(factors.round(9)).size == factors.size
+    falling = [each['disturbance.stribeck'] for each in arms]
+    assert len(set(falling)) == len(arms)
+    assert all(0.0 < each['disturbance.load_share'] < 0.08 for each in arms)
+
+
+def test_runs_of_soft_arms_that_are_kept_are_not_made_again(monkeypatch, tmp_path):
+    made = []
+
+    def figures(name, law, number, true):
+        made.append((name, law, number, true['disturbance.stribeck']))
+        return figures_of(1.0 + number)
+
+    monkeypatch.setattr(soft_arms, 'figures', figures)
+    path = tmp_path / 'runs.jsonl'
+    asked = 'fr3', 2, (soft_arms.THIS, soft_arms.PD)
+    rows = list(soft_arms.rows(*asked, soft_arms.Kept(path)))
+    assert list(soft_arms.rows(*asked, soft_arms.Kept(path))) == rows
+    assert len(made) == 4
+    assert made[0][2:] == made[2][2:]  # the same true arm
+    assert made[0][3] != made[1][3]
+
+
+def rise_of(law, controller, error):
+    """Return torques (k, n) of RISE at rest at the errors (k, n), 1 ms apart."""
+    settings, signals = controller.settings, controller.signals
+    state = controller.state._replace(memory=np.zeros(3 * settings.n))
+    for each in (signals.dq, signals.dqr, signals.ddqr):
+        each[:] = 0.0
+    torques = []
+    for k, xi1 in enumerate(error):
+        state.samples[0] = k
+        signals.xi1[:] = xi1
+        law.compute_demand(settings, state, signals, 1e-3 * k, 1e-3)
+        law.finish(settings, state, signals, 1e-3, k >= len(error) - 3)
+        torques.append(signals.demand.copy())
+    return np.array(torques)
+
+
+def test_rise_is_a_pid_over_the_model_and_the_integral_of_a_sign():
+    controller = controller_of(random_arms.study_of('panda').controller)
+    settings, signals = controller.settings, controller.signals
+    rng = np.random.default_rng(1)
+    signals.qr[:] = rng.uniform(-0.5, 0.5, settings.n)
+    gravity = model_torque(settings, settings.initial_estimate, signals.qr)
+    K = settings.barrier.weight
+    error = rng.uniform(-0.01, 0.01, settings.n)
+    law = rise.LAW(scale=0.8, rate=3.0, sign=0.2)
+    torque = rise_of(law, controller, np.tile(error, (9, 1)))
+    rate = 0.8 * (3.0 * K * error + 0.2 * K * np.sign(error))
+    for k in range(7):  # then torques are cut, and nothing is added
+        np.testing.assert_allclose(torque[k], gravity - 1e-3 * k * rate, atol=1e-9)
+    np.testing.assert_allclose(torque[8], torque[6], atol=1e-9)
+    law = rise.LAW(scale=0.8, rate=3.0, sign=0.0)
+    step = rise_of(law, controller, np.array([0.0 * error, error]))
+    np.testing.assert_allclose(step[1], gravity - 0.8 * K * error, atol=1e-9)
+
+
+def test_integral_of_rise_has_its_rate_at_the_amplitude_of_its_sign():
+    """The first harmonic over a slow period, in which D^-1 K e is the whole of e2.
+
+    The sum over 2000 samples is within 1e-3 of the integral.
+    """
+    controller = controller_of(random_arms.study_of('panda').controller)
+    settings = controller.settings
+    wave = np.sin(2.0 * np.pi * np.arange(2003) / 2000.0)
+    errors = soft_arms.SIGN * np.tile(wave[:, None], settings.n)
+    gains = soft_arms.rise_gains((0.9, 8.0))
+    law = rise.LAW(**{name.partition('.')[2]: each for name, each in gains.items()})
+    torque = rise_of(law, controller, errors)
+    K = settings.barrier.weight
+    integral = -(torque - torque[:1]) - 0.9 * K * errors
+    rate = np.diff(integral[:2001], axis=0) / 1e-3
+    found = 2.0 * (rate * wave[:2000, None]).mean(axis=0)
+    np.testing.assert_allclose(found, 0.9 * 8.0 * K * soft_arms.SIGN, rtol=2e-3)
+
+
+def test_two_encoders_have_the_loop_of_one_where_they_are_at_the_same_place():
+    loop = soft_arms.loop_with(soft_arms.ARMS['panda_no_loop'], {})
+    arm = random_arms.describe(loop.controller, loop.plant, 1)
+    own = random_arms.own_feedback(loop.controller, arm.M0)
+    feedback = two_encoders.with_ratio(own, 1.0)
+    seen = two_encoders.responses(arm)
+    C = law_response(feedback, arm.timing, seen.s)
+    for place, side in ((two_encoders.LINKS, False), (two_encoders.MOTORS, True)):
+        joints = arm.joints._replace(motor_side=side)
+        G = arm_response(arm.links, joints, arm.timing, seen.s)
+        gain = two_encoders.loop_gain(seen, arm.timing, feedback, (place, place))
+        np.testing.assert_allclose(gain, C @ G, rtol=1e-6, atol=1e-12)
+        factor = two_encoders.largest(seen, gain)
+        assert 0.0 < factor < 1.0
+        scaled = feedback._replace(
+            position=factor * feedback.position,
+            surface=factor * feedback.surface,
+            integral=1e-3 * own.integral,  # 0 keeps what it has, which is not stable
+        )
+        assert Loop(arm.links, joints, arm.timing, scaled).is_stable()
+
+
+def test_other_damping_leaves_the_stiffness():
+    loop = soft_arms.loop_with(soft_arms.ARMS['panda'], {})
+    arm = random_arms.describe(loop.controller, loop.plant, 1)
+    feedback = random_arms.own_feedback(loop.controller, arm.M0)
+    slow = 2j * np.pi * np.array([0.3, 30.0])
+    usual, other = (
+        law_response(two_encoders.with_ratio(feedback, ratio), arm.timing, slow)
+        for ratio in (1.0, 2.0)
+    )
+    np.testing.assert_allclose(other[:, 0].real, usual[:, 0].real, rtol=0.02)
+    diagonal = np.arange(feedback.rate.size)
+    damping, more = (each[0, 1, diagonal, diagonal] for each in (usual, other))
+    np.testing.assert_allclose(np.abs(more / damping), 2.0, rtol=0.1)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random elastic arms that change, each with and without learning.
+
+    python -m benchmark soft-pairs [N] [--robots NAME...] [--keep FILE]
+
+The studies are `monte_carlo_elastic_changes_*`: gears, motors, links, delays and tables are drawn
+independently of the controller, friction falls with the speed and grows with the load, and four
+events change load, friction and what pushes.  Each arm runs with learning, without it, and
+without it with other noise.  The rms is that of the error's norm from 5 s on, with learning over
+without, of arms that go to the end with finite numbers both times.
+
+It goes round the robots arm by arm.  After an interrupt, `--keep` goes on from the arms that
+its file has, and `soft-pairs 0` prints the table of what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmark.harness import print_table
+from benchmark.studies import load_study
+from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study
+from blf_dsc_controller.studies.runs import KEPT, VIOLATED, Columns, run_chunk
+
+ROBOTS = 'panda', 'ur5e'
+LAWS = '', WITHOUT, NOISE
+ALLOWED = 1.1  # rms with learning over without
+
+
+class Pair(NamedTuple):
+    """What becomes of an arm with learning, without it, and with other noise."""
+
+    robot: str
+    number: int
+    kept: tuple[bool, ...]  # the bound
+    ends: tuple[bool, ...]  # with finite numbers
+    rms: tuple[float, ...]  # rad, of the norm
+
+
+def pair_of(robot: str, number: int, study: Study, found: Columns) -> Pair:
+    """Return an arm from the columns of its runs."""
+
+    def rms(law: str) -> float:
+        each = [found[f'{law}rms_error_rad.{name}'][0] for name in study.plant.joints]
+        return float(np.linalg.norm(each))
+
+    outcomes = [str(found[f'{law}outcome'][0]) for law in LAWS]
+    return Pair(
+        robot,
+        number,
+        tuple(each == KEPT for each in outcomes),
+        tuple(each in (KEPT, VIOLATED) for each in outcomes),
+        tuple(map(rms, LAWS)),
+    )
+
+
+def pairs(runs: int, robots: Sequence[str], path: Path | None) -> Iterator[Pair]:
+    """Yield the arms that a file has, and those that are missing, which it gets."""
+    known = set()
+    if path is not None and path.exists():
+        for line in path.read_text(encoding='utf-8').splitlines():
+            robot, number, *values = json.loads(line)
+            known.add((robot, number))
+            yield Pair(robot, number, *map(tuple, values))
+    studies = {
+        name: load_study(f'monte_carlo_elastic_changes_{name}') for name in robots
+    }
+    for number, (name, study) in itertools.product(range(runs), studies.items()):
+        if (name, number) in known:
+            continue
+        with np.errstate(all='ignore'):
+            pair = pair_of(name, number, study, run_chunk(study, number, 1))
+        if path is not None:
+            with path.open('a', encoding='utf-8') as file:
+                file.write(json.dumps(pair) + '\n')
+        yield pair
+
+
+def row(robot: str, found: Sequence[Pair]) -> list[str]:
+    """Return what becomes of the arms of a robot."""
+    kept = np.array([each.kept for each in found])
+    with_, without, noise = kept.T
+    both = [each for each in found if all(each.ends)]
+    rms = np.array([each.rms for each in both])
+    ratio, chance = rms[:, 0] / rms[:, 1], rms[:, 2] / rms[:, 1]
+    return [
+        robot,
+        f'{len(found)}',
+        f'{with_.sum()} / {without.sum()}',
+        *(
+            f'{(a & ~b).sum()} / {(b & ~a).sum()}'
+            for a, b in ((without, with_), (without, noise))
+        ),
+        f'{len(both)}',
+        f'{np.median(ratio):.2f}, {ratio.max():.2f} ({both[int(ratio.argmax())].number})',
+        f'{(ratio > 1.0).sum()}, {(ratio > ALLOWED).sum()}',
+        f'{chance.max():.2f}',
+    ]
+
+
+HEADS = (
+    'robot',
+    'arms',
+    'bound kept with / without learning',
+    'broken only with / only without',
+    'broken only with / only without other noise',
+    'go to the end',
+    'rms with over without: median, largest (arm)',
+    'above 1, above 1.1',
+    'of other noise: largest',
+)
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument('runs', type=int, nargs='?', default=1000, help='arms of each')
+    parser.add_argument('--robots', nargs='+', choices=ROBOTS, default=list(ROBOTS))
+    parser.add_argument('--keep', type=Path, help='file of the runs that are made')
+
+
+def main(given: argparse.Namespace) -> None:
+    """Print the table."""
+    found = list(pairs(given.runs, given.robots, given.keep))
+    names = sorted({each.robot for each in found})
+    of = {name: [each for each in found if each.robot == name] for name in names}
+    print_table(HEADS, (row(*each) for each in of.items()))
