@@ -177,6 +177,35 @@ def test_arm_reaches_the_reference_from_anywhere_within_the_bound(start):
     assert away[t < settled].max() > BOUND
 
 
+@pytest.mark.parametrize(
+    ('speed', 'frequency', 'upper', 'share'),
+    [
+        (0.6, 1.0, 6.0, 0.6),
+        (0.0, 1.0, 6.0, 1.0),  # from rest
+        (1.0, 1.0, 6.0, 1.0),  # it would take 4.8 s
+        # braked by half of 2 rad/s^2 within 0.27 rad from 2.3 rad, by half of 1.2 in 0.45 rad
+        (0.6, 1.0, 2.65, 1.0),
+        (0.6, 2.2, 6.0, 1.0),  # the reference itself has 1.45 rad/s^2
+    ],
+)
+def test_arm_in_motion_is_taken_over_gently_where_that_is_possible(
+    speed, frequency, upper, share
+):
+    config = replace(
+        CONFIG,
+        reference=replace(CONFIG.reference, frequency=(frequency,)),
+        limits=replace(CONFIG.limits, position_upper=(upper, upper)),
+    )
+    start, velocity = np.array([2.3, 1.4]), np.array([speed, 0.0])
+    motion = plan_start(config, np.full(2, BOUND), start, velocity)
+    t = np.linspace(0.0, motion.settled, 10_000)
+    q, _, ddq = sampled(motion.vector, t).transpose(1, 0, 2)
+    used = (np.abs(ddq) / config.limits.acceleration).max()
+    assert used <= share * 1.001
+    assert used > 0.6 * 1.001 or share < 1.0
+    assert q.max() <= upper
+
+
 def test_fast_reference_is_approached_through_rest_at_its_middle():
     """At 96 % of the velocity limit it leaves too little speed to cover four radians directly."""
     config = replace(

@@ -11,6 +11,7 @@ from blf_dsc_controller import load_loop
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.recent_motion import RecentMotion
 from sim_plant.plant import plant_of
 
 LOADED = {
@@ -71,6 +72,63 @@ def test_it_goes_on_from_the_torque_that_holds_the_arm(arm):
     assert speed < 0.02  # rad/s
     types = [event.type for event in arm.guard.journal.pending]
     assert types[-2:] == [EventType.TAKEOVER, EventType.START]
+
+
+def test_a_reset_in_command_forgets_what_was_learned_and_goes_on_to_carry_the_load(arm):
+    """Elsewhere the arm sags, as the next test shows."""
+    held = arm.guard.controller.state.torque.copy()
+    arm.guard.reset()
+    state, settings = arm.guard.controller.state, arm.guard.controller.settings
+    np.testing.assert_array_equal(state.estimate, settings.initial_estimate)
+    torques, speed = arm.run(0.5)
+    assert speed < 0.02  # rad/s
+    np.testing.assert_allclose(torques[0], held, atol=0.5)
+
+
+@pytest.mark.parametrize('forgets', ['stopped', 'gap'])
+def test_a_reset_of_a_stopped_law_or_before_a_gap_begins_without_a_load(forgets):
+    """What has held the arm since may be another."""
+    arm = Arm('fr3')
+    arm.run(3.0)
+    carried = np.abs(arm.guard.controller.state.disturbance).max()
+    if forgets == 'stopped':
+        arm.guard.fail('by hand')
+        arm.run(0.1)
+    arm.guard.reset()
+    arm.stamp += 10**8 * (forgets == 'gap')
+    arm.run(arm.config.sample_time)
+    assert arm.guard.supervisor.running, arm.guard.supervisor.text
+    assert np.abs(arm.guard.controller.state.disturbance).max() < 0.01 * carried
+
+
+@pytest.mark.parametrize(
+    ('elapsed', 'moved', 'leads'),
+    [
+        (0.001, 0.0029, True),
+        (0.001, -0.0031, False),  # as the simulation of another episode begins
+        (0.02, 0.05, True),
+        (0.031, 0.0, False),
+        (0.0, 0.0, False),
+    ],
+)
+def test_last_sample_leads_to_a_state_that_an_arm_of_3_rad_s_can_reach(
+    elapsed, moved, leads
+):
+    recent = RecentMotion(1, 0.001)
+    assert not recent.leads_to(10**9, np.zeros(1), 3.0)
+    recent.take(10**9, np.array([0.5, 0.0, 0.0]), np.zeros(1))
+    stamp = 10**9 + round(elapsed * 1e9)
+    assert recent.leads_to(stamp, np.array([0.5 + moved]), 3.0) == leads
+
+
+def test_two_resets_in_a_row_carry_the_load():
+    """The second finds no sample, or too few to observe it."""
+    arm = Arm('fr3')
+    arm.run(3.0)
+    for seconds in (0.0, 0.05, 0.1):
+        arm.guard.reset()
+        _, speed = arm.run(seconds)
+        assert speed < 0.02
 
 
 @pytest.mark.parametrize('arm', ['fr3', 'panda'], indirect=True)

@@ -4,7 +4,8 @@
 An arm in motion is taken over at its velocity, in a motion that brakes.  A reference to
 hold rests where this ends.  Any other reference is blended into the present motion (see
 `terms`), starting at t0, in the shortest time that keeps the limits, found in 10 %
-steps and refined by bisection.  A blend exceeds the speed of its parts only by a
+steps and refined by bisection; in motion with a share of the acceleration, if that is
+possible and soon enough.  A blend exceeds the speed of its parts only by a
 multiple of their distance over its duration, so one exists if both parts stay strictly
 within the limits and their distance is finite.
 """
@@ -12,6 +13,8 @@ within the limits and their distance is finite.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +46,12 @@ _STEP = 1.1
 _BISECTIONS = 5
 _BRAKE = 3.0
 """Braking from v in the time h takes up to 1.5 v / h: h = 3 v / limit takes half."""
+_IN_MOTION = 0.6
+"""Share of limits.acceleration for a takeover in motion, where positions and time permit it.
+
+What the model lacks, as a load that a reset has made the law forget, acts by the acceleration.
+"""
+_LONGEST_IN_MOTION = 4.0  # s
 _PERIOD = 0.005  # s, between two checked samples
 _FEWEST_CHECKED = 200  # samples, for short motions
 _MOST_CHECKED = 1_000_000  # samples, for very long ones
@@ -151,16 +160,22 @@ def stop(t0: float, q: np.ndarray, dq: np.ndarray, config: ControllerConfig) -> 
 
 
 def blend(
-    before: Sequence[Term], target: Term, t0: float, config: ControllerConfig
+    before: Sequence[Term],
+    target: Term,
+    t0: float,
+    config: ControllerConfig,
+    longest: float = inf,
 ) -> BlendedReference:
     """Blend from `before` to `target`, starting at t0 [s], as fast as the limits allow.
 
     Raises:
-        MotionError: `target` or every blend within approach.longest violates a limit.
+        MotionError: `target` within approach.longest, or every blend within that and `longest`
+            [s], violates a limit.
     """
     n = len(config.joints)
-    longest = config.approach.longest
-    found = worst_violation(pack(n, [target]), check_times(t0, t0 + longest), config)
+    seen = config.approach.longest
+    longest = min(longest, seen)
+    found = worst_violation(pack(n, [target]), check_times(t0, t0 + seen), config)
     if found is not None:
         raise MotionError(
             f'the reference exceeds the limits of the arm: {found}; reduce the motion, or relax '
@@ -322,6 +337,9 @@ def plan_start(
         if _joins(config, dq, vector, t) or not config.approach.enabled:
             return BlendedReference(vector, t)
     (target,) = unpack(vector)
+    motion = _gently(config, q, dq, target, t)
+    if motion is not None:
+        return motion
     begin = [stop(t, q, dq, config)]
     try:
         return blend(begin, target, t, config)
@@ -351,8 +369,27 @@ def plan_resumption(
     check_takeover(config, bound, q, dq, reference_vector, t)
     if _joins(config, dq, reference_vector, t):
         return BlendedReference(reference_vector, t)
-    begin = [stop(t, q, dq, config)]
-    return blend(begin, unpack(reference_vector)[-1], t, config)
+    target = unpack(reference_vector)[-1]
+    motion = _gently(config, q, dq, target, t)
+    return motion or blend([stop(t, q, dq, config)], target, t, config)
+
+
+def _gently(
+    config: ControllerConfig, q: np.ndarray, dq: np.ndarray, target: Term, t: float
+) -> BlendedReference | None:
+    """Plan from motion to `target` with a share of the acceleration; None: rest, or no way."""
+    if np.abs(dq).max() <= AT_REST:
+        return None
+    limits = config.limits
+    acceleration = tuple(_IN_MOTION * each for each in limits.acceleration)
+    gentle = replace(config, limits=replace(limits, acceleration=acceleration))
+    begin, rest = stop(t, q, dq, gentle), t + braking_time(dq, gentle)
+    if worst_violation(pack(q.size, [begin]), check_times(t, rest), gentle) is not None:
+        return None  # known at once: no blend with it keeps the limits
+    try:
+        return blend([begin], target, t, gentle, _LONGEST_IN_MOTION)
+    except MotionError:
+        return None
 
 
 def _joins(

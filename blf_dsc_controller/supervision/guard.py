@@ -477,7 +477,7 @@ class Guard:
         """Go on from a start, or from the return to the reference, with this state."""
         self.journal.note(EventType.START, resumed=resumed)
         self._reference.last_stamp = stamp - self.config.sample_time_ns
-        self._takeover.acting = None
+        self._takeover.acting = self._takeover.carried = None
         self._held.recent.restart()
         self.watchdog.switch(self.config.safety.watchdog, stamp)
         self.supervisor.enter(Phase.APPROACHING)
@@ -685,13 +685,20 @@ class Guard:
             self._safe_stop.begin_deactivation(self.config.safety)
 
     def reset(self) -> None:
-        """Discard all estimates and faults, and restart with the next state."""
+        """Discard all estimates and faults, and restart with the next state.
+
+        A law in command goes on to carry what it carries besides the model.
+        """
         self._note(EventType.RESET)
         self._reference.resumable = False
         self.controller.reset()
         self._loads.forget()
+        load = self._takeover.carried  # of a reset just before
+        if self.supervisor.running:
+            load = self._held.load_before_learning()
         self.samples.keep()
         self._start_over()
+        self._takeover.carried = load
 
     def plan(self, command: Trajectory | Target, at: float | None = None) -> Plan:
         """Plan a motion, in any thread, to `adopt` by the time `at` [s] (now).
@@ -793,7 +800,7 @@ class Guard:
         self.states.restart()
         self.samples.restart()
         self.start_error = None
-        self._takeover.acting = None
+        self._takeover.acting = self._takeover.carried = None
         self.silenced = self.contacts.hold = False
         self.has_sample = False
         self._clean = True

@@ -66,6 +66,15 @@ class HeldTorque:
         load = self.recent.load(self._controller.settings, self._samples.estimate)
         return self._samples.disturbance if load is None else load
 
+    def load_before_learning(self) -> Vector:
+        """Return the load (n,) [N m] besides the initial estimate, by the last samples.
+
+        Where these are too few, it is the disturbance estimate of the law.
+        """
+        settings = self._controller.settings
+        load = self.recent.load(settings, settings.initial_estimate)
+        return self._samples.disturbance.copy() if load is None else load
+
     def load_of(self, command: Vector, q: Vector) -> Vector:
         """Return what a command (n,) [N m] carries besides the model, at rest at q (n,) [rad]."""
         at_rest = np.zeros((2, q.size))

@@ -21,12 +21,15 @@ class Takeover:
 
     Attributes:
         acting: torque (n,) [N m] by which another node holds the arm; None: none does.
+        carried: load (n,) [N m] of a law that was reset in command, which it goes on to carry
+            if nothing happens before it starts; None: it begins with its estimates.
     """
 
     def __init__(
         self, controller: Controller, reference: RunningReference, held: HeldTorque
     ) -> None:
         self.acting: Vector | None = None
+        self.carried: Vector | None = None
         self._controller = controller
         self._reference = reference
         self._held = held
@@ -57,6 +60,7 @@ class Takeover:
             motion = reference.plan_start(config, q, dq)
         self._controller.reference_vector = motion.vector
         self._begin_at_acting(q)
+        self._go_on_carrying(config, stamp, q)
         if commanded is None:
             check_first_torque(self._controller, config, measurement, self.acting)
         if not resumed:
@@ -87,11 +91,20 @@ class Takeover:
         """Let the law begin with the torque that another node holds the arm by, if any."""
         if self.acting is None:
             return
+        self._begin_with_load(self._held.load_of(self.acting, q))
+        self._controller.take_over(self.acting, q)
+
+    def _go_on_carrying(self, config: ControllerConfig, stamp: int, q: Vector) -> None:
+        """Let the law begin with the load that was carried until a reset, if any."""
+        fastest = config.safety.velocity_limit
+        if self.carried is not None and self._held.recent.leads_to(stamp, q, fastest):
+            self._begin_with_load(self.carried)
+
+    def _begin_with_load(self, load: Vector) -> None:
+        """Let d^3 begin with a load (n,) [N m]."""
         law = self._controller
         integrates = law.settings.disturbance.gain > 0.0
-        load = self._held.load_of(self.acting, q)
         law.state.disturbance[integrates] = load[integrates]
-        law.take_over(self.acting, q)
 
     def _follow(
         self, motion: BlendedReference, q: Vector, commanded: Vector | None
