@@ -50,6 +50,7 @@ if find_spec('rclpy'):  # some tests run without ROS
 # with one of them at the end.
 _FIRST = (
     'test_drive_franka',
+    'test_commissioning',
     'test_identify',
     'test_closed_loop',
     'test_examples',
@@ -65,7 +66,7 @@ _FIRST = (
     'test_monte_carlo',
     'test_watchdog',
     'test_nodes',
-    'test_commissioning',
+    'test_contact',
     'test_replay',
 )
 

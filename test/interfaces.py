@@ -7,6 +7,7 @@ few calls of the C compiler here.
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import io
 import os
@@ -14,10 +15,13 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from contextlib import redirect_stdout
+import tempfile
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 
 import numpy as np
+
+from blf_dsc_controller.compiled import kernel_cache
 
 # of a message: for the middleware, and for its description of the type
 _SUPPORTS = ('rosidl_typesupport_fastrtps_c', 'rosidl_typesupport_introspection_c')
@@ -61,8 +65,35 @@ def why_not() -> str:
     return f'no {missing[0]}' if missing else ''
 
 
+def built(definitions: Path) -> Path:
+    """Return a folder for PYTHONPATH with the package in `definitions`, named as that folder.
+
+    It is built once and kept beside the compiled kernels, for it takes 12 s of CPU time.
+    """
+    cache = kernel_cache.place()
+    folder = cache / f'{definitions.name}-{_digest(definitions)}'
+    if not folder.exists():
+        with tempfile.TemporaryDirectory(dir=cache) as fresh:
+            build(definitions, Path(fresh, 'built'))
+            with suppress(OSError):  # another process was faster
+                Path(fresh, 'built').rename(folder)
+    return folder
+
+
+def _digest(definitions: Path) -> str:
+    """Return what tells builds apart: definitions, generators and libraries, Python and numpy."""
+    found = hashlib.sha256(f'{sys.version} {sys.prefix} {np.__version__}'.encode())
+    for path in (Path(__file__), *sorted(definitions.rglob('*'))):
+        if path.is_file():
+            found.update(path.name.encode() + b'\0' + path.read_bytes())
+    for each in _LIBRARIES:
+        library = Path(sys.prefix, 'lib', f'lib{each}.so').stat()
+        found.update(f'{each} {library.st_size} {library.st_mtime_ns}'.encode())
+    return found.hexdigest()[:16]
+
+
 def build(definitions: Path, folder: Path) -> None:
-    """Build the package in `definitions`, named as that folder, into a folder for PYTHONPATH."""
+    """Build the package into a folder that may be moved afterwards."""
     name = definitions.name
     package = folder / name
     package.mkdir(parents=True)
@@ -138,7 +169,7 @@ def _compile(folder: Path, sources: list[Path], library: Path, *needed: Path) ->
         subprocess.run([compiler, *options, source, '-o', objects[-1]], check=True)
     of_ros = [*_LIBRARIES, *(f'{each}__{part}' for each in _USED for part in _PARTS)]
     links = [
-        f'-Wl,-soname,{library.name},--no-as-needed,-rpath,{folder}',
+        f'-Wl,-soname,{library.name},--no-as-needed,-rpath,$ORIGIN:$ORIGIN/..',
         *needed,
         f'-L{prefix / "lib"}',
         *(f'-l{each}' for each in of_ros),

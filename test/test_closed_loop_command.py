@@ -272,7 +272,9 @@ def test_folder_of_a_run_without_a_bag_goes_at_an_interrupt(tmp_path):
     assert discard_unrecorded() == []
 
 
-@pytest.mark.parametrize('mode', ['lockstep', 'realtime'])
+@pytest.mark.parametrize(
+    'mode', ['lockstep', pytest.param('realtime', marks=pytest.mark.nightly)]
+)
 def test_full_disk_ends_the_run_and_tells_how_to_recover_the_bag(tmp_path, mode):
     config = tmp_path / 'patient.yaml'
     config.write_text(PATIENT)

@@ -10,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from elastic_two_link import ARM, BEGIN, FAR, NEAR
+from elastic_two_link import ARM, BEGIN, FAR, NEAR, shorten_motions
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.commissioning import motion as motions
+from blf_dsc_controller.commissioning import proof
 from blf_dsc_controller.commissioning.commissioning import plan, postures_of
 from blf_dsc_controller.commissioning.driven import Driven
-from blf_dsc_controller.commissioning.motion import SETTLING
 from blf_dsc_controller.commissioning.postures import SPEED, EndedError, move
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -32,6 +33,7 @@ from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 
+pytestmark = pytest.mark.usefixtures('blank_pictures')
 DRIVER = """
 from math import inf
 from plant_driver import PlantDriver
@@ -42,10 +44,17 @@ class DRIVER(PlantDriver):
 
 
 @pytest.fixture
-def arm(tmp_path, monkeypatch):
+def whole(tmp_path, monkeypatch):
     """Write the arm's parameter file, with a driver on this arm, and return its path."""
     monkeypatch.syspath_prepend(Path(__file__).parent)
     return written(tmp_path, joints=2)
+
+
+@pytest.fixture
+def arm(whole, monkeypatch):
+    """Return that of an arm which is measured in less time."""
+    shorten_motions(monkeypatch)
+    return whole
 
 
 def written(folder, joints):
@@ -77,7 +86,9 @@ def gains_of(path):
     return np.array([feedback.joint_stiffness, feedback.joint_damping])
 
 
-def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(arm, capsys):
+def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(whole, capsys):
+    """In the time that a real one is given, in which the arm stays where it is."""
+    arm = whole
     assert commission(arm, 'plant', '--yes', postures=(NEAR, FAR)) == 0
     told = capsys.readouterr().out
     before, _, after = told.partition('0 of 2 postures measured')
@@ -110,9 +121,9 @@ def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(arm, ca
     ('address', 'code', 'printed'),
     [
         ('interrupt@300', 130, 'move 1: ended on request. No gains were chosen'),
-        ('interrupt@9000', 130, 'posture 1: ended on request. No gains were chosen'),
-        ('late@9000', 5, 'posture 1: the controller stopped: the stamp of a joint'),
-        ('reflex@9000', 5, 'posture 1: the robot stopped by itself: joint_reflex; it'),
+        ('interrupt@7000', 130, 'posture 1: ended on request. No gains were chosen'),
+        ('late@7000', 5, 'posture 1: the controller stopped: the stamp of a joint'),
+        ('reflex@7000', 5, 'posture 1: the robot stopped by itself: joint_reflex; it'),
         ('silent@300', 5, 'move 1: the connection was lost: no state for 1 s'),
         ('absent', 1, 'there is no robot: switch it on'),
     ],
@@ -120,7 +131,7 @@ def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(arm, ca
 def test_end_before_its_time_is_calm_and_writes_nothing_that_looks_whole(
     address, code, printed, arm, capsys
 ):
-    """The move takes 3.5 s: state 9000 is in the motion, before its period is over."""
+    """The move takes 3.5 s: state 7000 is in the motion, before its period is over."""
     assert commission(arm, address, '--yes') == code
     assert printed in capsys.readouterr().err
     assert nothing_looks_whole(arm)
@@ -244,7 +255,7 @@ def test_contacts_end_a_motion_and_loads_are_not_told_in_it():
     (motion,) = plan(change(preset, given), posture[None])
     assert motion.config.contact.reaction == 'stop'
     assert not motion.config.load.tell_drive
-    assert motion.duration > SETTLING + motion.excitation.period
+    assert motion.duration > motions.SETTLING + motion.excitation.period
 
 
 def test_reference_to_hold_visits_where_the_arm_is(arm):
@@ -359,7 +370,10 @@ def prove(arm, address, gains, *options):
     return main([*words, '--yes', '--record', str(arm.with_name('proof')), *options])
 
 
-def test_gains_are_proven_in_three_steps_and_errors_compared(arm, capsys):
+def test_gains_are_proven_in_three_steps_and_errors_compared(arm, capsys, monkeypatch):
+    """Each takes less time than a robot is given; the reference repeats itself after 3.2 s."""
+    monkeypatch.setattr(proof, '_SHORT', 1.0)
+    monkeypatch.setattr(proof, '_LAST', 4.0)
     assert prove(arm, 'plant', CHOSEN) == 0
     told = capsys.readouterr().out
     said = [

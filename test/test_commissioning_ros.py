@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from elastic_two_link import ARM, NEAR
+from elastic_two_link import ARM, NEAR, shorten_motions
 from rclpy.parameter import Parameter
 
 import blf_dsc_controller as blf
@@ -28,6 +28,8 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+
+pytestmark = pytest.mark.usefixtures('blank_pictures')
 
 
 class Rig:
@@ -77,7 +79,8 @@ def rig(ros, tmp_path):
     return Rig(ros, tmp_path)
 
 
-def test_arm_is_measured_and_its_bags_give_gains_with_the_margin(rig):
+def test_arm_is_measured_and_its_bags_give_gains_with_the_margin(rig, monkeypatch):
+    shorten_motions(monkeypatch)
     found = rig.measured(NEAR)
     assert [name for name, _ in found] == ['posture 1']
     (bag,) = (bag for _, bag in found)

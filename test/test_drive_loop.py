@@ -226,11 +226,11 @@ class LoadedDriver(PlantDriver):
         return self.mass
 
 
-def run_with_load(tmp_path, driver, duration, given=TOLD):
+def run_with_load(driver, duration, given=TOLD, record=None):
     config = blf.load_loop('fr3_direct', {CONTROLLER: given}).controller
     made = driver('plant', config, DriveConfig())
     made.connect()
-    with blf.ArmController(config, record=tmp_path / 'bag') as controller:
+    with blf.ArmController(config, record=record) as controller:
         loop = DriveLoop(made, controller, duration=duration)
         outcome = loop.run()
     assert outcome.end is End.DURATION, outcome.text
@@ -240,9 +240,9 @@ def run_with_load(tmp_path, driver, duration, given=TOLD):
 @pytest.fixture(scope='module')
 def all_of_it(tmp_path_factory):
     """Run with learning, a bound at the tool, a load that is told, and a contact."""
-    folder = tmp_path_factory.mktemp('all_of_it')
-    made = run_with_load(folder, LoadedDriver, 10.0, ALL)
-    return *made, read_run(folder / 'bag'), blf.verify(folder / 'bag')
+    bag = tmp_path_factory.mktemp('all_of_it') / 'bag'
+    made = run_with_load(LoadedDriver, 10.0, ALL, bag)
+    return *made, read_run(bag), blf.verify(bag)
 
 
 def test_weighed_load_is_told_to_the_drives_without_a_step_of_any_torque(all_of_it):
@@ -295,20 +295,20 @@ def test_run_with_all_of_it_replays_bit_for_bit(all_of_it):
     assert latched[-1] == 1.0
 
 
-def test_drives_that_refuse_a_load_are_asked_once(tmp_path):
+def test_drives_that_refuse_a_load_are_asked_once():
     class Refusing(LoadedDriver):
         refuses = True
 
-    driver, loop, _ = run_with_load(tmp_path, Refusing, 8.0)
+    driver, loop, _ = run_with_load(Refusing, 8.0)
     assert loop.remark == 'the load was refused: see Desk'
     assert driver.mass == 0
 
 
-def test_drives_that_forbid_it_are_not_told_while_they_move(tmp_path):
+def test_drives_that_forbid_it_are_not_told_while_they_move():
     class Forbidding(LoadedDriver):
         facts = LoadedDriver.facts._replace(load_in_motion=False)
 
-    driver, loop, _ = run_with_load(tmp_path, Forbidding, 8.0)
+    driver, loop, _ = run_with_load(Forbidding, 8.0)
     assert not driver.told
     assert not loop.remark
 

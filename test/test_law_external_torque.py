@@ -83,13 +83,13 @@ def test_phase_follows_from_distances_and_times(
     assert next_phase(phase, distance, remaining, calm, explained, H) == expected
 
 
-def update(state, r, load, seconds, settings=SETTINGS):
+def update(state, r, load, seconds, settings=SETTINGS, dt=DT):
     """Update the contact for some time of a constant r (n,)."""
     work = part(Work)
     state.torque[:] = r
-    for _ in range(round(seconds / DT)):
+    for _ in range(round(seconds / dt)):
         distance = external_torque.whiten_torque(state, work)
-        external_torque.update_contact(settings, state, work, load, distance, DT)
+        external_torque.update_contact(settings, state, work, load, distance, dt)
 
 
 def tip(mass, deviation):
@@ -115,7 +115,7 @@ def tip(mass, deviation):
 def test_load_explains_no_more_than_is_held(state, mass, deviation, pull, expected):
     """z_0 goes to 1 or -1, and the mass with it, within 2 s: 10 filters of 0.2 s."""
     state.filtered[0, 0] = 1.0
-    update(state, [pull, 0.0], tip(mass, deviation), 2.0)
+    update(state, [pull, 0.0], tip(mass, deviation), 2.0, dt=5.0 * DT)
     assert state.phase[0] == expected
     loads = SETTINGS._replace(loads=0)
     update(state, [pull, 0.0], tip(mass, deviation), DT, loads)

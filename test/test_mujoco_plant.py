@@ -227,7 +227,7 @@ def test_closed_loop_runs_the_same_with_both_plants():
         ('panda_rigid', 0.2, 2.3),
         pytest.param('ur5e_rigid', 0.55, 1.6, marks=pytest.mark.nightly),
         pytest.param('openarm', 0.36, 6.4, marks=pytest.mark.nightly),
-        ('widowx', 0.58, 39.0),
+        pytest.param('widowx', 0.58, 39.0, marks=pytest.mark.nightly),
     ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):

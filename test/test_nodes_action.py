@@ -64,7 +64,7 @@ CANCELED = GoalStatus.STATUS_CANCELED
 
 
 @pytest.fixture(scope='module')
-def built(tmp_path_factory):
+def built():
     """Provide a folder with control_msgs, unless ROS has it."""
     if importlib.util.find_spec('control_msgs'):
         return None
@@ -72,9 +72,7 @@ def built(tmp_path_factory):
         pytest.skip(
             f'control_msgs is not installed, and not built: {interfaces.why_not()}'
         )
-    folder = tmp_path_factory.mktemp('interfaces')
-    interfaces.build(Path(__file__).parent / 'definitions' / 'control_msgs', folder)
-    return folder
+    return interfaces.built(Path(__file__).parent / 'definitions' / 'control_msgs')
 
 
 @pytest.fixture(scope='module')

@@ -91,6 +91,7 @@ def test_python_blocks_run_and_print_the_output_shown_below_them(
                 assert printed.getvalue() == below.content
 
 
+@pytest.mark.usefixtures('blank_pictures')
 def test_python_of_the_home_page_keeps_the_bound(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = (DOC / 'index.rst').read_text()
