@@ -18,7 +18,7 @@ from recorded_run import Synthetic, small_disk
 from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.parser import make_parser
-from blf_dsc_controller.cli.run import _configuration, _ideal
+from blf_dsc_controller.cli.run import loop_configuration, notes_on_ideal_arm
 from blf_dsc_controller.compiled.announcement import COMPILING
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 
@@ -178,6 +178,23 @@ def test_wrong_name_is_answered_with_what_may_be_meant(
     assert (tmp_path / 'notes.md').read_text() == 'mine'
 
 
+@pytest.mark.parametrize(
+    ('command', 'what'),
+    [('report', 'drawn'), ('replay', 'run through the controller again')],
+)
+def test_work_on_a_large_bag_is_announced(tmp_path, monkeypatch, capsys, command, what):
+    monkeypatch.chdir(tmp_path)
+    large = tmp_path / 'long' / 'bag_0.mcap'
+    large.parent.mkdir()
+    for size, lines in ((9_000_000, 1), (12_000_000, 2)):
+        with large.open('wb') as file:
+            file.truncate(size)  # takes no space on the disk
+        assert main([command, 'long']) == 1  # it is no bag
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == lines
+    assert told[0] == f'long: 12 MB are {what}'
+
+
 def test_study_of_an_arm_that_is_none_leaves_no_folder(tmp_path, capsys):
     out = tmp_path / 'arms'
     for config, problem in (('nothing', 'does not exist'), ('paper', 'model two_link')):
@@ -189,12 +206,14 @@ def test_study_of_an_arm_that_is_none_leaves_no_folder(tmp_path, capsys):
 def test_run_says_that_its_simulated_arm_is_ideal_and_that_nothing_moves(tmp_path):
     path = tmp_path / 'my.yaml'
     path.write_text('/**: {ros__parameters: {robot: {urdf: ur5e.urdf, tip: tool0}}}\n')
-    rigid, holds = _ideal(load_loop(path))
+    rigid, holds = notes_on_ideal_arm(load_loop(path))
     assert 'exactly that of the URDF, on rigid gears' in rigid
     assert 'reference.type is hold' in holds
     still = {CONTROLLER: {'reference.type': 'sinusoids'}}
-    assert 'reference.amplitude is 0' in [*_ideal(load_loop(path, still))][1]
-    assert [*_ideal(load_loop('ur5e'))] == []
+    assert (
+        'reference.amplitude is 0' in [*notes_on_ideal_arm(load_loop(path, still))][1]
+    )
+    assert [*notes_on_ideal_arm(load_loop('ur5e'))] == []
 
 
 def test_interrupt_during_kernel_compilation_ends_the_command():
@@ -415,9 +434,9 @@ def test_duration_of_zero_is_no_limit_which_no_offline_run_can_have(tmp_path, ca
 
 def test_run_over_ros_without_a_limit_gets_a_plant_without_a_limit():
     options = make_parser().parse_args(['run', '--duration', '0'])
-    assert _configuration(options).plant.duration == 0.0
+    assert loop_configuration(options).plant.duration == 0.0
     options = make_parser().parse_args(['run'])
-    assert _configuration(options).plant.duration == 60.0
+    assert loop_configuration(options).plant.duration == 60.0
 
 
 def test_sections_that_no_node_reads_are_named_once(tmp_path, capsys):

@@ -21,6 +21,7 @@ import pytest
 import yaml
 
 import blf_dsc_controller
+from blf_dsc_controller.compiled import linked
 from blf_dsc_controller.errors import (
     BlfDscError,
     ConfigurationError,
@@ -318,6 +319,15 @@ def test_every_dependency_has_a_lower_bound(distribution):
     bare += [line for line in distribution.requires if 'trimesh' in line]
     assert bare
     assert [line for line in bare if '>=' not in line] == []
+
+
+def test_numba_is_installed_only_up_to_the_releases_whose_private_parts_are_known():
+    options = configparser.ConfigParser()
+    options.read(ROOT / 'setup.cfg')
+    required = options['options']['install_requires'].split()
+    (numba,) = (each for each in required if each.startswith('numba'))
+    first, after = ('.'.join(map(str, each)) for each in (linked.FIRST, linked.AFTER))
+    assert numba == f'numba>={first},<{after}'
 
 
 @pytest.mark.parametrize(

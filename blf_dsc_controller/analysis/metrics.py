@@ -68,6 +68,7 @@ class Metrics:
     samples: int
     joints: tuple[str, ...]
     sliding: tuple[str, ...]  #: those that slide: m and N instead of rad and N m
+    # of each joint
     max_error: tuple[float, ...]  #: (n,) rad, of |xi1|
     rms_error: tuple[float, ...]  #: (n,) rad
     bound: tuple[float, ...]  #: (n,) rad, the smallest
@@ -76,6 +77,7 @@ class Metrics:
     rms_torque: tuple[float, ...]  #: (n,) N m
     torque_limit: tuple[float, ...]  #: (n,) N m, the smallest
     torque_rate: tuple[float, ...]  #: (n,) N m/s, rms of the change per sample time
+    # the bound, and what happened
     max_error_ratio: float  #: of |xi1| / k_c
     held: bool | None  #: whether no joint left its bound
     first_violation: float  #: s
@@ -83,6 +85,7 @@ class Metrics:
     stops: list[dict[str, Any]]  #: `time` [s], `reason` and `text` of each
     #: `time` [s], `joint`, `torque`, `interval` [N m] of each, or None if not detected
     contacts: list[dict[str, Any]] | None
+    # learning
     learns: bool  #: whether the law uses what it learns
     latch_time: float  #: s
     model_changes: list[float]  #: s, when changes of the arm were detected
@@ -92,9 +95,11 @@ class Metrics:
     tool: dict[str, float] | None
     #: `rate` [Hz], `latency` [s], `late_steps`, in real time
     timing: dict[str, Any] | None
+    # what was learned, beside the truth
     estimate: dict[str, float] | None = None  #: at the end
     true: dict[str, float] | None = None  #: at the end
-    of_torques: bool = False  #: whether the following are errors of the model's torques
+    #: whether the parameter errors are those of the model's torques, as of a URDF's arm
+    of_torques: bool = False
     parameter_error: dict[int, float] = field(
         default_factory=lambda: dict.fromkeys(MOMENTS, math.nan)
     )  #: `Estimates.relative_error` at MOMENTS

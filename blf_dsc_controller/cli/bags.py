@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from blf_dsc_controller.bags import reader, recovery, table
@@ -26,6 +28,7 @@ PARTIAL = 4
 """Exit code if all compared outputs are equal, but others could not be compared."""
 
 _PAGES = {'', '.html', '.htm'}
+_LARGE = 10_000_000  # bytes, from which a bag takes more than some seconds
 _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 
@@ -37,6 +40,7 @@ def report(options: Namespace) -> None:
         raise BlfDscError(f'{options.out}: the report is a page: give a name in .html')
     make_room(options.out, force=options.force)
     names = NameMap.parse(options.map)
+    _announce(options.bags, 'drawn')
     bags = [read_bag(path, options.namespace, names) for path in options.bags]
     write_report(bags, options.out)
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
@@ -106,6 +110,7 @@ def replay(options: Namespace) -> int:
         return 0
     from blf_dsc_controller.replay.verify import verify
 
+    _announce([options.bag], 'run through the controller again')
     begin = time.perf_counter()
     names = NameMap.parse(options.map)
     result = verify(options.bag, options.namespace, names, options.law)
@@ -117,6 +122,17 @@ def replay(options: Namespace) -> int:
     if result.difference is not None:
         return DIFFERENT
     return PARTIAL if result.is_partial else 0
+
+
+def _announce(bags: Sequence[Path], what: str) -> None:
+    """Say to stderr what is done with bags, if that takes more than some seconds."""
+    files = [
+        file for bag in bags for file in ([bag] if bag.is_file() else bag.glob('*'))
+    ]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    if size > _LARGE:
+        listed = ', '.join(map(str, bags))
+        print(f'{listed}: {size / 1e6:.0f} MB are {what}', file=sys.stderr, flush=True)
 
 
 def play(options: Namespace) -> None:

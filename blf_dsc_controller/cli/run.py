@@ -67,7 +67,7 @@ def run(options: Namespace) -> int:
     """Run the closed loop and write the results to a new folder."""
     refuse_existing(options.out)  # before warnings, and what takes seconds
     with announced_compilation(print_notice):
-        config = _configuration(options)
+        config = loop_configuration(options)
     if options.view:
         if options.offline:
             raise BlfDscError('--view shows a run over ROS: leave out --offline')
@@ -107,7 +107,7 @@ def run(options: Namespace) -> int:
     return STOPPED if stopped else 0
 
 
-def _configuration(options: Namespace) -> LoopConfig:
+def loop_configuration(options: Namespace) -> LoopConfig:
     """Return the configuration of the three nodes, from file and options.
 
     Prints configuration warnings, and raises StartError or MotionError if the
@@ -139,7 +139,7 @@ def _configuration(options: Namespace) -> LoopConfig:
         print(f'warning: {warning}', file=sys.stderr)
     if controller.model == 'urdf':
         print(f'errors to expect: {expectation(controller)}')
-        for note in _ideal(config):
+        for note in notes_on_ideal_arm(config):
             print_notice(f'note: {note}')
     if end := end_of_waypoints(controller):
         print(end)
@@ -158,7 +158,7 @@ def _unused(given: str) -> Iterator[str]:
         )
 
 
-def _ideal(config: LoopConfig) -> Iterator[str]:
+def notes_on_ideal_arm(config: LoopConfig) -> Iterator[str]:
     """Yield why a simulated arm of a URDF errs less than a real one."""
     plant = config.plant
     if plant.truth == Truth() and not any(plant.joint.stiffness):

@@ -212,20 +212,19 @@ def _run_nodes(
         is_lockstep = config.plant.mode == 'lockstep'
         loop = [_LOOP] if is_lockstep else [CONTROLLER, PLANT]
         nodes = [started(name) for name in (RECORDER, *loop)]
-        starting = nodes
-        pages: list[NodeProcess] = []
-        while all(node.is_running for node in nodes) and not interrupts:
+
+        def is_running() -> bool:
+            return all(node.is_running for node in nodes) and not interrupts
+
+        while is_running() and monitor.start is None:
             monitor.wait(0.1)
-            notices = [notice for node in starting for notice in node.new_notices()]
-            for notice in notices:
-                tqdm.write(notice, file=sys.stderr)
-            if monitor.start is not None and (starting is nodes or notices):
-                # Only now, since the nodes wait for a subscriber, which must be the
-                # recorder.
-                if view:
-                    pages.append(started(VIEW))
-                starting = pages if view else []
-                view = False
+            _show_notices(nodes)
+        # Only now, since the nodes wait for a subscriber, which must be the recorder.
+        begun = view and monitor.start is not None
+        pages = [started(VIEW)] if begun else []
+        while is_running():
+            monitor.wait(0.1)
+            _show_notices(pages)
         if interrupts and monitor.start is None:
             _do_not_wait_for(nodes)  # they import, compile or wait for each other
             raise KeyboardInterrupt
@@ -237,6 +236,13 @@ def _run_nodes(
     for node in nodes:
         node.check()
     return completed
+
+
+def _show_notices(nodes: Iterable[NodeProcess]) -> None:
+    """Print what nodes newly report, above the progress bar."""
+    for node in nodes:
+        for notice in node.new_notices():
+            tqdm.write(notice, file=sys.stderr)
 
 
 def _hurry_without_recorder(recorder: NodeProcess, *others: NodeProcess) -> None:
@@ -269,8 +275,7 @@ def _keep(
         node.stop()  # so that the page says that they have finished
     tqdm.write(_ENDED, file=sys.stderr)
     while pages[0].is_running and not interrupts:
-        for notice in pages[0].new_notices():
-            tqdm.write(notice, file=sys.stderr)
+        _show_notices(pages)
         monitor.wait(0.1)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -188,7 +188,7 @@ class BagRecorderNode(PlainNode):
             return False
         taken = self._raw_subscriptions.take()
         try:
-            for message in self._timed([*filter(self._is_first, taken)]):
+            for message in self._timed(self._without_repeats(taken)):
                 self._bag.write(*message)
             if flush:
                 self._bag.flush()
@@ -199,10 +199,14 @@ class BagRecorderNode(PlainNode):
             self.failure = self._bag.abandon(error)
         return len(taken) > _RARE
 
-    def _is_first(self, message: RawMessage) -> bool:
-        """Whether a message has not been taken from another subscription before."""
-        recent = self._twice.get(message.handle)
-        return recent is None or recent.add(message)
+    def _without_repeats(self, taken: Iterable[RawMessage]) -> list[RawMessage]:
+        """Remember messages; return those that no other subscription has brought before."""
+        new = []
+        for message in taken:
+            recent = self._twice.get(message.handle)
+            if recent is None or recent.add(message):
+                new.append(message)
+        return new
 
     def _timed(self, messages: list[RawMessage]) -> list[RawMessage]:
         """Return messages with log times, those of the plant if it is the clock.

@@ -65,7 +65,9 @@ class StartConditions:
             StartError: it must not.
         """
         if not self._are_met:
-            self._are_met = self._is_alone() and (commanding or self._is_watched())
+            self._are_met = self._is_alone() and (
+                commanding or self._watchdog_lets_start()
+            )
         return self._are_met
 
     def end(self) -> np.ndarray | None:
@@ -95,7 +97,12 @@ class StartConditions:
             )
         return finding is Finding.NOBODY
 
-    def _is_watched(self) -> bool:
+    def _watchdog_lets_start(self) -> bool:
+        """Ask the watchdog now; warn while it delays the start.
+
+        Raises:
+            StartError: it was not ready in time.
+        """
         if not self._watchdog.delay_start(self._steady() * 1e-9):
             return True
         self._node.get_logger().warning(
