@@ -504,6 +504,16 @@ def test_rows_in_which_torques_are_exactly_zero_for_long_are_missing(tmp_path):
         np.testing.assert_allclose(recording.torque[:][there], wanted[there], atol=0.02)
 
 
+def test_first_state_may_be_before_any_torque(tmp_path):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    torque = TAU.copy()
+    torque[0] = 0.0
+    path = written(tmp_path / 'a.csv', names, (TIME, Q, torque))
+    recording = read_table(path, UR5E_TEXT)
+    assert 'missing' not in recording.source
+    np.testing.assert_allclose(recording.torque[:290], torque[:290], atol=1e-6)
+
+
 def test_torques_in_steps_of_which_some_are_zero_are_kept(tmp_path):
     """A coarse current sensor, at an eighth of the range."""
     torque = 2.5 * np.round(TAU / 2.5)

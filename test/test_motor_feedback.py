@@ -253,7 +253,9 @@ def test_motors_of_the_simulated_robot_are_those_of_the_plant(feedback, tmp_path
 def test_simulated_motors_need_their_models():
     loop = loop_of(SLOW)
     made = simulated(loop.plant, 'motor')
-    with pytest.raises(BlfDscError, match=r'motor_models: got 0, .* 7 joints'):
+    with pytest.raises(
+        BlfDscError, match=r'motor_models: got 0, .* 7 joints: .* each, of 4310, 4340'
+    ):
         made('simulated', loop.controller, build(DriveConfig, {'feedback': 'motor'}))
 
 

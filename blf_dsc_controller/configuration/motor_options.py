@@ -37,13 +37,17 @@ def limits_of(config: DriveConfig, joints: int) -> list[Limits]:
     Raises:
         BlfDscError: the models of so many motors are not given.
     """
-    models = _for_each('motor_models', config.motor_models, joints)
+    known = f', of {", ".join(damiao.MODELS)}'
+    models = _for_each('motor_models', config.motor_models, joints, known)
     return [damiao.MODELS[each] for each in models]
 
 
-def _for_each(name: str, given: Sequence[T], joints: int) -> Sequence[T]:
+def _for_each(
+    name: str, given: Sequence[T], joints: int, known: str = ''
+) -> Sequence[T]:
     if len(given) != joints:
         raise BlfDscError(
-            f'drive.{name}: got {len(given)}, but the arm has {joints} joints: give one for each'
+            f'drive.{name}: got {len(given)}, but the arm has {joints} joints: give one for '
+            f'each{known}'
         )
     return given

@@ -92,9 +92,17 @@ def constant(torque: Floats) -> NDArray[np.intp]:
 
 
 def unrecorded(torque: Floats) -> NDArray[np.bool_]:
-    """Return the rows (N,) in which all torques (N, n) are zero, or one is for long."""
+    """Return the rows (N,) in which all torques (N, n) are zero, or one is for long.
+
+    Few of the former at the begin and the end stay: arms may have no torque there.
+    """
     is_zero = torque == 0.0
-    found: NDArray[np.bool_] = is_zero.all(axis=1) & (torque.shape[1] > 1)
+    n = len(torque)
+    found = np.zeros(n, dtype=bool)
+    for begin, end in _runs(is_zero.all(axis=1)):
+        is_inside = begin > 0 and end < n  # the first state may be before any torque
+        if torque.shape[1] > 1 and (is_inside or end - begin >= _LONG):
+            found[begin:end] = True
     for column, zeros in zip(torque.T, is_zero.T, strict=True):
         sizes = np.abs(column)
         least = np.min(sizes, initial=np.inf, where=sizes > 0.0)
