@@ -242,7 +242,7 @@ def test_rivals_at_rest_have_the_gains_that_they_have_in_motion(monkeypatch):
 def test_table_of_soft_arms_has_the_laws_that_are_asked_for(monkeypatch):
     none = [0.0] * 3
 
-    def figures(*run, true):
+    def figures(*run, **_):
         rms = 2.0 if run[1] == soft_arms.NO_LEARNING else 1.0
         return soft_arms.Figures('', none, none, rms, np.nan, 0.0, is_softened=False)
 
