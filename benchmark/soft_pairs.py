@@ -88,8 +88,6 @@ def row(robot: str, found: Sequence[Pair]) -> list[str]:
     kept = np.array([each.kept for each in found])
     with_, without, noise = kept.T
     both = [each for each in found if all(each.ends)]
-    rms = np.array([each.rms for each in both])
-    ratio, chance = rms[:, 0] / rms[:, 1], rms[:, 2] / rms[:, 1]
     return [
         robot,
         f'{len(found)}',
@@ -99,7 +97,17 @@ def row(robot: str, found: Sequence[Pair]) -> list[str]:
             for a, b in ((without, with_), (without, noise))
         ),
         f'{len(both)}',
-        f'{np.median(ratio):.2f}, {ratio.max():.2f} ({both[int(ratio.argmax())].number})',
+        *(ratios(both) if both else ['-'] * 3),
+    ]
+
+
+def ratios(found: Sequence[Pair]) -> list[str]:
+    """Return how the rms of some arms with learning, and with other noise, is to that without."""
+    rms = np.array([each.rms for each in found])
+    ratio, chance = rms[:, 0] / rms[:, 1], rms[:, 2] / rms[:, 1]
+    worst = int(ratio.argmax())
+    return [
+        f'{np.median(ratio):.2f}, {ratio[worst]:.2f} ({found[worst].number})',
         f'{(ratio > 1.0).sum()}, {(ratio > ALLOWED).sum()}',
         f'{chance.max():.2f}',
     ]

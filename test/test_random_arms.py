@@ -15,6 +15,7 @@ from benchmark import (
     random_arms,
     rise,
     soft_arms,
+    soft_pairs,
     two_encoders,
 )
 from blf_dsc_controller.arms.linear_loop import (
@@ -242,7 +243,7 @@ def test_rivals_at_rest_have_the_gains_that_they_have_in_motion(monkeypatch):
 def test_table_of_soft_arms_has_the_laws_that_are_asked_for(monkeypatch):
     none = [0.0] * 3
 
-    def figures(*run, true):
+    def figures(*run, **_):
         rms = 2.0 if run[1] == soft_arms.NO_LEARNING else 1.0
         return soft_arms.Figures('', none, none, rms, np.nan, 0.0, is_softened=False)
 
@@ -401,3 +402,48 @@ def test_other_damping_leaves_the_stiffness():
     diagonal = np.arange(feedback.rate.size)
     damping, more = (each[0, 1, diagonal, diagonal] for each in (usual, other))
     np.testing.assert_allclose(np.abs(more / damping), 2.0, rtol=0.1)
+
+
+def test_rows_of_pairs_count_what_learning_and_noise_break():
+    yes, no = (True,) * 3, (False,) * 3
+    found = [
+        soft_pairs.Pair('panda', 0, yes, yes, (1.0, 2.0, 2.0)),
+        soft_pairs.Pair('panda', 1, (False, True, True), yes, (2.4, 2.0, 2.1)),
+        soft_pairs.Pair('panda', 2, (True, False, False), yes, (2.1, 2.0, 2.0)),
+        soft_pairs.Pair('panda', 3, (True, True, False), yes, (1.0, 2.0, 3.0)),
+        soft_pairs.Pair('panda', 4, no, (False, True, True), (np.nan, 2.0, 2.0)),
+    ]
+    row = soft_pairs.row('panda', found)
+    assert row[1:6] == ['5', '3 / 3', '1 / 1', '1 / 0', '4']
+    assert row[6:] == ['0.78, 1.20 (1)', '2, 1', '1.50']
+    assert len(row) == len(soft_pairs.HEADS) == len(soft_pairs.row('panda', found[4:]))
+
+
+def test_pairs_that_are_kept_are_not_run_again(monkeypatch, tmp_path):
+    made = []
+
+    def run_chunk(study, first, count):
+        made.append(first + count - 1)
+        rms = {f'rms_error_rad.{name}': [3e-3] for name in study.plant.joints}
+        row = {'outcome': ['kept'], **rms}
+        return {f'{law}{name}': row[name] for law in soft_pairs.LAWS for name in row}
+
+    monkeypatch.setattr(soft_pairs, 'run_chunk', run_chunk)
+    path = tmp_path / 'pairs.jsonl'
+    found = list(soft_pairs.pairs(2, ['ur5e'], path))
+    assert list(soft_pairs.pairs(2, ['ur5e'], path)) == found
+    assert made == [0, 1]
+    assert found[1].rms == pytest.approx([3e-3 * 6**0.5] * 3)
+    assert found[1].kept == found[1].ends == (True,) * 3
+
+
+@pytest.mark.parametrize('name', soft_pairs.ROBOTS)
+def test_arms_of_pairs_are_elastic_and_their_friction_falls_and_follows_the_load(name):
+    study = soft_pairs.load_study(f'monte_carlo_elastic_changes_{name}')
+    arms = [random_arms.arm_of(study, number) for number in range(5)]
+    assert study.settings.pairs
+    assert min(min(arm.joint.stiffness) for arm in arms) >= 1e4
+    assert len({arm.disturbance.stribeck for arm in arms}) == len(arms)
+    assert len({arm.disturbance.load_share for arm in arms}) == len(arms)
+    assert all(arm.events.begin[0] >= 1.0 for arm in arms)
+    assert any(any(arm.events.payload) for arm in arms)
