@@ -113,7 +113,7 @@ class MotionLimits:
     scale: float = positive(
         1.0,
         'share of the largest velocity, acceleration and jerk that motions which are sent '
-        'may use; starts and stops have all of it',
+        'may use; starts from rest and stops have all of it',
         at_most=1.0,
     )
 
