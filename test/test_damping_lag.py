@@ -18,11 +18,12 @@ from blf_dsc_controller.supervision.expected_errors import linear_feedback
 from blf_dsc_controller.supervision.retuning import apply_bumpless
 
 T = 0.001  # s
+LATE = 100.0  # s, when bounds have narrowed
 LAG = {'feedback.damping_lag': 0.003}
 HELD = {
     'reference.type': 'hold',
     'learning.weight': 0.0,
-    'learning.adaptation_gain': [0.0] * 52,
+    'learning.adaptation_gain': [0.0] * 40,
 }
 SHAKEN = 3  # the joint
 
@@ -52,17 +53,18 @@ def test_the_law_has_the_frequency_response_of_its_linear_form(
     qr, n = np.array(config.reference.offset), 6
     s = 2j * np.pi * hertz
     size = 1e-3 if of_velocity else 1e-6
-    demands = []
+    torques = []
     for k in range(1000):
         measurement = np.concatenate((qr, np.zeros(2 * n)))
         measurement[n * of_velocity + SHAKEN] += size * np.exp(s * k * T).real
-        law.update(k * T, T, measurement)
-        demands.append(law.signals.demand[SHAKEN])
+        law.update(LATE + k * T, T, measurement)
+        feedback = law.signals.demand - law.signals.model_torque
+        torques.append(feedback[SHAKEN])
     settings = law.settings
-    feedback = linear_feedback(settings, np.eye(n)[None], settings.barrier.weight)
-    C = law_responses(feedback, T, np.array([s]))[of_velocity][0, 0]
-    found = amplitude(np.array(demands[500:]), s) * np.exp(-s * 500 * T)
-    assert found / size == pytest.approx(-C[SHAKEN, SHAKEN], rel=2e-3)
+    form = linear_feedback(settings, np.eye(n)[None], settings.barrier.weight)
+    C = law_responses(form, T, np.array([s]))[of_velocity][0, 0]
+    found = amplitude(np.array(torques[500:]), s) * np.exp(-s * 500 * T)
+    assert found / size == pytest.approx(-C[SHAKEN, SHAKEN], rel=1e-5)
 
 
 def test_the_lag_begins_anew_with_the_first_sample_of_a_start(config):
@@ -77,6 +79,11 @@ def test_the_lag_begins_anew_with_the_first_sample_of_a_start(config):
     law.reset()
     again = law.update(0.0, T, np.concatenate((qr, moving)))
     np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(law.state.feedback.late, law.signals.xi2)
+    law.update(T, T, np.concatenate((qr, rest)))
+    assert np.abs(law.state.feedback.late - law.signals.xi2).min() > 0.01
+    law.state.samples[0] = 0.0  # as `Takeover.rejoin` does
+    law.update(2 * T, T, np.concatenate((qr, rest)))
     np.testing.assert_array_equal(law.state.feedback.late, law.signals.xi2)
 
 
@@ -108,8 +115,8 @@ def test_it_gives_a_ur5e_in_the_middle_of_its_study_half_as_much_margin_again():
 
 @pytest.mark.parametrize(('given', 'reports'), [({}, True), (LAG, False)])
 def test_an_arm_that_oscillates_with_the_published_gains_is_calm(given, reports):
-    """Arm 442 of the study, at 23 Hz within 4 s of its motion."""
+    """Arm 442 of the study; it is reported 1.6 s after the pick-up, at 26 Hz."""
     study = random_arms.study_of('ur5e')
-    plant = replace(random_arms.arm_of(study, 442), duration=4.0)
+    plant = replace(random_arms.arm_of(study, 442), duration=7.8)
     record = simulate(change(study.controller, given), plant)
     assert bool(record.run().oscillations) == reports
