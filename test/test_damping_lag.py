@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark import random_arms
+from benchmark import damping_lag, random_arms
 from blf_dsc_controller.arms.linear_loop import law_responses
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
@@ -102,15 +102,13 @@ def test_gains_that_change_leave_no_part_of_a_jump_behind(config):
     np.testing.assert_allclose(law.state.feedback.late, law.signals.xi2, atol=1e-5)
 
 
-def test_it_gives_a_ur5e_in_the_middle_of_its_study_half_as_much_margin_again():
-    arm = random_arms.described('ur5e')
-    config = load_loop('ur5e').controller
-    own, late = (
-        arm.margin(random_arms.own_feedback(change(config, each), arm.M0))
-        for each in ({}, LAG)
-    )
+def test_a_ur5e_gets_half_as_much_margin_again_unless_encoders_are_at_its_motors():
+    rows = {lag: map(float, sides) for lag, *sides in damping_lag.margins()}
+    own, own_motors = rows['0 ms']
+    late, late_motors = rows['3 ms']
     assert 0.4 < own < 0.5
     assert late > 1.35 * own
+    assert late_motors < 0.8 * own_motors
 
 
 @pytest.mark.parametrize(('given', 'reports'), [({}, True), (LAG, False)])
