@@ -120,9 +120,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(given: argparse.Namespace) -> None:
     """Print the table that was asked for."""
-    rows = {
-        'margins': margins,
-        'arms': lambda: arms(given.arms, given.lag),
-        'presets': lambda: presets(given.lag),
-    }
-    print_table(HEADS[given.table], rows[given.table]())
+    if given.table == 'margins':
+        rows = margins()
+    elif given.table == 'arms':
+        rows = arms(given.arms, given.lag)
+    else:
+        rows = presets(given.lag)
+    print_table(HEADS[given.table], rows)
