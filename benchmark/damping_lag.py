@@ -16,7 +16,7 @@ pick-up on, and from 3 s later on.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -35,16 +35,19 @@ OSCILLATE = (143, 362, 411, 417, 424, 442)
 CALM = (3, 5, 8)
 PLAY = 4e-4  # rad
 ROTORS = (0.5, 1.0, 2.0, 7.0)
-AT_MOTORS = {'sensor.side': 'motor'}
-OF_2_KG = {'events.payload': [2.0]}
-PRESETS: tuple[tuple[str, str, dict[str, object], tuple[float | None, ...]], ...] = (
-    (UR5E, 'encoders at the links', {}, (None, *ROTORS)),
-    (UR5E, 'encoders at the links, 2 kg', OF_2_KG, (None,)),
-    (UR5E, 'encoders at the motors', AT_MOTORS, (None, *ROTORS)),
-    (UR5E, 'encoders at the motors, 2 kg', AT_MOTORS | OF_2_KG, (None,)),
-    (UR5E, 'play of 0.4 mrad', {'joint.backlash': [PLAY] * 6}, (None,)),
-    ('ur5e_driver', 'encoders at the links', {}, (None, *ROTORS)),
-    ('ur5e_driver', 'encoders at the links, 2 kg', OF_2_KG, (None,)),
+AT_MOTORS: Mapping[str, object] = {'sensor.side': 'motor'}
+OF_2_KG: Mapping[str, object] = {'events.payload': [2.0]}
+AS_IT_IS: Mapping[str, object] = {}
+PLAYS: Mapping[str, object] = {'joint.backlash': [PLAY] * 6}
+ALL: tuple[float | None, ...] = (None, *ROTORS)
+PRESETS = (
+    (UR5E, 'encoders at the links', AS_IT_IS, ALL),
+    (UR5E, 'encoders at the links, 2 kg', OF_2_KG, ALL[:1]),
+    (UR5E, 'encoders at the motors', AT_MOTORS, ALL),
+    (UR5E, 'encoders at the motors, 2 kg', {**AT_MOTORS, **OF_2_KG}, ALL[:1]),
+    (UR5E, 'play of 0.4 mrad', PLAYS, ALL[:1]),
+    ('ur5e_driver', 'encoders at the links', AS_IT_IS, ALL),
+    ('ur5e_driver', 'encoders at the links, 2 kg', OF_2_KG, ALL[:1]),
 )
 
 
@@ -76,7 +79,7 @@ def presets(lag: float) -> Iterator[list[str]]:
     """Compute the rows: presets without and with the lag."""
     pick_up = random_arms.picks_up(UR5E)
     for name, label, changes, factors in PRESETS:
-        loop = load_loop(name, {PLANT: pick_up | changes})
+        loop = load_loop(name, {PLANT: {**pick_up, **changes}})
         for factor in factors:
             plant, motors = loop.plant, 'as they are'
             if factor is not None:
