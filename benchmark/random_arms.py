@@ -547,12 +547,13 @@ def _kind(text: str) -> str:
 def rotors() -> Iterator[list[str]]:
     """Compute the rows: presets with motors of a multiple of the controller's guess."""
     for name in ('panda', 'fr3', 'ur5e'):
-        loop = load_loop(ROBOTS[name].preset, {PLANT: _with_pick_up(name)})
+        loop = load_loop(ROBOTS[name].preset, {PLANT: picks_up(name)})
         for law in (THIS, STOCK):
             yield [name, law, *(_cell(loop, name, law, each) for each in ROTORS)]
 
 
-def _with_pick_up(name: str) -> dict[str, object]:
+def picks_up(name: str) -> dict[str, object]:
+    """Return the plant's parameters for a pick-up of the rated payload of a robot."""
     payload = load_loop(ROBOTS[name].preset).controller.robot.payload
     return {
         'duration': SECONDS,

@@ -76,19 +76,20 @@ LAW = linear(JointGains(np.array([60.0]), np.array([10.0])), np.array([1.2]), 1)
         joints(torque_loop=TorqueLoop(), motor_side=True),
     ],
 )
-def test_the_sampled_loop_and_its_frequency_response_agree(arm):
+@pytest.mark.parametrize('law', [LAW, LAW._replace(damping_lag=0.003)])
+def test_the_sampled_loop_and_its_frequency_response_agree(arm, law):
     """Eigenvalues of the loop are zeros of 1 + G C.
 
     Below 40 Hz, where images of the sampling add less than 1e-3.
     """
-    A, _ = Loop(ONE, arm, TIMING, LAW).transition()
+    A, _ = Loop(ONE, arm, TIMING, law).transition()
     z = np.linalg.eigvals(A[0])
     z = z[np.abs(z) > 0.5]
     s = np.log(z) / TIMING.period
     s = s[np.abs(s) < 2.0 * np.pi * 40.0]
     assert s.size >= 4
     G = arm_response(ONE, arm, TIMING, s)
-    C = law_response(LAW, TIMING, s)
+    C = law_response(law, TIMING, s)
     np.testing.assert_allclose((G @ C)[0, :, 0, 0], -1.0, rtol=1e-3)
 
 
@@ -114,6 +115,19 @@ def test_an_encoder_beyond_the_spring_costs_phase_that_one_at_the_motor_does_not
     at_motor = Loop(ONE, joints(3e3, motor_side=True), TIMING, law).margin()
     assert at_link.value == 0.0
     assert at_motor.value > 0.3
+
+
+def test_a_lag_of_the_damping_helps_an_encoder_beyond_the_spring_alone():
+    """With 3e4 N m/rad and motors of 2 kg m^2, as at the shoulder of a UR5e."""
+    law = by_velocity(60.0)
+    late = law._replace(damping_lag=0.003)
+
+    def margin(feedback, **given):
+        arm = joints(3e4, motors=2.0, **given)
+        return Loop(ONE, arm, TIMING, feedback).margin().value
+
+    assert margin(late) > 2.0 * margin(law)
+    assert margin(late, motor_side=True) < margin(law, motor_side=True)
 
 
 def test_a_torque_loop_hides_the_motor():

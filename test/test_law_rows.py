@@ -113,6 +113,8 @@ FEEDBACK = feedback.Settings(
     damping_rate=5.0,
     follows_inertia=0,
     decoupled=0,
+    damping_lag=0.0,
+    lags=0,
 )
 
 
@@ -125,8 +127,36 @@ FEEDBACK = feedback.Settings(
     ],
 )
 def test_feedback_is_damping_and_the_robust_term_of_28(xi1, xi2, joint, torque):
-    found = feedback.joint_torque(FEEDBACK, xi1, xi2, 0.01, joint)
+    found = feedback.joint_torque(FEEDBACK, xi1, xi2, xi2, 0.01, joint)
     assert found == pytest.approx(torque)
+
+
+@pytest.mark.parametrize(
+    ('late', 'joint', 'torque'),
+    [(0.0, 0, 0.0), (-0.01, 0, 0.1), (-0.01, 1, 0.2 - 0.3 * 0.5)],
+)
+def test_the_robust_term_does_not_lag(late, joint, torque):
+    found = feedback.joint_torque(FEEDBACK, 0.001, 0.005, late, 0.01, joint)
+    assert found == pytest.approx(torque)
+
+
+@pytest.mark.parametrize(
+    ('lag', 'begins', 'samples', 'share'),
+    [
+        (0.0, False, 1, 1.0),  # no lag
+        (0.003, True, 1, 1.0),  # it begins with the first sample
+        (0.003, False, 1, 1.0 - np.exp(-1.0 / 3.0)),
+        (0.003, False, 6, 1.0 - np.exp(-2.0)),
+    ],
+)
+def test_damping_follows_a_step_of_the_velocity_error(lag, begins, samples, share):
+    of = FEEDBACK._replace(damping_lag=lag, lags=int(lag > 0.0))
+    first, then = np.array([0.1, -0.2]), np.array([0.5, 0.2])
+    state = feedback.State(late=first[: 2 * of.lags].copy())
+    for _ in range(samples):
+        feedback.advance(of, state, then, begins, 0.001)
+    found = [feedback.damped(of, state, then, i) for i in range(2)]
+    assert found == pytest.approx(first + share * (then - first))
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,13 @@ def test_local_gains_are_what_a_lasting_deviation_changes(inside):
         np.testing.assert_allclose(gains[1], wanted, rtol=0.05)
 
 
+def test_damping_that_lags_is_none_that_motors_can_do():
+    config = change(loop_of(SLOW, LEROBOT).controller, {'feedback.damping_lag': 0.003})
+    law = blf.ArmController(config).guard.controller
+    with pytest.raises(BlfDscError, match=r'feedback\.damping_lag: got 0\.003 s, but'):
+        LocalGains(law)
+
+
 def run(loop, feedback, duration, dies_after=2.0, loses=0):
     """Run the law on motors; return controller, largest error late, travel once it is dead.
 

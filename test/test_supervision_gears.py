@@ -65,6 +65,15 @@ def test_given_gains_of_joints_are_used_and_scaled():
             'feedback.damping_rate: got 10 1/s, which acts through the inertia matrix',
         ),
         (
+            {
+                'feedback.inertia': 'surface',
+                'feedback.damping_rate': 10.0,
+                'feedback.damping_lag': 0.003,
+            },
+            'feedback.damping_lag: got 0.003 s, which is the lag of feedback.gain alone',
+        ),
+        ({'feedback.damping_lag': -0.001}, 'feedback.damping_lag: got -0.001'),
+        (
             GAINS | {'feedback.joint_damping': [60.0] * 5 + [0.0]},
             'got 0 for a joint, but each must be above 0',
         ),

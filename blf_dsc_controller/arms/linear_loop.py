@@ -73,6 +73,8 @@ class Feedback(NamedTuple):
 
         tau = - position y - surface xi2 + inertia alpha2' + d3,    xi2 = v - alpha2
         alpha2 follows -rate y by the surface filter,               d3' = - integral xi2
+
+    The xi2 of `surface` may lag.
     """
 
     position: Floats  # (k, n, n) N m/rad
@@ -82,6 +84,7 @@ class Feedback(NamedTuple):
     rate: Floats  # (n,) 1/s
     time_constant: float  # lambda, s
     known_rate: bool
+    damping_lag: float = 0.0  # s
 
 
 class Loop(NamedTuple):
@@ -187,8 +190,10 @@ def _of_alpha2(
     dalpha2 = (z - 1.0) / T * alpha2
     xi2 = velocity - alpha2
     d3 = -T / (z - 1.0) * xi2
+    decay = _damping_decay(feedback, T)
+    late = (1.0 - decay) / (1.0 - decay / z) * xi2
     return np.asarray(
-        feedback.surface[:, None] * xi2[:, None, :]
+        feedback.surface[:, None] * late[:, None, :]
         - feedback.inertia[:, None] * dalpha2[:, None, :]
         - feedback.integral[:, None] * d3[:, None, :]
     )
@@ -201,6 +206,11 @@ def _diagonals(values: Complex) -> Complex:
 
 def _decay(lag: float, T: float) -> float:
     return float(np.exp(-T / max(lag, _SHORTEST)))
+
+
+def _damping_decay(feedback: Feedback, T: float) -> float:
+    """Return what is left of a late xi2 after a sample."""
+    return _decay(feedback.damping_lag, T) if feedback.damping_lag > 0.0 else 0.0
 
 
 def _damping(links: Floats, joints: Joints, K: Floats) -> Floats:
@@ -274,13 +284,14 @@ def _with_law(
     n = own.shape[0]
     T = timing.period
     waiting = timing.delay
-    blocks = waiting + 4  # y of the last sample, its velocity, alpha2, d3
+    lags = feedback.damping_lag > 0.0
+    blocks = waiting + 4 + lags  # last y, its velocity, alpha2, d3, late xi2
     N = size + blocks * n
     wide = np.zeros((n, N))
     wide[:, :size] = sensed
     y = wide
     rows = np.eye(N)[size:].reshape(blocks, n, N)
-    under_way, (before, speed, alpha2, d3) = rows[:waiting], rows[waiting:]
+    under_way, (before, speed, alpha2, d3) = rows[:waiting], rows[waiting:][:4]
     decay = _decay(timing.velocity_lag, T)
     v = decay * speed + (1.0 - decay) * (y - before) / T
     g = 1.0 - np.exp(-T / feedback.time_constant)
@@ -289,7 +300,9 @@ def _with_law(
     if feedback.known_rate:
         dalpha2 = dalpha2 - rate * v
     xi2 = v - alpha2
-    tau = feedback.inertia @ dalpha2 - feedback.position @ y - feedback.surface @ xi2
+    decay = _damping_decay(feedback, T)
+    late = decay * rows[-1] + (1.0 - decay) * xi2 if lags else xi2
+    tau = feedback.inertia @ dalpha2 - feedback.position @ y - feedback.surface @ late
     tau = tau + d3
     acting = under_way[0] if waiting else tau
     A = np.zeros((k, N, N))
@@ -297,7 +310,7 @@ def _with_law(
     A[:, :size] += push[..., :n] @ acting
     later = [*under_way[1:], tau] if waiting else []
     integrated = d3 - T * (feedback.integral @ xi2)
-    parts = [*later, y, v, alpha2 + T * dalpha2, integrated]
+    parts = [*later, y, v, alpha2 + T * dalpha2, integrated, *([late] if lags else [])]
     A[:, size:] = np.concatenate(
         [np.broadcast_to(part, (k, n, N)) for part in parts], axis=1
     )

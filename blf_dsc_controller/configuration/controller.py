@@ -248,6 +248,12 @@ class ControllerConfig(ArmConfig):
                 f'feedback.damping_rate: got {feedback.damping_rate:g} 1/s, which acts through '
                 'the inertia matrix, with feedback.inertia none: give feedback.joint_damping'
             )
+        if feedback.damping_lag > 0.0 and feedback.damping_rate > 0.0:
+            yield (
+                f'feedback.damping_lag: got {feedback.damping_lag:g} s, which is the lag of '
+                f'feedback.gain alone, with a feedback.damping_rate of {feedback.damping_rate:g} '
+                '1/s: set one of them to 0'
+            )
         given = bool(feedback.joint_stiffness), bool(feedback.joint_damping)
         acts = feedback.inertia == 'none' and self.model == 'urdf'
         if any(given) and self.law in OWN and not acts:

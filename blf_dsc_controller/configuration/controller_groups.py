@@ -251,6 +251,13 @@ class Feedback:
     gain: PerJoint = non_negative(
         (60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p'
     )
+    damping_lag: float = non_negative(
+        0.0,
+        'lag of the damping by gain; 0: none. A few ms where gears give way and encoders '
+        'are at the links',
+        's',
+        read_only='it sets the size of the state of the law',
+    )
     damping_rate: float = non_negative(
         0.0,
         'rate of damping, scaled by the inertia of learning.initial_estimate',

@@ -152,6 +152,7 @@ def _feedback(config: ControllerConfig) -> feedback.Settings:
         config.feedback,
         follows_inertia=int(_follows_inertia(config)),
         decoupled=int(config.feedback.inertia == 'none'),
+        lags=int(config.feedback.damping_lag > 0.0),
     )
 
 

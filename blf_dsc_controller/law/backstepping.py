@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.law import learning
+from blf_dsc_controller.law import feedback, learning
 from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.compensation import (
     compensated,
@@ -43,13 +43,15 @@ class Backstepping(NamedTuple):
         if settings.rotors.unsure == 1:
             measure_rotors(settings, state, signals, dt)
             correct_feedback(settings, state, signals)
+        begins, of = state.samples[0] == 0.0, settings.feedback
+        feedback.advance(of, state.feedback, signals.xi2, begins, dt)
         for i in range(settings.n):
-            torque = settings.feedback.gain[i] * signals.xi2[i]
+            torque = of.gain[i] * feedback.damped(of, state.feedback, signals.xi2, i)
             torque += settings.robust_gain[i] * clip(
                 signals.xi2[i] / self.layer, -1.0, 1.0
             )
             torque = -torque
-            if settings.feedback.follows_inertia == 0:
+            if of.follows_inertia == 0:
                 torque += signals.feedback.restoring[i]
             signals.demand[i] = compensated(settings, state, signals, i, torque)
 

@@ -16,6 +16,7 @@ Where it departs from the paper, and why:
 - tau_m, the torque of the model, is in `compensation`: what is learned acts along the reference.
 - The barrier's torque -dV/dxi1 continues past a stiffness that a sampled loop can hold: `barrier`.
 - A bound that narrows adds xi1 k'/k to the virtual control: `barrier`.
+- K_p xi2 may lag, where gears give way: `feedback`.
 - The feedback of an arm whose rotor inertias are guessed follows those that it measures:
   `apparent_inertia`.
 - f, zero in the paper, is what is known of beta2' if `known_rate` of `surface.Settings` is 1.
@@ -29,6 +30,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier, feedback, learning
 from blf_dsc_controller.law.compensation import (
     compensated,
@@ -59,8 +61,10 @@ class BlfDsc(NamedTuple):
         if settings.rotors.unsure == 1:
             measure_rotors(settings, state, signals, dt)
             correct_feedback(settings, state, signals)
+        begins = state.samples[0] == 0.0
+        feedback.advance(settings.feedback, state.feedback, signals.xi2, begins, dt)
         for i in range(settings.n):
-            torque = joint_feedback(settings, signals, self.layer, i)
+            torque = joint_feedback(settings, state, signals, self.layer, i)
             signals.demand[i] = compensated(settings, state, signals, i, torque)
 
     def finish(
@@ -109,11 +113,22 @@ def compute_surface(
         )
 
 
+def shift_surface(state: State, change: Array) -> None:
+    """Add to alpha2 (n,) [rad/s] as if it had always been more: damping lags by none of it."""
+    late = state.feedback.late
+    state.alpha2[:] += change
+    late -= change[: late.size]
+
+
 @inner
-def joint_feedback(settings: Settings, signals: Signals, layer: float, i: int) -> float:
+def joint_feedback(
+    settings: Settings, state: State, signals: Signals, layer: float, i: int
+) -> float:
     """Return the feedback of joint i [N m]: barrier, robust term and damping of (28)."""
     of = settings.feedback
-    torque = feedback.joint_torque(of, signals.xi1[i], signals.xi2[i], layer, i)
+    xi1, xi2 = signals.xi1[i], signals.xi2[i]
+    late = feedback.damped(of, state.feedback, signals.xi2, i)
+    torque = feedback.joint_torque(of, xi1, xi2, late, layer, i)
     if of.follows_inertia == 1:  # the barrier is in `model_torque`
         return torque
     return torque + float(signals.feedback.restoring[i])

@@ -6,6 +6,10 @@
 
 a_f is the acceleration that the model is given (see `compensation`), where damping and
 the torque tau_c by the error act through the inertia matrix of the initial estimate.
+
+Between the resonance of a link behind its gear and that of link and motor, damping by an
+encoder at the link drives what it should damp.  So K_p xi2 may pass a lag, which acts there
+alone: the rest of the torque is small at those frequencies.
 """
 
 from typing import Annotated, NamedTuple
@@ -13,6 +17,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.clipping import clip
+from blf_dsc_controller.law.lag import filter_gain
 
 
 class Settings(NamedTuple):
@@ -24,6 +29,14 @@ class Settings(NamedTuple):
     damping_rate: float
     follows_inertia: int  # 1: barrier and d^3 act through M(q, P^(0)) / m
     decoupled: int  # 1: no feedback acts through M(q, P^(0))
+    damping_lag: float  # of K_p xi2, s; 0: none
+    lags: int  # 1: there is one
+
+
+class State(NamedTuple):
+    """What it keeps from one sample to the next."""
+
+    late: Annotated[Array, 'n * feedback.lags']  # xi2 behind the lag, rad/s
 
 
 class Work(NamedTuple):
@@ -34,12 +47,33 @@ class Work(NamedTuple):
 
 
 @inner
+def advance(
+    settings: Settings, state: State, xi2: Array, begins: bool, dt: float
+) -> None:
+    """Pass xi2 (n,) [rad/s] of a sample, `dt` [s] after the last, through the lag."""
+    if settings.lags == 0:
+        return
+    gain = 1.0 if begins else filter_gain(settings.damping_lag, dt)
+    for i in range(xi2.size):
+        state.late[i] += gain * (xi2[i] - state.late[i])
+
+
+@inner
+def damped(settings: Settings, state: State, xi2: Array, i: int) -> float:
+    """Return what K_p damps of joint i [rad/s]: its xi2, behind the lag if there is one."""
+    return float(state.late[i] if settings.lags == 1 else xi2[i])
+
+
+@inner
 def joint_torque(
-    settings: Settings, xi1: float, xi2: float, layer: float, i: int
+    settings: Settings, xi1: float, xi2: float, late: float, layer: float, i: int
 ) -> float:
-    """Return the damping and the robust term of joint i [N m]; `layer` is b [rad/s]."""
+    """Return the damping and the robust term of joint i [N m].
+
+    `late` [rad/s] is what is `damped`, `layer` is b [rad/s].
+    """
     robust = settings.robust_gain[i] * abs(xi1)
-    torque = settings.gain[i] * xi2
+    torque = settings.gain[i] * late
     torque += robust * clip(xi2 / layer, -1.0, 1.0)
     return float(-torque)
 

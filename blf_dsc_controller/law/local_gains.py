@@ -62,12 +62,19 @@ class LocalGains:
         """Compile them.
 
         Raises:
-            BlfDscError: it is a law of a file, whose feedback is not known.
+            BlfDscError: it is a law of a file, whose feedback is not known, or its damping
+                lags, which no stiffness and damping can do.
         """
         if not isinstance(controller.law, PACKAGED):
             raise BlfDscError(
                 f'the feedback of {type(controller.law).__name__}, a law of a file, is not '
                 'known: let the host close it'
+            )
+        if controller.settings.feedback.lags == 1:
+            raise BlfDscError(
+                f'feedback.damping_lag: got {controller.settings.feedback.damping_lag:g} s, but '
+                'motors that close the feedback damp without a lag: set it to 0, or '
+                'drive.feedback: host'
             )
         self._gains = np.zeros((2, controller.settings.n))
         self._arguments = (

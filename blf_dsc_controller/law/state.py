@@ -87,6 +87,7 @@ class State(NamedTuple):
     torque: Annotated[Array, 'n']  # last commanded torque, N m
     disturbance: Annotated[Array, 'n']  # d^3, N m
     estimate: Annotated[Array, 'm']  # theta^ = [P^; columns]
+    feedback: feedback.State
     saturation: torque.State
     row: prediction.State
     observer: load_observer.State

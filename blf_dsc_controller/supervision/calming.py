@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.blf_dsc import shift_surface
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.oscillation import PATIENCE, VIOLENT, oscillates
 from blf_dsc_controller.law.state import Settings, settings_of
@@ -202,6 +203,6 @@ class Calming:
         if settings.has_barrier == 1:  # so that beta2 - alpha2 does not jump
             signals = controller.signals
             gap = signals.dqr - signals.surface.beta2
-            controller.state.alpha2[:] += (1.0 - factor) * gap
+            shift_surface(controller.state, (1.0 - factor) * gap)
         controller.retune(controller.law, softened(settings, factor))
         self.share *= factor

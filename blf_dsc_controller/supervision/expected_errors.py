@@ -48,6 +48,7 @@ def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedba
         rate=settings.surface.gain / 2.0 + settings.surface.mu,
         time_constant=settings.surface.time_constant,
         known_rate=settings.surface.known_rate == 1,
+        damping_lag=settings.feedback.damping_lag,
     )
 
 

@@ -21,6 +21,7 @@ from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.adaptation import NEWTON
+from blf_dsc_controller.law.blf_dsc import shift_surface
 from blf_dsc_controller.law.controller import Controller
 
 Floats = NDArray[np.float64]
@@ -57,7 +58,7 @@ def apply_bumpless(
     apply(controller, config)
     if controller.settings.has_barrier == 1:
         controller.trial(t, T, measurement)
-        state.alpha2[:] += signals.surface.beta2 - beta2
+        shift_surface(state, signals.surface.beta2 - beta2)
     controller.trial(t, T, measurement)
     integrates = controller.settings.disturbance.gain > 0.0
     state.disturbance[integrates] -= (signals.demand - demand)[integrates]

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Damping that lags (`feedback.damping_lag`): in the law, and on arms whose gears give way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmark import damping_lag, random_arms
+from blf_dsc_controller.arms.linear_loop import law_responses
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision.expected_errors import linear_feedback
+from blf_dsc_controller.supervision.retuning import apply_bumpless
+
+T = 0.001  # s
+LATE = 100.0  # s, when bounds have narrowed
+LAG = {'feedback.damping_lag': 0.003}
+HELD = {
+    'reference.type': 'hold',
+    'learning.weight': 0.0,
+    'learning.adaptation_gain': [0.0] * 40,
+}
+SHAKEN = 3  # the joint
+
+
+@pytest.fixture
+def config():
+    """Return a UR5e at rest that learns nothing and whose damping lags."""
+    return change(load_loop('ur5e').controller, HELD | LAG)
+
+
+def amplitude(values, s):
+    """Return the complex amplitude of e^(s t) in values (k,), beside a drift."""
+    t = T * np.arange(len(values))
+    wave = np.exp(s * t)
+    columns = np.column_stack((wave.real, -wave.imag, np.ones_like(t), t))
+    found = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return complex(found[0], found[1])
+
+
+@pytest.mark.parametrize('hertz', [8.0, 25.0, 40.0])
+@pytest.mark.parametrize('of_velocity', [False, True])
+def test_the_law_has_the_frequency_response_of_its_linear_form(
+    config, hertz, of_velocity
+):
+    """One joint of the compiled law is shaken by 1 urad, or by 1 mrad/s."""
+    law = controller_of(config)
+    qr, n = np.array(config.reference.offset), 6
+    s = 2j * np.pi * hertz
+    size = 1e-3 if of_velocity else 1e-6
+    torques = []
+    for k in range(1000):
+        measurement = np.concatenate((qr, np.zeros(2 * n)))
+        measurement[n * of_velocity + SHAKEN] += size * np.exp(s * k * T).real
+        law.update(LATE + k * T, T, measurement)
+        feedback = law.signals.demand - law.signals.model_torque
+        torques.append(feedback[SHAKEN])
+    settings = law.settings
+    form = linear_feedback(settings, np.eye(n)[None], settings.barrier.weight)
+    C = law_responses(form, T, np.array([s]))[of_velocity][0, 0]
+    found = amplitude(np.array(torques[500:]), s) * np.exp(-s * 500 * T)
+    assert found / size == pytest.approx(-C[SHAKEN, SHAKEN], rel=1e-5)
+
+
+def test_the_lag_begins_anew_with_the_first_sample_of_a_start(config):
+    """A reset, or a law that takes over again, damps what it finds."""
+    law = controller_of(config)
+    qr = np.array(config.reference.offset)
+    rest, moving = np.zeros(12), np.concatenate((np.full(6, 0.1), np.zeros(6)))
+    first = law.update(0.0, T, np.concatenate((qr, moving))).copy()
+    for k in range(1, 5):
+        law.update(k * T, T, np.concatenate((qr, rest)))
+    assert np.abs(law.state.feedback.late).min() > 0.01  # still late
+    law.reset()
+    again = law.update(0.0, T, np.concatenate((qr, moving)))
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(law.state.feedback.late, law.signals.xi2)
+    law.update(T, T, np.concatenate((qr, rest)))
+    assert np.abs(law.state.feedback.late - law.signals.xi2).min() > 0.01
+    law.state.samples[0] = 0.0  # as `Takeover.rejoin` does
+    law.update(2 * T, T, np.concatenate((qr, rest)))
+    np.testing.assert_array_equal(law.state.feedback.late, law.signals.xi2)
+
+
+def test_gains_that_change_leave_no_part_of_a_jump_behind(config):
+    """xi2 jumps with the rate of the surface; its lag is to follow at once."""
+    law = controller_of(config)
+    qr = np.array(config.reference.offset)
+    off = np.concatenate((qr + 2e-3, np.zeros(12)))
+    for k in range(200):
+        law.update(k * T, T, off)
+    before = law.signals.xi2.copy()
+    faster = [1.2 * each for each in config.surface.mu]
+    apply_bumpless(law, change(config, {'surface.mu': faster}), 0.199, off)
+    law.update(0.2, T, off)
+    assert np.abs(law.signals.xi2 - before).min() > 1e-3
+    np.testing.assert_allclose(law.state.feedback.late, law.signals.xi2, atol=1e-5)
+
+
+def test_a_ur5e_gets_half_as_much_margin_again_unless_encoders_are_at_its_motors():
+    rows = {lag: map(float, sides) for lag, *sides in damping_lag.margins()}
+    own, own_motors = rows['0 ms']
+    late, late_motors = rows['3 ms']
+    assert 0.4 < own < 0.5
+    assert late > 1.35 * own
+    assert late_motors < 0.8 * own_motors
+
+
+@pytest.mark.parametrize(('given', 'reports'), [({}, True), (LAG, False)])
+def test_an_arm_that_oscillates_with_the_published_gains_is_calm(given, reports):
+    """Arm 442 of the study; it is reported 1.6 s after the pick-up, at 26 Hz."""
+    study = random_arms.study_of('ur5e')
+    plant = replace(random_arms.arm_of(study, 442), duration=7.8)
+    record = simulate(change(study.controller, given), plant)
+    assert bool(record.run().oscillations) == reports
