@@ -36,6 +36,9 @@ class Chosen:
             'commissioning.margin': commissioning.margin,
             'barrier.bound': config.barrier.bound,
         }
+        if commissioning.friction:  # earlier files have none
+            self.values['commissioning.friction'] = commissioning.friction
+            self.values['commissioning.unseen_inertia'] = commissioning.unseen_inertia
         if config.robot.rotor_inertia:  # no drive hides the motors
             self.values['robot.rotor_inertia'] = config.robot.rotor_inertia
             self.values['safety.damping'] = config.safety.damping

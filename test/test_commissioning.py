@@ -29,6 +29,7 @@ from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
 from blf_dsc_controller.commissioning.chosen import kept_stop
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
+from blf_dsc_controller.commissioning.own_loop import REPEATS
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import (
     Response,
@@ -365,6 +366,8 @@ def lines_of(stiffness, noise):
         columns=np.ones((f.size, 2)),
         posture=np.zeros(2),
         seen=np.ones(f.size, bool),
+        speed=np.zeros(2),
+        friction=np.zeros(2),
     )
 
 
@@ -436,9 +439,9 @@ def test_mode_that_is_all_noise_makes_no_resonance_between_two_lines():
 def test_simulated_arm_holds_with_the_chosen_gains():
     config = build(
         ControllerConfig,
-        {**ROBOT, 'robot.payload': 0.1, 'barrier.bound': [0.2, 0.2]}
-        | {'reference.type': 'hold'}
-        | found().parameters(),
+        {**ROBOT, 'robot.payload': 0.1, 'reference.type': 'hold'}
+        | found().parameters()
+        | {'barrier.bound': [0.2, 0.2]},
     )
     push = {'duration': 10.0, 'disturbance.constant': [2.0, 1.0]}
     start = {'initial.position': POSTURE.tolist()}
@@ -581,7 +584,8 @@ def test_gains_of_the_law_in_a_file_give_way_to_those_that_were_chosen(tmp_path)
         '/**/blf_dsc_controller:\n  ros__parameters:\n'
         '    feedback.gain: [1.0, 1.0]\n    barrier: {weight: [3.0, 3.0], bound: [0.3, 0.3]}\n'
     )
-    sections = files.of_commissioned(read(file), found())
+    wide = change(CONFIG, {'barrier.bound': [0.3, 0.3]})
+    sections = files.of_commissioned(read(file), found()._replace(before=wide))
     given = sections['/**/blf_dsc_controller']
     assert 'feedback.gain' not in given
     assert 'barrier.weight' not in given
@@ -622,6 +626,67 @@ def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
             [(run, config)],
         ).parameters()
     )
+
+
+@cache
+def rubbing():
+    """Return a commissioning of an arm with friction of which its file knows nothing."""
+    commissioning = blf.Commissioning(moving(), [POSTURE])
+    (motion,) = commissioning.motions
+    run, _ = simulated.measured(motion, STUCK)
+    for _ in range(REPEATS):
+        motion = commissioning.stronger(motion, run)
+        run, config = simulated.measured(motion, STUCK)
+    return commissioning.result([(run, config)])
+
+
+STUCK = change(
+    ARM,
+    {
+        'disturbance.coulomb': [3.0, 1.5],  # N m
+        'disturbance.stribeck': 0.5,
+        'truth.rotor_inertia': [1.5, 0.5],
+    },
+)
+
+
+def moving():
+    """Return an arm that moves to and fro, at up to 1.2 rad/s^2, with a bound of 10 mrad."""
+    values = {
+        'reference.type': 'sinusoids',
+        'reference.offset': POSTURE.tolist(),
+        'reference.amplitude': [0.3, 0.3],
+        'reference.frequency': [2.0],
+        'reference.phase': [0.0],
+        'barrier.bound': [0.01, 0.01],  # rad
+        'barrier.initial_bound': [0.0, 0.0],
+    }
+    return change(CONFIG, values)
+
+
+def test_bound_is_kept_by_an_arm_with_more_friction_and_inertia_than_its_file_has():
+    """From rest, before anything is learned."""
+    seen = rubbing()
+    start = {'initial.position': (POSTURE + 0.3).tolist(), 'duration': 10.0}
+    run = simulate(seen.config, change(STUCK, start)).run()
+    assert run.stops == ()
+    largest = np.abs(run.error).max(axis=0)
+    assert (largest > 0.01).any()  # wider it had to be
+    assert (largest < seen.config.barrier.bound).all()
+
+
+def test_friction_is_measured_and_told():
+    """Of 3 and 1.5 N m, with half as much more near rest: some of it, since joints creep."""
+    seen = rubbing()
+    share = seen.findings.friction / [3.0, 1.5]
+    assert (share > 0.6).all()
+    assert (share < 1.5).all()
+    assert found().findings.friction.max() < 0.2  # viscous, of 1 to 2 N m s/rad
+    written = seen.parameters()['commissioning.friction']
+    creep = seen.findings.damping > seen.start.damping  # their friction is not all seen
+    assert creep.all()
+    np.testing.assert_allclose(written, 1.5 * seen.findings.friction, rtol=0.01)
+    assert any('more friction than robot.coulomb: joint1' in s for s in sentences(seen))
 
 
 def test_joint_whose_inertia_friction_hides_is_not_trusted():

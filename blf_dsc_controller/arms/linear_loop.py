@@ -32,9 +32,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+SLOWEST = 5.0
+"""Frequency [Hz] from which on margins count: below, the damping ratio says more."""
+
 _SHORTEST = 1e-5  # s, of a lag that is not left out
 _FREQUENCIES = 120
-_SLOWEST = 5.0  # Hz, below which no margin is looked for
 _FASTEST = 0.48  # of the sample rate
 
 
@@ -110,9 +112,7 @@ class Loop(NamedTuple):
 
     def margin(self) -> Margin:
         """Return the modulus margin in the worst posture; 0 if one is unstable."""
-        frequencies = np.geomspace(
-            _SLOWEST, _FASTEST / self.timing.period, _FREQUENCIES
-        )
+        frequencies = np.geomspace(SLOWEST, _FASTEST / self.timing.period, _FREQUENCIES)
         s: Complex = np.asarray(2j * np.pi * frequencies, complex)
         G = arm_response(self.links, self.joints, self.timing, s)
         C = law_response(self.feedback, self.timing, s)

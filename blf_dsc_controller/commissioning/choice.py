@@ -23,7 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains, linear
-from blf_dsc_controller.arms.linear_loop import Joints, Loop, Timing, law_responses
+from blf_dsc_controller.arms.linear_loop import (
+    SLOWEST,
+    Joints,
+    Loop,
+    Timing,
+    law_responses,
+)
 from blf_dsc_controller.commissioning.response import DEVIATIONS, Response
 
 Floats = NDArray[np.float64]
@@ -31,9 +37,6 @@ Complex = NDArray[np.complex128]
 
 MARGIN = 0.5
 """Modulus margin of the gains that are chosen."""
-
-SLOWEST = 5.0
-"""Frequency [Hz] from which on margins count: below, the damping ratio says more."""
 
 _STEP = 1.1
 _LEAST, _MOST = 0.05, 100.0  # times the damping of the measurement

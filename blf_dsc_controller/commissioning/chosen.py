@@ -73,14 +73,15 @@ def kept_stop(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
 def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     """Return the bounds wide enough for the errors to expect, by dotted name.
 
-    None, if the bounds of the joints follow from one at the tool.  Funnels that are given
-    begin at these bounds at least; others follow.
+    Friction may act while a load is picked up, so the errors of both add.  None, if the
+    bounds of the joints follow from one at the tool.  Funnels that are given begin at these
+    bounds at least; others follow.
     """
     barrier = config.barrier
     if barrier.bounds_tool:
         return {}
     errors = expected_errors(config, settings_of_config(config))
-    least = _ROOM * np.maximum(errors.unmodelled, errors.pick_up)
+    least = _ROOM * (errors.unmodelled + errors.pick_up)
     if (least <= barrier.bound).all():
         return {}
     wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])

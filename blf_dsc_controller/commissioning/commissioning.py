@@ -43,6 +43,12 @@ TORQUE = 0.03
 TRAVEL = 0.01
 """How far the tool may travel in the motion, from its middle [m]."""
 POSTURES = 3
+CREEPING = 1.5
+"""Times the measured friction, to expect of a joint that hardly slid while it was measured.
+
+One whose friction damps it more than its gains follows less than half of its swings, and shows
+less than its friction.  It is as much more as is taken for breakaway.
+"""
 
 
 class Planned(NamedTuple):
@@ -74,6 +80,8 @@ class Commissioned(NamedTuple):
     findings: Findings
     assumed: Floats  # (n,) kg m^2, inertias by URDF and guess, where findings has them
     rotors: Floats  # (n,) kg m^2, robot.rotor_inertia: measured, unless drives hide it
+    friction: Floats  # (n,) N m, to expect: of joints that creep more than measured
+    unseen: Floats  # (n,) kg m^2, that friction may hide beyond the model's
     lag: float  # s, robot.lag: likewise
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
@@ -122,6 +130,8 @@ class Commissioned(NamedTuple):
             'commissioning.date': self.date,
             'commissioning.version': __version__,
             'commissioning.margin': float(f'{self.choice.margin.value:.3g}'),
+            'commissioning.friction': _rounded(self.friction),
+            'commissioning.unseen_inertia': _rounded(self.unseen),
         }
 
 
@@ -227,6 +237,9 @@ def commissioned(
         findings=found,
         assumed=here.max(axis=0),
         rotors=rotors,
+        friction=found.friction
+        * np.where(found.damping > start.damping, CREEPING, 1.0),
+        unseen=_unseen(found, here),
         lag=config.robot.lag if np.isnan(lag) else lag,
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
         aim=margin,
@@ -238,6 +251,15 @@ def _least(measured: Floats, assumed: Floats) -> Floats:
     """Return the least (n,) of what was measured in k runs (k, n); of `assumed` where none was."""
     least = np.where(np.isnan(measured), np.inf, measured).min(axis=0)
     return np.asarray(np.where(np.isinf(least), assumed.min(axis=0), least))
+
+
+def _unseen(found: Findings, assumed: Floats) -> Floats:
+    """Return the inertia (n,) that may be missing, of joints that no run shows.
+
+    The model has `assumed` (k, n) [kg m^2] in k runs.
+    """
+    beyond = (found.hidden - assumed).clip(0.0).min(axis=0)
+    return np.asarray(np.where(np.isnan(found.inertia), beyond, 0.0))
 
 
 def measuring_gains(arm: Design) -> JointGains:

@@ -7,9 +7,10 @@ diagonal what each joint asks for while the others are held, with a lag on the w
     D_jj = (J (i omega)^2 + F i omega) e^(i omega tau)
 
 so inertia J, damping F (friction in motion acts like it) and lag tau follow by least
-squares.  The lag of velocities is that of G_v against i omega G_y.  Where a joint is free,
-gears show as an antiresonance, at which the link absorbs what its motor does, and a
-resonance above it.
+squares.  Constant friction f, at speeds v, dissipates what a damping f <|v|> / <v^2> does.
+An inertia that asks for less than the damping is not seen.  The lag of velocities is that
+of G_v against i omega G_y.  Where a joint is free, gears show as an antiresonance, at
+which the link absorbs what its motor does, and a resonance above it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ class Findings(NamedTuple):
     )
     inertias: Floats  # (k, n) likewise in each run
     damping: Floats  # (n,) N m s/rad, the mean
+    friction: Floats  # (n,) N m, the largest: constant, it takes as much power
+    hidden: Floats  # (k, n) kg m^2, inertias up to which friction hides one; 0: none
     drive_lag: float  # s, from a torque to the motion, sampling included; nan likewise
     velocity_lag: float  # s, of velocities against positions
     resonances: tuple[Resonance, ...]
@@ -88,12 +91,18 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
     inertia, damping, lag = (np.array(each) for each in zip(*fits, strict=True))
     hidden = _is_hidden(inertia, damping)
     inertia[hidden] = lag[hidden] = np.nan
+    friction = np.maximum(
+        damping.clip(0.0) * np.array([each.speed for each in responses]),
+        np.array([each.friction for each in responses]),
+    )
     gaps = np.concatenate([np.diff(run.stamp) for run in runs]) * 1e-9
     usual = float(np.median(gaps))
     return Findings(
         inertia=_largest(inertia),
         inertias=inertia,
         damping=damping.mean(axis=0),
+        friction=friction.max(axis=0),
+        hidden=np.where(hidden, _hidden_by(damping), 0.0),
         drive_lag=_middle(lag),
         velocity_lag=float(np.median([_velocity_lag(each) for each in responses])),
         resonances=tuple(each for found in peaks for each in found),
@@ -114,7 +123,12 @@ def rubs(response: Response, damping: Floats) -> bool:
 
 
 def _is_hidden(inertia: Floats, damping: Floats) -> NDArray[np.bool_]:
-    return np.asarray(inertia * 2.0 * np.pi * _RIGID[1] < _SEEN * damping)
+    return np.asarray(inertia < _hidden_by(damping))
+
+
+def _hidden_by(damping: Floats) -> Floats:
+    """Return the inertias [kg m^2] up to which a damping [N m s/rad] hides one."""
+    return np.asarray(_SEEN * damping / (2.0 * np.pi * _RIGID[1]))
 
 
 def _rigid_fit(

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
-from blf_dsc_controller.commissioning.choice import SLOWEST
-from blf_dsc_controller.commissioning.commissioning import Commissioned, Planned
+from blf_dsc_controller.arms.linear_loop import SLOWEST
+from blf_dsc_controller.commissioning.commissioning import (
+    CREEPING,
+    Commissioned,
+    Planned,
+)
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.supervision.expected_errors import expectation
@@ -23,6 +27,7 @@ Floats = NDArray[np.float64]
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
 _FAR = 5.0  # times the gains of the measurement: friction may act otherwise on theirs
+_MORE = 1.2  # times the assumed friction, from which more is said
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
 
@@ -43,12 +48,23 @@ def table(found: Commissioned) -> str:
         'inertia',
         'as assumed',
         'damping',
+        'friction',
         'resonance',
         'stiffness',
         'damping',
     )
-    units = ('', 'kg m^2', 'kg m^2', 'N m s/rad', 'Hz', 'N m/rad', 'N m s/rad')
-    above = ('', 'measured', '', 'measured', 'measured', 'chosen', 'chosen')
+    units = (
+        '',
+        'kg m^2',
+        'kg m^2',
+        'N m s/rad',
+        'N m',
+        'Hz',
+        'N m/rad',
+        'N m s/rad',
+    )
+    measured = ('measured',) * 3
+    above = ('', 'measured', '', *measured, 'chosen', 'chosen')
     rows: list[Sequence[str]] = [heads, above, units]
     gains = found.choice.gains
     for j, joint in enumerate(found.joints):
@@ -61,6 +77,7 @@ def table(found: Commissioned) -> str:
                 _known(found.findings.inertia[j]),
                 f'{found.assumed[j]:.3g}',
                 f'{found.findings.damping[j]:.3g}',
+                f'{found.findings.friction[j]:.2g}',
                 f'{min(peaks):.0f}' if peaks else '-',
                 f'{gains.stiffness[j]:.3g}',
                 f'{gains.damping[j]:.3g}',
@@ -132,11 +149,35 @@ def _of_friction(found: Commissioned) -> Iterator[str]:
             'and the margin is that of joints that stick, not that of joints that slide: prove '
             'the gains (--prove), or take half of feedback.stiffness and a wider bound'
         )
+        unseen = ', '.join(
+            f'{joint} {more:.2g}'
+            for joint, more in zip(found.joints, found.unseen, strict=True)
+            if more > 0.0
+        )
+        if unseen:
+            yield (
+                f'so much more inertia would not show, and the errors to expect count it: {unseen} '
+                'kg m^2'
+            )
     rubbing = ~hidden & (found.findings.damping > found.choice.gains.damping)
     if rubbing.any():
         yield (
             f'friction damps {", ".join(names[rubbing])} more than the gains do while shaken, and '
             'less in a steady motion: the true margin is smaller, so prove the gains (--prove)'
+        )
+    robot = found.before.robot
+    known = robot.friction(robot.chain(found.joints))['coulomb']
+    more = [
+        f'{joint} {measured:.2g} N m instead of {assumed:g}'
+        for joint, measured, assumed in zip(
+            found.joints, found.findings.friction, known, strict=True
+        )
+        if measured > _MORE * assumed
+    ]
+    if more:
+        yield (
+            f'more friction than robot.coulomb: {"; ".join(more)}. The errors to expect count it, '
+            f'{CREEPING:g} times as much of joints that hardly slid'
         )
 
 

@@ -54,6 +54,8 @@ class Response(NamedTuple):
     columns: Floats  # (f, n) 1/(N m), size of the columns of U^-1
     posture: Floats  # (n,) rad, mean
     seen: NDArray[np.bool_]  # (f,) the rest may be noise that looks like a resonance
+    speed: Floats  # (n,) rad/s, of all tones: mean square over mean
+    friction: Floats  # (n,) N m, a constant one that takes the power of the slow tones
 
 
 def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
@@ -77,6 +79,7 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
         _noise(measured, U, response, at, between)
         for measured, response in ((Y, Y_at @ inverse), (V, V_at @ inverse))
     ]
+    speed, friction = _rubbing(U, Y, lines)
     at_lines = Response(
         frequency=lines.frequencies,
         position=np.asarray(Y_at @ inverse),
@@ -86,6 +89,8 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
         columns=np.asarray(np.linalg.norm(inverse, axis=1)),
         posture=np.asarray(position.mean(axis=0)),
         seen=np.ones(len(lines.frequencies), bool),
+        speed=speed,
+        friction=friction,
     )
     return refined(at_lines)
 
@@ -119,6 +124,8 @@ def refined(response: Response) -> Response:
         columns=between(response.columns),
         posture=response.posture,
         seen=_is_seen(response, inverse, inverse_between, low),
+        speed=response.speed,
+        friction=response.friction,
     )
 
 
@@ -192,6 +199,24 @@ def _spectrum(values: Floats) -> Complex:
     count = len(values) - 1
     drift = np.linspace(0.0, values[-1] - values[0], count + 1)
     return np.asarray(np.fft.rfft((values - drift)[:-1], axis=0) * (2.0 / count))
+
+
+def _rubbing(U: Complex, Y: Complex, lines: Lines) -> tuple[Floats, Floats]:
+    """Return the mean square of the speeds over their mean (n,) [rad/s], and friction (n,) [N m].
+
+    A damping dissipates as much as constant friction of the product with that speed does.
+    The friction is that by the power of the slow tones alone: no more than there is, but for
+    what joints hand to each other.
+    """
+    rows = np.union1d(lines.bins, lines.slow)
+    V = np.zeros_like(Y)
+    V[rows] = 2j * np.pi / lines.period * rows[:, None] * Y[rows]
+    count = 2 * (len(Y) - 1)
+    speeds = np.abs(np.fft.irfft(V, count, axis=0) * (count / 2.0))
+    mean = np.maximum(speeds.mean(axis=0), np.finfo(float).tiny)  # of a joint at rest
+    joints = np.arange(Y.shape[1])[:, None]
+    power = 0.5 * (U * V.conj()).real[lines.slow, joints].sum(axis=1)
+    return np.asarray((speeds**2).mean(axis=0) / mean), np.asarray(power / mean)
 
 
 def _between(lines: Lines, count: int) -> NDArray[np.bool_]:

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.linear_loop import SLOWEST
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.commissioning.choice import SLOWEST, Loops
+from blf_dsc_controller.commissioning.choice import Loops
 from blf_dsc_controller.commissioning.commissioning import measuring_gains
 from blf_dsc_controller.commissioning.findings import rubs
 from blf_dsc_controller.commissioning.motion import lines_in

@@ -33,7 +33,9 @@ in_window = partial(
 )
 """Declare a parameter on which the rows of a window depend."""
 _at_start = partial(parameter, read_only='it has no effect later')
-_measured = partial(parameter, read_only='it says how the gains were found')
+_FOUND = 'it says how the gains were found'
+_measured = partial(parameter, read_only=_FOUND)
+_of_joints = partial(non_negative, (), read_only=_FOUND, omittable=True)
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 # per window: fewer do not determine P, more need over 100 MB
@@ -494,4 +496,14 @@ class CommissionedGains:
     version: str = _measured('', 'version of this package that chose them')
     margin: float = _measured(
         0.0, 'modulus margin that they have in all postures measured', at_least=0.0
+    )
+    friction: PerJoint = _of_joints(
+        'friction that each joint showed while it was measured, which the errors to '
+        'expect count; empty: that of robot.coulomb',
+        'N m',
+    )
+    unseen_inertia: PerJoint = _of_joints(
+        'inertia of each joint beyond that of the model which friction may have '
+        'hidden, likewise; empty: none',
+        'kg m^2',
     )

@@ -104,13 +104,25 @@ def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErr
     P0 = settings.initial_estimate[: settings.p]
     load = robot.payload * parameters_of(robot, chain).load
     M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
-    floor = np.array(config.learning.residual_floor)
-    floor += REVERSAL * np.array(robot.friction(chain)['coulomb'])
-    unmodelled = _peak_errors(config, settings, M0, M0, np.broadcast_to(floor, q.shape))
+    unmodelled = _peak_errors(config, settings, M0, M0, _unmodelled(config, ddq))
     pick_up = _peak_errors(
         config, settings, M, M0, regressors_at(model, q, dq, dq, ddq) @ load
     )
     return ExpectedErrors(unmodelled.max(axis=0), pick_up.max(axis=0))
+
+
+def _unmodelled(config: ControllerConfig, ddq: Floats) -> Floats:
+    """Return the torque (k, n) [N m] that the model may lack at accelerations (k, n).
+
+    With what commissioning has measured of friction, and not seen of inertia.  The law
+    compensates the friction that it knows; the rest has either sign at a reversal.
+    """
+    robot, measured = config.robot, config.commissioning
+    known = np.array(robot.friction(robot.chain(config.joints))['coulomb'])
+    friction = np.maximum(known, measured.friction or 0.0)
+    floor = np.array(config.learning.residual_floor)
+    floor += REVERSAL * (friction + 2.0 * (friction - known))
+    return np.asarray(floor + np.abs(ddq) * np.array(measured.unseen_inertia or 0.0))
 
 
 def expectation(config: ControllerConfig) -> str:
