@@ -8,9 +8,9 @@
 The margins are those of the linear loop of the arm in the middle of the study of
 `random-arms`, with encoders at its links and at its motors.  Arms are random ones of that
 study, by default those that oscillate although the published gains hold, and three calm
-ones.  Presets pick up their payload, with motors of several times the controller's guess,
-encoders at either side, and play.  Errors [mrad] are the largest in motion, from the
-pick-up on, and from 3 s later on.
+ones.  Presets pick up the 3 kg of `ur5e`, or 2 kg, with motors of several times the
+controller's guess, encoders at either side, and play.  Errors [mrad] are the largest in
+motion, from the pick-up on, and from 3 s later on.
 """
 
 from __future__ import annotations
