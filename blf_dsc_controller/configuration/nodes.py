@@ -202,8 +202,10 @@ def locate(given: str | Path) -> Path:
     if path.exists() and not path.is_dir():
         what = 'is no regular file'
     guess = suggestion(stem.removesuffix('.yml').lower(), presets)
-    remedy = guess or f': give a parameter file, or a preset: {", ".join(presets)}'
-    raise ConfigurationError([f'{name or "an empty name"} {what}{remedy}'])
+    remedy = f'give a parameter file, or a preset: {", ".join(presets)}'
+    raise ConfigurationError(
+        [f'{name or "an empty name"} {what}{guess or ":"} {remedy}']
+    )
 
 
 def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:

@@ -101,6 +101,58 @@ def fill_sample(
 
 
 @inner
+def refuse(checks: Checks, measurement: Array, dt: float) -> int:
+    """Return the flags of a measurement that the law must not use; 0 if it may."""
+    if checks.velocity_limit[0] <= 0.0:
+        return 0  # nothing is checked
+    if not is_valid_state(checks, measurement):
+        return INVALID
+    T = checks.sample_time[0]
+    if T > 0.0 and compare_velocities(
+        checks.sensor, checks.oscillation, T, dt, measurement
+    ):
+        return INVALID | CONTRADICTION
+    return 0
+
+
+@inner
+def take_measurement(
+    checks: Checks, signals: Signals, measurement: Array, begins: bool, dt: float
+) -> None:
+    """Write q, dq and effort into the signals, without repeats if there are checks."""
+    used = measurement
+    if checks.velocity_limit[0] > 0.0:
+        T = checks.sample_time[0]
+        repeats.bridge(checks.repeats, measurement, begins, T, dt)
+        used = checks.repeats.used
+    n = signals.q.size
+    for i in range(n):
+        signals.q[i] = used[i]
+        signals.dq[i] = used[n + i]
+        signals.effort[i] = used[2 * n + i]
+
+
+@inner
+def prepare(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    reference_vector: Array,
+    t: float,
+) -> None:
+    """Find what every law reads: torques at work, reference, bound and error."""
+    torque.find_added(settings.torque, signals.saturation, signals.q)
+    torque.find_applied(
+        state.saturation, signals.saturation, state.torque, signals.applied
+    )
+    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    truth.update_disturbance(settings.truth, signals.truth, t)
+    barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
+    for i in range(settings.n):
+        signals.xi1[i] = signals.q[i] - signals.qr[i]
+
+
+@inner
 def step(
     law: Law,
     settings: Settings,
@@ -119,56 +171,43 @@ def step(
     m], t [s] the time since the start, dt [s] since the last sample (at the first:
     until the next).  The terms of (29) are separate: `lyapunov.fill_energies`.
     """
-    n = settings.n
+    flags = refuse(checks, measurement, dt)
+    if flags != 0:
+        return flags
     is_checked = checks.velocity_limit[0] > 0.0
-    if is_checked and not is_valid_state(checks, measurement):
-        return INVALID
-    sample_time = checks.sample_time[0]
-    compares = is_checked and sample_time > 0.0
-    if compares and compare_velocities(
-        checks.sensor, checks.oscillation, sample_time, dt, measurement
-    ):
-        return INVALID | CONTRADICTION
     begins = state.samples[0] == 0.0
-    if is_checked:
-        repeats.bridge(checks.repeats, measurement, begins, sample_time, dt)
-    used = checks.repeats.used if is_checked else measurement
-    for i in range(n):
-        signals.q[i] = used[i]
-        signals.dq[i] = used[n + i]
-        signals.effort[i] = used[2 * n + i]
-    drives, work = state.saturation, signals.saturation
-    torque.find_added(settings.torque, work, signals.q)
-    torque.find_applied(drives, work, state.torque, signals.applied)
-    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    truth.update_disturbance(settings.truth, signals.truth, t)
-    barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
-    for i in range(n):
-        signals.xi1[i] = signals.q[i] - signals.qr[i]
-    oscillates = compares and watch_oscillation(settings, checks, signals, begins, dt)
+    take_measurement(checks, signals, measurement, begins, dt)
+    prepare(settings, state, signals, reference_vector, t)
+    oscillates = (
+        is_checked
+        and checks.sample_time[0] > 0.0
+        and watch_oscillation(settings, checks, signals, begins, dt)
+    )
     fault = state.sensors.fault[0]
     law.compute_demand(settings, state, signals, t, dt)
     saturated = torque.saturate(
         settings.torque,
-        drives,
-        work,
+        state.saturation,
+        signals.saturation,
         signals.demand,
         state.torque,
-        not begins or drives.takes_over[0] > 0.0,
+        not begins or state.saturation.takes_over[0] > 0.0,
         dt,
         signals.torque,
     )
     law.finish(settings, state, signals, dt, saturated)
-    for i in range(n):
+    for i in range(settings.n):
         state.torque[i] = signals.torque[i]
     state.samples[0] += 1.0
     fill_sample(settings, state, signals, sample)
-    flags = check_sample(settings, checks, state, signals, sample) if is_checked else 0
-    if is_checked and state.sensors.fault[0] != fault:
-        flags |= NOT_SENSORS
+    if not is_checked:
+        return 0
+    flags = check_sample(settings, checks, state, signals, sample)
+    if state.sensors.fault[0] != fault:
         oscillation.forget_all(checks.oscillation)  # r may have been the cause
-    elif oscillates and not torque_sensors.is_fading(state.observer.faded):
-        flags |= OSCILLATES
+        return flags | NOT_SENSORS
+    if oscillates and not torque_sensors.is_fading(state.observer.faded):
+        return flags | OSCILLATES
     return flags
 
 
