@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedback through a bus, and inside motors with a PD of their own: OpenArm, YAM.
 
-    python -m benchmark motor-feedback [--arm openarm | yam] [--gears rigid elastic] [LAW...]
+    python -m benchmark motor-feedback [LAW...] [--arm openarm | yam] [--gears rigid elastic]
 
 The arm of the preset runs its motion for 14 s and picks up 0.5 kg at 8 s.  Its links are
 10 % off, its rotors 20 %.  The motors run at 4 kHz, frames go at 250 or 500 Hz with the
