@@ -686,7 +686,13 @@ def test_friction_is_measured_and_told():
     creep = seen.findings.damping > seen.start.damping  # their friction is not all seen
     assert creep.all()
     np.testing.assert_allclose(written, 1.5 * seen.findings.friction, rtol=0.01)
-    assert any('more friction than robot.coulomb: joint1' in s for s in sentences(seen))
+    told = 'more friction than robot.coulomb: joint1'
+    assert any(told in each for each in sentences(seen))
+    little = found().findings._replace(
+        friction=np.array(CONFIG.learning.residual_floor)
+    )
+    shown = sentences(found()._replace(findings=little))
+    assert not any('more friction than' in each for each in shown)
 
 
 def test_joint_whose_inertia_friction_hides_is_not_trusted():

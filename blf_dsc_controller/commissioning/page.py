@@ -27,7 +27,6 @@ Floats = NDArray[np.float64]
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
 _FAR = 5.0  # times the gains of the measurement: friction may act otherwise on theirs
-_MORE = 1.2  # times the assumed friction, from which more is said
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
 
@@ -169,10 +168,14 @@ def _of_friction(found: Commissioned) -> Iterator[str]:
     known = robot.friction(robot.chain(found.joints))['coulomb']
     more = [
         f'{joint} {measured:.2g} N m instead of {assumed:g}'
-        for joint, measured, assumed in zip(
-            found.joints, found.findings.friction, known, strict=True
+        for joint, measured, assumed, floor in zip(
+            found.joints,
+            found.findings.friction,
+            known,
+            found.before.learning.residual_floor,
+            strict=True,
         )
-        if measured > _MORE * assumed
+        if measured > assumed + floor
     ]
     if more:
         yield (
