@@ -484,6 +484,8 @@ def test_what_is_no_commissioning_is_refused():
             build(ControllerConfig, {**ROBOT, 'feedback.inertia': 'whole'}),
             POSTURE[None],
         )
+    with pytest.raises(BlfDscError, match=r'feedback\.damping_lag: got 0\.003 s'):
+        plan(change(CONFIG, {'feedback.damping_lag': 0.003}), POSTURE[None])
     with pytest.raises(BlfDscError, match=r'joint2 would be at 6\.25 rad'):
         plan(CONFIG, np.array([[0.0, 6.25]]))
     with pytest.raises(BlfDscError, match=r'robot\.urdf: got none'):

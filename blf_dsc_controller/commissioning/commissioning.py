@@ -166,8 +166,9 @@ def plan(
 
     With swings that keep its joints sliding, if these stick without (`sliding`).
 
-    Raises BlfDscError if the arm is not from a URDF, or has feedback through its inertia
-    matrix, with which no arm with elastic joints is safe to be measured.
+    Raises BlfDscError if the arm is not from a URDF, has feedback through its inertia
+    matrix, with which no arm with elastic joints is safe to be measured, or damping that
+    lags, of which the choice does not know.
     """
     if config.model != 'urdf':
         raise BlfDscError(
@@ -177,6 +178,11 @@ def plan(
         raise BlfDscError(
             f'feedback.inertia: got {config.feedback.inertia}, but an arm is measured with '
             'gains of its joints, each on its own: give none'
+        )
+    if config.feedback.damping_lag > 0.0:
+        raise BlfDscError(
+            f'feedback.damping_lag: got {config.feedback.damping_lag:g} s, but the margin of gains '
+            'that are chosen is that of damping which does not lag: give 0.0'
         )
     planned = []
     for posture in postures:
