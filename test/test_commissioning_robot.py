@@ -287,17 +287,19 @@ def test_loop_of_ones_own_logs_it_without_a_warning(caplog):
     assert line.levelno == logging.INFO
 
 
-def test_a_posture_that_noise_hides_is_measured_again(arm, capsys):
+def test_a_posture_that_noise_hides_is_measured_again(whole, capsys):
     """Both bags are kept, and only the second one counts."""
     coarse = '    sensor: {resolution: 4.0e-4, velocity: differenced}\n'
-    arm.write_text(
-        arm.read_text().replace('    initial.position', coarse + '    initial.position')
+    whole.write_text(
+        whole.read_text().replace(
+            '    initial.position', coarse + '    initial.position'
+        )
     )
-    assert commission(arm, 'plant', '--yes', '--torque', '0.01') == 0
+    assert commission(whole, 'plant', '--yes', '--torque', '0.03') == 0
     told = capsys.readouterr().out
     assert 'is measured once more' in told
     assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
-    folder = arm.with_name('out_bags')
+    folder = whole.with_name('out_bags')
     assert {bag.name for bag in folder.iterdir()} == {
         *('move_1', 'weak_posture_1', 'posture_1')
     }
@@ -308,11 +310,26 @@ def test_a_posture_that_noise_hides_is_measured_again(arm, capsys):
     assert strong == pytest.approx(MOST * weak)  # of the last joint's fastest line
     run = blf.read_run(folder / 'posture_1')
     assert np.abs(run.error[0]).max() < 1e-3  # from where the arm rests: a step or two
-    gains = gains_of(arm.with_name('out.yaml'))
+    gains = gains_of(whole.with_name('out.yaml'))
     bag = str(folder / 'posture_1')
-    again = arm.with_name('again.yaml')
-    assert main(['commission', bag, '--config', str(arm), '--out', str(again)]) == 0
+    again = whole.with_name('again.yaml')
+    assert main(['commission', bag, '--config', str(whole), '--out', str(again)]) == 0
     np.testing.assert_array_equal(gains_of(again), gains)
+
+
+def test_gains_too_soft_for_any_bound_are_refused(whole, capsys):
+    """So coarse are the positions, or so weak is the motion."""
+    coarse = '    sensor: {resolution: 4.0e-4, velocity: differenced}\n'
+    whole.write_text(
+        whole.read_text().replace(
+            '    initial.position', coarse + '    initial.position'
+        )
+    )
+    assert commission(whole, 'plant', '--yes', '--torque', '0.01') == 1
+    told = capsys.readouterr().err
+    assert 'too soft for any bound: joint1 would be off by up to 1.6' in told
+    assert '--torque' in told
+    assert nothing_looks_whole(whole)
 
 
 def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.tuning import gains_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.configuration.plausibility import widest_bound
 from blf_dsc_controller.configuration.schema import Value, change, flatten
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 
@@ -75,7 +77,8 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
 
     Friction may act while a load is picked up, so the errors of both add.  None, if the
     bounds of the joints follow from one at the tool.  Funnels that are given begin at these
-    bounds at least; others follow.
+    bounds at least; others follow.  Raises BlfDscError if a joint needs one that bounds
+    nothing.
     """
     barrier = config.barrier
     if barrier.bounds_tool:
@@ -85,6 +88,7 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     if (least <= barrier.bound).all():
         return {}
     wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
+    _check_bound(config, wide)
     values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
     arm, _ = design_of(config)
     usual = gains_of(arm, np.array(barrier.bound))['barrier.initial_bound']
@@ -93,3 +97,16 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
         starts = np.where(starts > 0.0, np.maximum(starts, wide), 0.0)
         values['barrier.initial_bound'] = tuple(starts.tolist())
     return values
+
+
+def _check_bound(config: ControllerConfig, wide: Floats) -> None:
+    """Refuse bounds (n,) [rad or m] that are half of a joint's range, or a quarter turn."""
+    limits, kinds = config.limits, config.robot.kinds(config.joints)
+    widest = map(widest_bound, kinds, limits.position_lower, limits.position_upper)
+    for joint, bound, most in zip(config.joints, wide, widest, strict=True):
+        if bound > most:
+            raise BlfDscError(
+                f'the gains that have the margin are too soft for any bound: {joint} would be off '
+                f'by up to {bound / _ROOM:.2g}, in rad or m. Noise or friction hide the response: '
+                'measure again with a larger --torque or --travel'
+            )

@@ -172,6 +172,14 @@ def _of_ranges(config: Checked, chain: Chain) -> Iterator[_Doubt]:
                 )
 
 
+def widest_bound(kind: str, lower: float, upper: float) -> float:
+    """Return the largest bound [rad or m] on the error of a joint by its limits."""
+    allowed = 0.5 * (upper - lower)
+    if kind != 'prismatic':
+        allowed = min(allowed, _QUARTER)
+    return max(allowed, _SOFTEST)
+
+
 def _of_errors(config: Checked) -> Iterator[_Doubt]:
     """Check the bounds on errors against the ranges of the joints."""
     if config.barrier.bounds_tool:  # from which they follow
@@ -185,10 +193,8 @@ def _of_errors(config: Checked) -> Iterator[_Doubt]:
         limits.position_upper,
         strict=True,
     ):
-        allowed = 0.5 * (upper - lower)
-        if kind != 'prismatic':
-            allowed = min(allowed, _QUARTER)
-        if bound > max(allowed, _SOFTEST):
+        allowed = widest_bound(kind, lower, upper)
+        if bound > allowed:
             yield _Doubt(
                 'barrier.bound',
                 f'got {bound:g} for {joint}, but past {allowed:.3g}, half of its range or a '
