@@ -182,6 +182,7 @@ def test_arm_reaches_the_reference_from_anywhere_within_the_bound(start):
     [
         (0.6, 1.0, 6.0, 0.6),
         (0.0, 1.0, 6.0, 1.0),  # from rest
+        (0.011, 1.0, 6.0, 1.0),  # which is a step of the velocity of a Damiao motor
         (1.0, 1.0, 6.0, 1.0),  # it would take 4.8 s
         # braked by half of 2 rad/s^2 within 0.27 rad from 2.3 rad, by half of 1.2 in 0.45 rad
         (0.6, 1.0, 2.65, 1.0),

@@ -104,4 +104,4 @@ def test_command_of_earlier_versions_says_where_its_table_is(command, table, cap
         blf_dsc([command, '--out', 'nowhere'])
     assert ended.value.code == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last.endswith(f'in a checkout, call python -m benchmark {table}')
+    assert f': in a checkout, call python -m benchmark {table}; see ' in last

@@ -52,6 +52,9 @@ _IN_MOTION = 0.6
 What the model lacks, as a load that a reset has made the law forget, acts by the acceleration.
 """
 _LONGEST_IN_MOTION = 4.0  # s
+_MOVING = (
+    2.0 * AT_REST
+)  # rad/s, from which on it does: steps of a motor's velocity reach AT_REST
 _PERIOD = 0.005  # s, between two checked samples
 _FEWEST_CHECKED = 200  # samples, for short motions
 _MOST_CHECKED = 1_000_000  # samples, for very long ones
@@ -378,7 +381,7 @@ def _gently(
     config: ControllerConfig, q: np.ndarray, dq: np.ndarray, target: Term, t: float
 ) -> BlendedReference | None:
     """Plan from motion to `target` with a share of the acceleration; None: rest, or no way."""
-    if np.abs(dq).max() <= AT_REST:
+    if np.abs(dq).max() <= _MOVING:
         return None
     limits = config.limits
     acceleration = tuple(_IN_MOTION * each for each in limits.acceleration)
