@@ -52,9 +52,7 @@ _IN_MOTION = 0.6
 What the model lacks, as a load that a reset has made the law forget, acts by the acceleration.
 """
 _LONGEST_IN_MOTION = 4.0  # s
-_MOVING = (
-    2.0 * AT_REST
-)  # rad/s, from which on it does: steps of a motor's velocity reach AT_REST
+_MOVING = 2.0 * AT_REST  # rad/s; steps of a motor's velocity reach AT_REST
 _PERIOD = 0.005  # s, between two checked samples
 _FEWEST_CHECKED = 200  # samples, for short motions
 _MOST_CHECKED = 1_000_000  # samples, for very long ones
