@@ -73,6 +73,15 @@ def commission(arm, address, *options, postures=(NEAR,)):
     return main([*words, '--out', str(arm.with_name('out.yaml')), *options])
 
 
+def coarsen(arm, resolution):
+    """Give the arm encoders with such steps [rad], whose velocities are differences."""
+    coarse = f'    sensor: {{resolution: {resolution}, velocity: differenced}}\n'
+    text = arm.read_text()
+    arm.write_text(
+        text.replace('    initial.position', coarse + '    initial.position')
+    )
+
+
 def nothing_looks_whole(arm):
     return not (arm.with_name('out.yaml').exists() or arm.with_name('out.png').exists())
 
@@ -289,12 +298,7 @@ def test_loop_of_ones_own_logs_it_without_a_warning(caplog):
 
 def test_a_posture_that_noise_hides_is_measured_again(whole, capsys):
     """Both bags are kept, and only the second one counts."""
-    coarse = '    sensor: {resolution: 4.0e-4, velocity: differenced}\n'
-    whole.write_text(
-        whole.read_text().replace(
-            '    initial.position', coarse + '    initial.position'
-        )
-    )
+    coarsen(whole, '4.0e-4')
     assert commission(whole, 'plant', '--yes', '--torque', '0.03') == 0
     told = capsys.readouterr().out
     assert 'is measured once more' in told
@@ -319,15 +323,10 @@ def test_a_posture_that_noise_hides_is_measured_again(whole, capsys):
 
 def test_gains_too_soft_for_any_bound_are_refused(whole, capsys):
     """So coarse are the positions, or so weak is the motion."""
-    coarse = '    sensor: {resolution: 4.0e-4, velocity: differenced}\n'
-    whole.write_text(
-        whole.read_text().replace(
-            '    initial.position', coarse + '    initial.position'
-        )
-    )
+    coarsen(whole, '4.0e-4')
     assert commission(whole, 'plant', '--yes', '--torque', '0.01') == 1
     told = capsys.readouterr().err
-    assert 'too soft for any bound: joint1 would be off by up to 1.6' in told
+    assert 'too soft for any bound: joint1 would be off by up to 1.7 rad' in told
     assert '--torque' in told
     assert nothing_looks_whole(whole)
 
@@ -356,10 +355,7 @@ def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):
 
 def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
     """Not once all postures have been measured."""
-    coarse = '    sensor: {resolution: 1.0e-3, velocity: differenced}\n'
-    arm.write_text(
-        arm.read_text().replace('    initial.position', coarse + '    initial.position')
-    )
+    coarsen(arm, '1.0e-3')
     options = ('--yes', '--torque', '0.01', '--travel', '1e-5')
     assert commission(arm, 'plant', *options, postures=(FAR, NEAR)) == 1
     told = capsys.readouterr().err

@@ -87,8 +87,8 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     least = _ROOM * (errors.unmodelled + errors.pick_up)
     if (least <= barrier.bound).all():
         return {}
+    _check_bound(config, least)
     wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
-    _check_bound(config, wide)
     values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
     arm, _ = design_of(config)
     usual = gains_of(arm, np.array(barrier.bound))['barrier.initial_bound']
@@ -99,14 +99,21 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     return values
 
 
-def _check_bound(config: ControllerConfig, wide: Floats) -> None:
-    """Refuse bounds (n,) [rad or m] that are half of a joint's range, or a quarter turn."""
+def _check_bound(config: ControllerConfig, least: Floats) -> None:
+    """Refuse errors to expect (n,) [rad or m] of half of a joint's range, or a quarter turn.
+
+    One within a bound that the file gives and insists on may be so large.
+    """
     limits, kinds = config.limits, config.robot.kinds(config.joints)
     widest = map(widest_bound, kinds, limits.position_lower, limits.position_upper)
-    for joint, bound, most in zip(config.joints, wide, widest, strict=True):
-        if bound > most:
+    given = config.barrier.bound
+    for joint, kind, needed, most in zip(
+        config.joints, kinds, least, np.maximum(given, [*widest]), strict=True
+    ):
+        if needed > most:
+            unit = 'm' if kind == 'prismatic' else 'rad'
             raise BlfDscError(
                 f'the gains that have the margin are too soft for any bound: {joint} would be off '
-                f'by up to {bound / _ROOM:.2g}, in rad or m. Noise or friction hide the response: '
+                f'by up to {needed / _ROOM:.2g} {unit}. Noise or friction hide the response: '
                 'measure again with a larger --torque or --travel'
             )
