@@ -11,6 +11,8 @@ import pytest
 from law_part import part
 
 import blf_dsc_controller as blf
+from benchmark.soft_pairs import pair_of
+from benchmark.studies import load_study
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
@@ -20,6 +22,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import disturbance, load_observer
 from blf_dsc_controller.law.load_observer import Settings, State, Work
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.runs import run_chunk
 from blf_dsc_controller.supervision.calming import softened
 
 DT = 1e-3  # s
@@ -29,7 +32,6 @@ SETTINGS = Settings(
     enabled=1,
     observer_bandwidth=L,
     sensor_lag=0.0,
-    samples=2000,
     most=np.array([40.0, 6.0]),
     unmodelled=np.array([0.5, 0.1]),
     rotors=np.array([0.0, 0.0, 0.25]),
@@ -37,6 +39,7 @@ SETTINGS = Settings(
 X = np.array([[9.0, 2.0, 0.5, 1.0], [0.0, 3.0, 1.5, 1.0]])
 THETA = np.array([1.0, -2.0, 0.75, 5.0])
 LINKS = THETA[:P] - SETTINGS.rotors
+NOTHING = np.zeros(P)
 CERTAIN = np.diag([1e6] * M)  # 1e-3 of each parameter
 
 
@@ -54,17 +57,15 @@ def run(
     *,
     settings=SETTINGS,
     theta=THETA,
+    absorbed=NOTHING,
     information=CERTAIN,
-    learned=False,
-    d3=None,
 ):
     """Observe constant sensors for some time; `effort` may be a function of the time."""
-    d3 = np.zeros(N) if d3 is None else d3
     for k in range(round(seconds / DT)):
         sensed = effort(k * DT) if callable(effort) else effort
         for i in range(N):
             load_observer.filter_interval(settings, state, i, X[i], sensed[i], DT)
-        load_observer.update(settings, state, work, theta, information, d3, learned, DT)
+        load_observer.update(settings, state, work, theta, absorbed, information, DT)
     return state.torque.copy()
 
 
@@ -106,10 +107,9 @@ def test_r_is_the_load_of_a_known_mass_on_an_arm_at_rest():
                 state,
                 work,
                 theta,
+                np.zeros(settings.p),
                 settings.information,
-                np.zeros(n),
-                is_learned=False,
-                dt=DT,
+                DT,
             )
     weight = H @ (loaded - links)
     assert np.abs(weight).max() > 5.0  # N m
@@ -150,7 +150,7 @@ def test_what_is_learned_fades_from_r_and_changes_no_torque():
     d3 = np.array([1.0, 2.0])
     before, after = THETA.copy(), THETA + learned
     disturbance.hand_over(d3, X, after, before)
-    load_observer.hand_over(SETTINGS, state, d3, after, before)
+    load_observer.hand_over(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
     r = run(state, work, sensed, DT, theta=after)
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
@@ -230,45 +230,27 @@ def test_law_that_continues_with_its_disturbance_does_not_have_it_twice():
     np.testing.assert_allclose(r, [0.0, 2.0 * exp(-4.0)], atol=1e-3)
 
 
-def test_what_remains_once_a_window_is_learned_is_not_added():
-    """0.4 N m at 1 Hz: rms 0.28, of which twice is not reached; 3 N m are, less 0.57."""
+def test_what_is_absorbed_of_friction_is_not_taken_back():
+    """P^ has 0.3 of a parameter too much, by which it compensates for friction."""
     state, work = settled()
-
-    def ripple(t, more=0.0):
-        wave = 0.4 * np.sin(2.0 * np.pi * t) + more
-        return X[:, :P] @ LINKS + [wave, 0.0]
-
-    run(state, work, ripple, 20.0, learned=True)
-    largest = 0.0
-    for _ in range(100):
-        largest = max(largest, abs(run(state, work, ripple, 0.01, learned=True)[0]))
-    assert largest < 0.05
-    r = run(state, work, lambda t: ripple(t, 3.0), 0.25, learned=True)[0]
-    assert 2.5 < r < 3.0  # 3 + 0.4 - 2 rms
+    share = np.array([0.3, 0.0, 0.0])
+    learned = THETA + np.append(share, 0.0)
+    sensed = X[:, :P] @ LINKS
+    r = run(state, work, sensed, 1.0, theta=learned)
+    np.testing.assert_allclose(r, -X[:, :P] @ share, atol=1e-9)
+    r = run(state, work, sensed, 1.0, theta=learned, absorbed=share)
+    np.testing.assert_allclose(r, 0.0, atol=1e-9)
 
 
-def test_threshold_begins_without_a_step_of_the_torque():
-    """The unmodelled 0.5 N m are s at first: 1 of 3 N m goes to d^3."""
+def test_torque_is_the_same_while_it_becomes_known_what_is_absorbed():
     state, work = settled()
-    sensed = X[:, :P] @ LINKS + [3.0, 0.0]
+    sensed = X[:, :P] @ LINKS + [1.0, 0.5]
     before = run(state, work, sensed, 1.0)
-    d3 = np.zeros(N)
-    after = run(state, work, sensed, DT, learned=True, d3=d3)
-    np.testing.assert_allclose(d3, [1.0, 0.0], atol=0.02)  # 1 / 200 windows
+    share, d3 = np.array([0.05, 0.1, 0.0]), np.zeros(N)
+    load_observer.hand_over(SETTINGS, state, d3, THETA, THETA, share, NOTHING)
+    after = run(state, work, sensed, DT, absorbed=share)
+    assert np.abs(after - before).max() > 0.1
     np.testing.assert_allclose(after + d3, before, atol=1e-9)
-
-
-def test_load_that_is_never_learned_goes_to_the_disturbance_estimate():
-    """The mean of r becomes the bias, within windows; d^3 then takes it."""
-    state, work = settled()
-    sensed = X[:, :P] @ LINKS + [3.0, 0.0]
-    run(state, work, X[:, :P] @ LINKS, 2.0, learned=True)
-    r = run(state, work, sensed, 0.2, learned=True)[0]
-    assert r > 2.5
-    d3 = np.zeros(N)
-    later = run(state, work, sensed, 60.0, learned=True, d3=d3)[0]
-    assert later < 0.5
-    assert later + d3[0] == pytest.approx(r, abs=0.05)  # the filters had e^-10 to go
 
 
 @pytest.mark.parametrize(
@@ -314,6 +296,17 @@ def test_soft_elastic_arm_takes_up_a_load_by_its_torque_sensors():
     state, kept = record.controller.state, record.controller.checks.estimates.kept
     held = state.disturbance + state.observer.torque
     np.testing.assert_array_equal(kept[-len(held) :], held)
+
+
+def test_learning_costs_nothing_on_a_panda_that_is_pushed_and_loaded():
+    """Arm 1 of a study: 1.03 times the rms error without learning.
+
+    While r only had what exceeded its usual rms, it was 1.58 times.
+    """
+    study = load_study('monte_carlo_elastic_changes_panda')
+    pair = pair_of('panda', 1, study, run_chunk(study, 1, 1))
+    learning, without, _ = pair.rms
+    assert learning < 1.1 * without
 
 
 def test_without_the_observer_efforts_change_no_torque():

@@ -28,6 +28,7 @@ from blf_dsc_controller.factory.estimate import (
 from blf_dsc_controller.factory.inertia import joint_inertia
 from blf_dsc_controller.factory.laws import law_of, of_law
 from blf_dsc_controller.law import (
+    absorbed_friction,
     adaptation,
     apparent_inertia,
     barrier,
@@ -96,7 +97,13 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         surface=_surface(config, row.lag),
         feedback=_feedback(config),
         disturbance=filled(disturbance.Settings, config.disturbance, bumpless=1),
-        observer=_observer(config, model.p, row.lag, sliding),
+        observer=_observer(config, model.p, row.lag),
+        absorbed=absorbed_friction.Settings(
+            filter_pole=row.filter_pole,
+            length=sliding.length,
+            period=sliding.row_interval * config.sample_time,
+            least_weight=sliding.prior_weight + sliding.regularization,
+        ),
         torque=_torque(config),
         columns=_columns(config, model.p),
         row=row,
@@ -161,9 +168,7 @@ def _follows_inertia(config: ControllerConfig) -> bool:
     return config.model == 'urdf' and config.feedback.inertia == 'whole'
 
 
-def _observer(
-    config: ControllerConfig, p: int, lag: float, sliding: window.Settings
-) -> load_observer.Settings:
+def _observer(config: ControllerConfig, p: int, lag: float) -> load_observer.Settings:
     """Return how the load is observed by joint torque sensors; `lag` [s] is that of the rows."""
     robot = config.robot
     is_on = config.disturbance.observer_bandwidth > 0.0
@@ -177,7 +182,6 @@ def _observer(
         config.disturbance,
         enabled=int(is_on),
         sensor_lag=0.5 * lag,  # the other half is that of the drives
-        samples=sliding.length * sliding.row_interval,
         unmodelled=_unmodelled(config),
         most=load_observer.most_load(np.array(config.torque.limit)),
         rotors=rotors,

@@ -7,6 +7,7 @@ columns, ripple   the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
 load_observer     the torque that joint torque sensors show and the model lacks
 torque_sensors    whether they are such sensors, and alive
+absorbed_friction what P^ has taken of the friction of the motors, by these sensors
 window            sums of the rows over tau_d
 change            whether the arm has changed, so that the window must be forgotten
 excitation        whether a window is excited, consistent, and latched
@@ -23,6 +24,7 @@ from __future__ import annotations
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import (
+    absorbed_friction,
     adaptation,
     change,
     columns,
@@ -61,21 +63,54 @@ def observe(
         return
     samples = int(state.samples[0])
     if samples % settings.window.row_interval == 0:
+        if settings.observer.enabled == 1:
+            add_absorbed(settings, state, signals)
         window.push_row(state.window, signals.row.Xu)
         measure_reversals(settings, state, settings.window.row_interval * dt)
     if settings.excitation.change_detection == 1:
         detect_change(settings, state, signals, dt)
     if samples % settings.window.interval == 0:
-        excitation.update_excitation(
-            settings.excitation,
-            state.latch,
-            signals.latch,
-            Window(settings.window, state.window, signals.window),
-            Prior(settings.initial_estimate, settings.information),
-            settings.model,
-            signals.q,
-            t,
-            dt,
+        check_excitation(settings, state, signals, t, dt)
+
+
+@inner
+def add_absorbed(settings: Settings, state: State, signals: Signals) -> None:
+    """Add the row to those of the friction that P^ absorbs, unless a sensor is silent."""
+    of, now, row = settings.absorbed, state.absorbed, signals.row.Xu
+    if load_observer.is_missing(signals.effort):
+        return
+    moving = prediction.moving_share(signals.dqr, settings.row.motion_scale)
+    share = absorbed_friction.fade(of, now, moving)
+    for i in range(settings.n):
+        weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
+        g = absorbed_friction.unexplained(
+            now, row, weight, i, settings.observer.rotors, state.estimate
+        )
+        absorbed_friction.add_row(now, row, i, g, share)
+
+
+@inner
+def check_excitation(
+    settings: Settings, state: State, signals: Signals, t: float, dt: float
+) -> None:
+    """Latch the window at time t [s] if it suffices."""
+    sliding = Window(settings.window, state.window, signals.window)
+    prior = Prior(settings.initial_estimate, settings.information)
+    excitation.update_excitation(
+        settings.excitation,
+        state.latch,
+        signals.latch,
+        sliding,
+        prior,
+        settings.model,
+        signals.q,
+        t,
+        dt,
+    )
+    is_new = state.latch.latched[0] == 1.0 and state.latch.latch_time[0] == t
+    if is_new and settings.observer.enabled == 1:
+        absorbed_friction.solve(
+            settings.absorbed, state.absorbed, signals.absorbed, settings.information
         )
 
 
@@ -144,7 +179,6 @@ def filter_external_torque(
 def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Let `load_observer` find r by the row of the last interval, before its poles."""
     of, now, row = settings.observer, state.observer, signals.row.Xu
-    is_learned = state.latch.latched[0] == 1.0 and settings.adaptation.weight > 0.0
     if state.samples[0] <= 1.0:
         load_observer.begin(now, state.disturbance)
     if load_observer.is_missing(signals.effort):
@@ -157,11 +191,11 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
         now,
         signals.observer,
         state.estimate,
+        state.absorbed.absorbed,
         settings.information,
-        state.disturbance,
-        is_learned and state.frozen[0] == 0.0,
         dt,
     )
+    absorbed_friction.pass_poles(settings.absorbed, state.absorbed, now.late, dt)
     torque_sensors.follow_applied(
         state.sensors, row, settings.m, of.observer_bandwidth, dt
     )
@@ -180,7 +214,7 @@ def check_sensors(
         work.differences[0, i] = of.filtered[i, settings.p] - now.command[i]
         if now.is_told[0] == 0.0:
             work.differences[1, i] = load_observer.residual(
-                settings.observer, of, i, state.estimate
+                settings.observer, of, i, state.estimate, state.absorbed.absorbed
             )
     if begins:
         torque_sensors.begin(now, of.torque)
@@ -282,7 +316,28 @@ def hand_over(
             state.disturbance,
             state.estimate,
             before,
+            state.absorbed.absorbed,
+            state.absorbed.absorbed,
         )
+
+
+@inner
+def follow_absorbed(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Let P_f follow, as P^ does; d^3 takes what r loses."""
+    now, work = state.absorbed, signals.absorbed
+    of = settings.adaptation
+    absorbed_friction.follow(now, work, of.weight, of.adaptation_gain, dt)
+    load_observer.hand_over(
+        settings.observer,
+        state.observer,
+        state.disturbance,
+        state.estimate,
+        state.estimate,
+        now.absorbed,
+        work.before,
+    )
 
 
 @inner
@@ -326,6 +381,8 @@ def adapt(
     if latch.latched[0] == 1.0:
         if settings.disturbance.bumpless == 1:
             hand_over(settings, state, signals, work.tracked)
+        if settings.observer.enabled == 1:
+            follow_absorbed(settings, state, signals, dt)
         friction.adapt_breakaway(
             settings.friction, state.friction, signals.friction, dt
         )

@@ -3,13 +3,13 @@
 
 A sensor behind a gear shows the torque tau_J that reaches the links, whatever motor and
 friction do.  With the row X of the last interval (see `prediction`), by the measured
-motion, and P_l, the learned parameters less those of the assumed rotors,
+motion, and P_l, the learned parameters less those of the motors,
 
     r = tau_J,L - X_L P_l - bias,       both passed through the lag of velocities and a pole L
 
 is added to the torque: within some 1 / L it has what d^3 and the learning find in seconds.
 It is linear in P^, so that it gives up what is learned at once; d^3 then only has to give
-up the rest (`handed_over`).  Near the reference it is the feedback
+up the rest (`hand_over`).  Near the reference it is the feedback
 
     r = L / (s + L) (M - M_l) s^2 xi1
 
@@ -26,12 +26,8 @@ within 10 / L if the prior explains it.  A joint whose sensor shows more than `_
 deviations keeps it: it has an offset, or the arm holds something.  It is also kept if the
 law continues with a d^3 of its own, which may have that already.
 
-*Threshold.*  What is learned describes the torque of the motors, with all their friction:
-r would take back what of it helps the motors alone.  So once a window is learned, only what
-exceeds `_THRESHOLD` s is added, s being the rms of r about its mean: at first that of the
-unmodelled torque, then measured over the length of a window while nothing touches the
-arm.  What r has added below that before is handed to d^3, and so is a load that is not learned, as
-at rest, in the seconds in which it becomes the usual r.
+*Friction.*  What is learned describes the torque of the motors, with all their friction.  P_l
+is without what P^ has absorbed of that (`absorbed_friction`), or else r would take it back.
 """
 
 from math import isfinite, sqrt
@@ -46,10 +42,6 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 _SETTLING = 4.0  # 1/L, until r is that of the arm
 _RELEASED = 10.0  # 1/L, in which a plausible bias fades
 _SIGMAS = 3.0  # of what the prior explains
-_THRESHOLD = 2.0  # s: a sinusoid does not reach it
-_FIRST = 0.1  # of a window, for which the unmodelled torque counts as s
-_CLIPPED = 2.0  # s, beyond which r says nothing about its mean and its rms
-_LEAST = 0.1  # of the unmodelled torque, likewise
 _MOST = 0.5  # of the torque limit
 
 
@@ -64,7 +56,6 @@ class Settings(NamedTuple):
     enabled: int  # 1: there are joint torque sensors, which are used
     observer_bandwidth: float  # L, rad/s
     sensor_lag: float  # of velocities, which the torque waits for, s
-    samples: int  # in a window of the learning
     most: Annotated[Array, 'n']  # largest |r|, N m; zero: the observer is off
     unmodelled: Annotated[Array, 'n']  # rms torque that no column describes, N m
     # what the assumed rotors add to P^, kg m^2
@@ -80,10 +71,8 @@ class State(NamedTuple):
     bias: Annotated[Array, 'n * observer.enabled']  # N m
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
-    square: Annotated[Array, 'n * observer.enabled']  # s^2, (N m)^2
     faded: Cell  # share of r that is left out, as the sensors are in doubt
     elapsed: Cell  # s, since the first interval
-    measured: Cell  # samples of s^2
 
 
 class Work(NamedTuple):
@@ -125,32 +114,28 @@ def filter_interval(
 
 
 @inner
-def residual(settings: Settings, state: State, i: int, estimate: Array) -> float:
+def residual(
+    settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
+) -> float:
     """Return tau_J,L - X_L P_l of joint i [N m] for an `estimate` theta (m,)."""
     filtered = state.filtered[i]
     p = filtered.size - 1
     r = filtered[p]
     for j in range(p):
-        r -= filtered[j] * (estimate[j] - settings.rotors[j])
+        r -= filtered[j] * (estimate[j] - settings.rotors[j] - absorbed[j])
     return float(r)
 
 
 @inner
-def load_torque(settings: Settings, state: State, i: int, estimate: Array) -> float:
+def load_torque(
+    settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
+) -> float:
     """Return r of joint i [N m] for an `estimate` theta (m,)."""
     if not has_settled(settings, state):
         return 0.0
-    return excess(settings, state, i, residual(settings, state, i, estimate))
-
-
-@inner
-def excess(settings: Settings, state: State, i: int, seen: float) -> float:
-    """Return r of joint i [N m] for a `seen` residual [N m]: what its threshold leaves of it."""
-    r = seen - state.bias[i]
-    usual = _THRESHOLD * sqrt(state.square[i])
+    r = residual(settings, state, i, estimate, absorbed) - state.bias[i]
     most = settings.most[i]
-    share = 1.0 - state.faded[0]
-    return float(share * clip(r - clip(r, -usual, usual), -most, most))
+    return float((1.0 - state.faded[0]) * clip(r, -most, most))
 
 
 @inner
@@ -159,30 +144,22 @@ def update(
     state: State,
     work: Work,
     estimate: Array,
+    absorbed: Array,
     information: Array,
-    disturbance: Array,
-    is_learned: bool,
     dt: float,
 ) -> None:
     """Compute r after an interval of `dt` [s], and its bias once the filters have settled.
 
-    The `information` (m, m) is the inverse covariance of the prior of theta, which
-    `is_learned` by now, while nothing touches the arm, or not.  d^3, the `disturbance` (n,)
-    [N m], takes what bias and threshold then keep out of r.
+    The `information` (m, m) is the inverse covariance of the prior of theta.
     """
     settling = _SETTLING / settings.observer_bandwidth
     before = state.elapsed[0]
     state.elapsed[0] = before + dt
     if before < settling <= state.elapsed[0]:
-        find_bias(settings, state, work, estimate, information)
-    if is_learned:
-        if state.measured[0] == 0.0:
-            begin_threshold(settings, state, estimate, disturbance)
-        measure(settings, state, estimate, disturbance)
-    elif state.measured[0] == 0.0:
-        release_bias(settings, state, dt)
+        find_bias(settings, state, work, estimate, absorbed, information)
+    release_bias(settings, state, dt)
     for i in range(state.torque.size):
-        state.torque[i] = load_torque(settings, state, i, estimate)
+        state.torque[i] = load_torque(settings, state, i, estimate, absorbed)
 
 
 @inner
@@ -195,46 +172,12 @@ def release_bias(settings: Settings, state: State, dt: float) -> None:
 
 
 @inner
-def begin_threshold(
-    settings: Settings, state: State, estimate: Array, disturbance: Array
-) -> None:
-    """Begin with the unmodelled torque as s; d^3 takes what r loses."""
-    for i in range(state.square.size):
-        disturbance[i] += load_torque(settings, state, i, estimate)
-        state.square[i] = settings.unmodelled[i] * settings.unmodelled[i]
-        disturbance[i] -= load_torque(settings, state, i, estimate)
-
-
-@inner
-def measure(
-    settings: Settings, state: State, estimate: Array, disturbance: Array
-) -> None:
-    """Update the mean of r, which is the bias, and its mean square about that.
-
-    d^3, the `disturbance` (n,) [N m], takes what r loses.
-    """
-    state.measured[0] += 1.0
-    first = _FIRST * settings.samples + state.measured[0]
-    share = max(1.0 / settings.samples, 1.0 / first)
-    for i in range(state.bias.size):
-        seen = residual(settings, state, i, estimate)
-        before = excess(settings, state, i, seen)
-        r = seen - state.bias[i]
-        least = _LEAST * settings.unmodelled[i]
-        most = _CLIPPED * max(least, sqrt(state.square[i]))
-        r = clip(r, -most, most)
-        state.bias[i] += share * r
-        state.square[i] += share * (r * r - state.square[i])
-        if has_settled(settings, state):
-            disturbance[i] += before - excess(settings, state, i, seen)
-
-
-@inner
 def find_bias(
     settings: Settings,
     state: State,
     work: Work,
     estimate: Array,
+    absorbed: Array,
     information: Array,
 ) -> None:
     """Subtract what the sensors show at the start; keep it where the prior does not explain it."""
@@ -244,7 +187,7 @@ def find_bias(
             work.factor[j, k] = information[j, k]
     cholesky_factor(work.factor)
     for i in range(state.bias.size):
-        state.bias[i] = residual(settings, state, i, estimate)
+        state.bias[i] = residual(settings, state, i, estimate, absorbed)
         p = state.filtered.shape[1] - 1
         for j in range(m):
             work.row[j] = state.filtered[i, j] if j < p else 0.0
@@ -267,9 +210,18 @@ def begin(state: State, disturbance: Array) -> None:
 
 @inner
 def hand_over(
-    settings: Settings, state: State, disturbance: Array, theta: Array, before: Array
+    settings: Settings,
+    state: State,
+    disturbance: Array,
+    theta: Array,
+    before: Array,
+    absorbed: Array,
+    absorbed_before: Array,
 ) -> None:
-    """Add to d^3, the `disturbance` (n,) [N m], what r has given up to theta since `before`."""
+    """Add to d^3, the `disturbance` (n,) [N m], what r has given up since `before`.
+
+    That is by a change of theta (m,), and of what it has `absorbed` (p,).
+    """
     for i in range(state.torque.size):
-        disturbance[i] += load_torque(settings, state, i, before)
-        disturbance[i] -= load_torque(settings, state, i, theta)
+        disturbance[i] += load_torque(settings, state, i, before, absorbed_before)
+        disturbance[i] -= load_torque(settings, state, i, theta, absorbed)

@@ -17,6 +17,7 @@ from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, Passed, size_of, view_of
 from blf_dsc_controller.law import (
+    absorbed_friction,
     adaptation,
     apparent_inertia,
     barrier,
@@ -66,6 +67,7 @@ class Settings(NamedTuple):
     feedback: feedback.Settings
     disturbance: disturbance.Settings
     observer: load_observer.Settings
+    absorbed: absorbed_friction.Settings
     torque: torque.Settings
     columns: columns.Settings
     row: prediction.Settings
@@ -91,6 +93,7 @@ class State(NamedTuple):
     saturation: torque.State
     row: prediction.State
     observer: load_observer.State
+    absorbed: absorbed_friction.State
     sensors: torque_sensors.State
     latch: excitation.State
     change: change.State
@@ -139,6 +142,7 @@ class Signals(NamedTuple):
     saturation: torque.Work
     row: prediction.Work
     observer: load_observer.Work
+    absorbed: absorbed_friction.Work
     sensors: torque_sensors.Work
     window: window.Work
     latch: excitation.Work
