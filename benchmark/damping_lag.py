@@ -2,20 +2,25 @@
 """UR5es whose damping lags (`feedback.damping_lag`), and the same ones without.
 
     python -m benchmark damping-lag margins
+    python -m benchmark damping-lag motors
+    python -m benchmark damping-lag drawn [--count 40]
     python -m benchmark damping-lag arms [--arms 143 ...] [--lag 0.003]
     python -m benchmark damping-lag presets [--lag 0.003]
 
 The margins are those of the linear loop of the arm in the middle of the study of
-`random-arms`, with encoders at its links and at its motors.  Arms are random ones of that
-study, by default those that oscillate although the published gains hold, and three calm
-ones.  Presets pick up the 3 kg of `ur5e`, or 2 kg, with motors of several times the
-controller's guess, encoders at either side, and play.  Errors [mrad] are the largest in
-motion, from the pick-up on, and from 3 s later on.
+`random-arms`, with encoders at its links and at its motors.  Those of `motors` are of presets
+with motors of several times the controller's guess, those of `drawn` of arms of that study,
+both also with a lag on the damping of the first three joints alone, which the law does not
+have.  Arms are random ones of the study, by default those that oscillate although the
+published gains hold, and three calm ones.  Presets pick up the 3 kg of `ur5e`, or 2 kg, with
+motors of several times the controller's guess, encoders at either side, and play.  Errors
+[mrad] are the largest in motion, from the pick-up on, and from 3 s later on.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -34,6 +39,17 @@ LAGS = (0.0, 0.001, 0.002, 0.003, 0.004, 0.005, 0.0075)  # s
 OSCILLATE = (143, 362, 411, 417, 424, 442)
 CALM = (3, 5, 8)
 PLAY = 4e-4  # rad
+GUESSES = (1.0, 2.0, 3.0, 5.0, 7.0)
+POSTURES = 3
+LARGE = 3  # joints of shoulder and elbow
+SETTINGS = {  # how many joints lag, by how much [s]
+    'none': (0, 0.0),
+    '3 ms': (6, LAG),
+    f'3 ms, first {LARGE} joints': (LARGE, LAG),
+    f'5 ms, first {LARGE} joints': (LARGE, 0.005),
+}
+QUARTILES = (0.0, 0.25, 0.5, 0.75, 1.0)
+LESS = 0.02  # of margin, that counts as less
 ROTORS = (0.5, 1.0, 2.0, 7.0)
 AT_MOTORS: Mapping[str, object] = {'sensor.side': 'motor'}
 OF_2_KG: Mapping[str, object] = {'events.payload': [2.0]}
@@ -65,6 +81,46 @@ def margins() -> Iterator[list[str]]:
         sides = (arm.joints._replace(motor_side=each) for each in (False, True))
         values = [arm._replace(joints=joints).margin(law) for joints in sides]
         yield [f'{1e3 * lag:g} ms', *(f'{each:.2f}' for each in values)]
+
+
+def motors() -> Iterator[list[str]]:
+    """Compute the rows: margins of presets with motors of several times the guess."""
+    for preset, side, factor in itertools.product(
+        (UR5E, 'ur5e_driver'), ('link', 'motor'), GUESSES
+    ):
+        loop = load_loop(preset, {PLANT: random_arms.picks_up(UR5E)})
+        rotors = factor * random_arms.guessed_rotors(loop.controller)
+        given = {'truth.rotor_inertia': rotors.tolist(), 'sensor.side': side}
+        found = margins_of(loop.controller, change(loop.plant, given))
+        yield [preset, side, f'{factor:g}', *(f'{each:.2f}' for each in found)]
+
+
+def drawn(count: int) -> Iterator[list[str]]:
+    """Compute the rows: margins of random arms, with encoders on either side."""
+    study = random_arms.study_of(UR5E)
+    plants = [random_arms.arm_of(study, number) for number in range(count)]
+    for side in ('link', 'motor'):
+        found = np.array(
+            [
+                margins_of(study.controller, change(each, {'sensor.side': side}))
+                for each in plants
+            ]
+        )
+        for label, values in zip(SETTINGS, found.T, strict=True):
+            quartiles = ' / '.join(f'{q:.2f}' for q in np.quantile(values, QUARTILES))
+            less = int((values < found[:, 0] - LESS).sum())
+            yield [side, label, quartiles, f'{(values == 0.0).sum()}', f'{less}']
+
+
+def margins_of(config: ControllerConfig, plant: PlantConfig) -> list[float]:
+    """Return the modulus margins of an arm with each of the `SETTINGS`."""
+    arm = random_arms.describe(config, plant, POSTURES)
+    law = random_arms.own_feedback(config, arm.M0)
+    n = len(config.joints)
+    return [
+        arm.margin(law._replace(damping_lag=np.where(np.arange(n) < first, lag, 0.0)))
+        for first, lag in SETTINGS.values()
+    ]
 
 
 def arms(numbers: Sequence[int], lag: float) -> Iterator[list[str]]:
@@ -109,6 +165,14 @@ def _told(found: Result) -> str:
 BOTH = 'without [mrad]', 'with the lag [mrad]'
 HEADS = {
     'margins': ('lag', 'encoders at the links', 'at the motors'),
+    'motors': ('preset', 'encoders', 'motors [of the guess]', *SETTINGS),
+    'drawn': (
+        'encoders',
+        'lag',
+        'margin: least / quartiles / largest',
+        'unstable',
+        'less than without',
+    ),
     'arms': ('arm', *BOTH),
     'presets': ('preset', 'arm', 'motors', *BOTH),
 }
@@ -118,6 +182,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument('table', choices=HEADS)
     parser.add_argument('--arms', type=int, nargs='+', default=[*OSCILLATE, *CALM])
+    parser.add_argument('--count', type=int, default=40, help='arms of drawn')
     parser.add_argument('--lag', type=float, default=LAG, help='s')
 
 
@@ -125,6 +190,10 @@ def main(given: argparse.Namespace) -> None:
     """Print the table that was asked for."""
     if given.table == 'margins':
         rows = margins()
+    elif given.table == 'motors':
+        rows = motors()
+    elif given.table == 'drawn':
+        rows = drawn(given.count)
     elif given.table == 'arms':
         rows = arms(given.arms, given.lag)
     else:

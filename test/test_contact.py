@@ -247,13 +247,14 @@ def test_arm_that_yields_gives_way_and_one_that_stops_resists():
     assert way[1] > 3.0 * way[0]
 
 
-def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away():
+def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away(monkeypatch):
     config = loop_of(pushed(PUSH), **{'contact.reaction': 'hold'})
     guard = Guard(config.controller, lambda: 0, lambda: 0)
     guard.activate()
     guard.update(FIRST_STAMP, plant_of(config.plant).measure())
     guard.controller.sample.external_interval[:] = 1.0
-    guard._react()
+    monkeypatch.setattr(guard.controller, 'perceive', lambda _: True)
+    guard.perceive()
     q = guard.controller.signals.q
     target = Target(tuple(q), (0.0,) * 7, 0.1, 0.3, held=True)
     with pytest.raises(TrajectoryError, match='the arm holds: send a trajectory'):

@@ -18,12 +18,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from command import COMPILED, PATIENCE
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.drive.driver import disagreements
 from blf_dsc_controller.errors import LoopEndedError
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.messages.topics import MOTOR_STATES
@@ -321,10 +323,50 @@ def test_mass_that_only_the_robot_knows_is_remarked(set_load, m_ee, m_total, wor
     controller = change(blf.load_loop('fr3_direct').controller, known)
     driver = FrankaDriver('', controller, build(DriveConfig, {'set_load': set_load}))
     driver._robot = ToldRobot()
-    driver._robot.read_once = lambda: SimpleNamespace(m_ee=m_ee, m_total=m_total)
+    driver._robot.read_once = lambda: SimpleNamespace(
+        m_ee=m_ee, m_total=m_total, tau_J=[1.0] * 7
+    )
     remarks = list(driver._remarks())
     assert len(remarks) == bool(words)
     assert words in ''.join(remarks)
+
+
+def test_robot_without_torques_is_remarked_with_settings_that_its_driver_takes():
+    """As of franka-sim, whose tau_J is the command."""
+    given = blf.load_loop('fr3_direct').controller
+    driver = FrankaDriver('', given, build(DriveConfig, {}))
+    driver._robot = ToldRobot()
+    driver._robot.read_once = lambda: SimpleNamespace(
+        m_ee=0.0, m_total=0.0, tau_J=[0.0] * 7
+    )
+    (remark,) = driver._remarks()
+    advised = re.findall(r'([a-z_]+\.[a-z_]+): ([a-z0-9.]+[a-z0-9])', remark)
+    values = {name: yaml.safe_load(value) for name, value in advised}
+    assert values == {
+        'safety.first_torque': 'send',
+        'disturbance.observer_bandwidth': 0.0,
+    }
+    assert not disagreements(FrankaDriver.facts, change(given, values))
+
+
+@pytest.mark.parametrize(
+    ('theta', 'has_motors'),
+    [([0.0] * 7, False), ([0.5] * 7, False), ([0.5] * 6 + [0.51], True)],
+)
+def test_motors_that_are_where_their_links_are_say_nothing(theta, has_motors):
+    """Gears that do not give way would be stiffer than any."""
+    driver = FrankaDriver('', blf.load_loop('fr3_direct').controller, DriveConfig())
+    state = SimpleNamespace(
+        m_load=0.0,
+        time=SimpleNamespace(to_sec=lambda: 1.0),
+        q=[0.5] * 7,
+        dq=[0.0] * 7,
+        tau_J=[0.0] * 7,
+        theta=theta,
+        dtheta=[0.0] * 7,
+    )
+    driver._control = SimpleNamespace(readOnce=lambda: (state, None))
+    assert (driver.read().motors is not None) == has_motors
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):

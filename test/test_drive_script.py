@@ -25,8 +25,9 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import PLANT
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.arguments import checked_overrides
-from blf_dsc_controller.drive.driver import ReflexError
+from blf_dsc_controller.drive.driver import ReflexError, disagreements
 from blf_dsc_controller.drive.script import Script
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
@@ -304,6 +305,40 @@ def test_tare_is_refused_with_the_reason_and_the_arm_holds(arm):
     with pytest.raises(MotionFailedError, match=r'set contact\.enabled'):
         arm.tare()
     assert not arm.ended
+
+
+# a Panda whose efforts are its commands
+ECHO = {
+    'actuator.loop_gain': 0.0,
+    'actuator.loop_damping': 0.0,
+    'joint.stiffness': [5e4] * 7,
+}
+DISTRUSTED = (
+    r'the efforts are what is commanded.* the load observer is off.* A driver of `blf_dsc drive` '
+    r'.*takes no other: with one, set disturbance\.observer_bandwidth to 0'
+)
+
+
+def test_efforts_that_are_not_of_sensors_are_told_and_what_a_driver_takes(caplog):
+    with drive(sim_plant=ECHO) as arm:
+        arm.move_to(arm.state.q + STEP)
+        wait_for(lambda: 'load observer is off' in caplog.text)
+    assert re.search(DISTRUSTED, caplog.text)
+    assert caplog.text.count('load observer is off') == 1
+    loop = blf.load_loop('panda', {PLANT: ECHO})
+    config = change(loop.controller, {'disturbance.observer_bandwidth': 0.0})
+    assert not disagreements(simulated(loop.plant).facts, config)
+
+
+def test_command_ends_with_what_is_wrong_with_the_efforts(tmp_path, capsys):
+    preset = (blf.share_folder() / 'config/panda.yaml').read_text()
+    for name in ('loop_gain', 'loop_damping'):
+        preset = re.sub(f' {name}: .*', f' {name}: 0.0', preset)
+    preset = re.sub(r' stiffness: \[1.4e.*', f' stiffness: {[5e4] * 7}', preset)
+    (tmp_path / 'my.yaml').write_text(preset)
+    words = ['--robot', 'simulated', '--config', f'{tmp_path / "my.yaml"}']
+    assert main(['drive', *words, '--duration', '0.8']) == 0
+    assert re.search('sensors +' + DISTRUSTED, capsys.readouterr().out)
 
 
 def test_load_is_not_declared_to_drives_that_add_nothing(arm):

@@ -430,7 +430,7 @@ def test_deactivation_aborts_the_goal(loop):
 def test_stop_past_the_bound_violates_the_path(loop):
     arm, law, client = loop
     handle = client.follow(point(FAR, 2.0))
-    law.guard._stop(Reason.OUTSIDE_BOUND, "joint 'joint1' is past its bound")
+    law.guard.stop(Reason.OUTSIDE_BOUND, "joint 'joint1' is past its bound")
     status, result = client.result(handle)
     assert (status, result.error_code) == (ABORTED, result.PATH_TOLERANCE_VIOLATED)
     assert "joint 'joint1' is past its bound" in result.error_string

@@ -117,7 +117,7 @@ def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
         states.publish(encoder.encode(10**9 + k * 10**6, START, ZERO, ZERO))
         ros.until(lambda k=k: node.guard.journal.stamp == 10**9 + k * 10**6)
         node._report_if_changed(node.guard)
-    node.guard._note(EventType.SILENCE, torques=1)
+    node.guard.journal.note(EventType.SILENCE, torques=1)
     node._report_if_changed(node.guard)
     ros.until(lambda: log('real', '', FATAL))
     ros.spin(0.2)
@@ -165,7 +165,7 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     law.close()
     ros.until(lambda: not ros.spin(0.1))
     gravity = dynamics((1.0, 0.32, 0.4), 9.8, arm.plant.measure()[:2], ZERO)[2]
-    load = law.guard._safe_torque.load  # what it met on the way
+    load = law.guard.safe_torque.load  # what it met on the way
     np.testing.assert_allclose(torques(commands)[-1], gravity + load, atol=0.05)
     assert np.abs(load).max() < 0.3
     assert law.guard.journal.pending == deque()

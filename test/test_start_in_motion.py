@@ -138,10 +138,10 @@ def test_first_torque_in_motion_continues_the_one_that_acts(preset):
     arm.run(1.5, 1.5)
     arm.guard.deactivate()
     arm.run(0.05, 0.05)
-    last = arm.guard._safe_torque.commanded.copy()
+    last = arm.guard.safe_torque.commanded.copy()
     arm.guard.reset()
     arm.run(arm.config.sample_time, arm.config.sample_time)
-    first = arm.guard._safe_torque.commanded
+    first = arm.guard.safe_torque.commanded
     step = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
     assert arm.guard.controller.samples == 1
     assert np.all(np.abs(first - last) <= step * (1.0 + 1e-9))

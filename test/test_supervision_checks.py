@@ -452,7 +452,7 @@ def test_missing_and_implausible_velocities_are_differenced_from_the_positions(d
     rig.sense = lambda state: [state.raw(dq=dq)]
     rig.step(2)
     assert rig.supervisor.phase is Phase.SAFE_STOP
-    np.testing.assert_allclose(rig.guard._safe_torque.last.dq, true, atol=0.05)
+    np.testing.assert_allclose(rig.guard.safe_torque.last.dq, true, atol=0.05)
     rig.step(1000)
     assert np.abs(rig.state().dq).max() < 0.1  # a falling arm has several rad/s by then
 
@@ -479,8 +479,8 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
         rig.guard.deactivate()
     torque = rig.guard.release()
     samples = rig.guard.samples
-    q = rig.guard._safe_torque.last.q
-    load = rig.guard._held.recent.load(rig.guard.controller.settings, samples.estimate)
+    q = rig.guard.safe_torque.last.q
+    load = rig.guard.held.recent.load(rig.guard.controller.settings, samples.estimate)
     holding = dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + load
     np.testing.assert_allclose(
         torque, holding if safety == 'hold_gravity' else [0.0, 0.0]

@@ -248,7 +248,7 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     rig = Rig({'safety.torque': 'hold_gravity'})
     rig.step(300)
     rig.guard.fail('by the test')
-    known = rig.guard._safe_torque.load.copy()
+    known = rig.guard.safe_torque.load.copy()
     rig.push[:] = [0.0, 2.0]
     rig.actuate = lambda _: []  # the last torque is held: nothing brakes
     seen = []
@@ -264,7 +264,7 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     for _ in range(50):
         rig.step()
     last = LastState(2)
-    slow = guard._safe_torque.last.slow
+    slow = guard.safe_torque.last.slow
     last.take(0, np.concatenate(seen[-1][1:]), slow)
     goal = safe_torque(safety, settings, last, guard.samples.estimate, known)
     np.testing.assert_allclose(rig.commands[-1], goal, rtol=0.0, atol=1e-9)

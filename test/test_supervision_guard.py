@@ -170,7 +170,7 @@ def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
     lacking = weight(rig.state().q) * (
         1.0 - factor
     )  # gravity, from the first torque on
-    np.testing.assert_allclose(rig.guard._safe_torque.load, lacking, atol=1.0)
+    np.testing.assert_allclose(rig.guard.safe_torque.load, lacking, atol=1.0)
     start = rig.state().q
     rig.step(3000)
     assert rig.supervisor.phase is Phase.SAFE_STOP

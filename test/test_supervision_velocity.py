@@ -76,7 +76,7 @@ def test_wrong_velocity_does_not_decide_how_much_the_safe_torque_damps():
     rig = Rig({'safety.torque': 'damping'})
     rig.step(200)
     rig.guard.fail('a test')
-    scale = rig.guard._safe_torque.scale
+    scale = rig.guard.safe_torque.scale
     before = scale.copy()
     scale[:] = 0.1
     rig.sense = lambda state: [state.raw(dq=-state.dq)]
@@ -139,7 +139,7 @@ def test_change_to_velocities_of_the_positions_is_no_acceleration():
         if guard.supervisor.reason is Reason.VELOCITY:
             break
     assert guard.supervisor.reason is Reason.VELOCITY
-    last = guard._safe_torque.last
+    last = guard.safe_torque.last
     np.testing.assert_allclose(last.dq, moving, rtol=1e-6)
     np.testing.assert_allclose(last.ddq, 0.0, atol=1e-6)
 

@@ -86,7 +86,7 @@ class Feedback(NamedTuple):
     rate: Floats  # (n,) 1/s
     time_constant: float  # lambda, s
     known_rate: bool
-    damping_lag: float = 0.0  # s
+    damping_lag: float | Floats = 0.0  # s, of all joints or of each (n,)
 
 
 class Loop(NamedTuple):
@@ -208,9 +208,10 @@ def _decay(lag: float, T: float) -> float:
     return float(np.exp(-T / max(lag, _SHORTEST)))
 
 
-def _damping_decay(feedback: Feedback, T: float) -> float:
-    """Return what is left of a late xi2 after a sample."""
-    return _decay(feedback.damping_lag, T) if feedback.damping_lag > 0.0 else 0.0
+def _damping_decay(feedback: Feedback, T: float) -> Floats:
+    """Return what is left of a late xi2 after a sample: of all joints or of each (n,)."""
+    lag = np.asarray(feedback.damping_lag)
+    return np.where(lag > 0.0, np.exp(-T / np.maximum(lag, _SHORTEST)), 0.0)
 
 
 def _damping(links: Floats, joints: Joints, K: Floats) -> Floats:
@@ -284,7 +285,7 @@ def _with_law(
     n = own.shape[0]
     T = timing.period
     waiting = timing.delay
-    lags = feedback.damping_lag > 0.0
+    lags = bool(np.any(feedback.damping_lag))
     blocks = waiting + 4 + lags  # last y, its velocity, alpha2, d3, late xi2
     N = size + blocks * n
     wide = np.zeros((n, N))
@@ -300,8 +301,8 @@ def _with_law(
     if feedback.known_rate:
         dalpha2 = dalpha2 - rate * v
     xi2 = v - alpha2
-    decay = _damping_decay(feedback, T)
-    late = decay * rows[-1] + (1.0 - decay) * xi2 if lags else xi2
+    left = _damping_decay(feedback, T)[..., None]
+    late = left * rows[-1] + (1.0 - left) * xi2 if lags else xi2
     tau = feedback.inertia @ dalpha2 - feedback.position @ y - feedback.surface @ late
     tau = tau + d3
     acting = under_way[0] if waiting else tau

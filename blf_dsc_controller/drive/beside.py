@@ -22,6 +22,7 @@ class Beside(ABC):
         self._link = link
         self._guard = controller.guard
         self.log = LinkLog(link)
+        self._untrusted = ''  # what was said of the torque sensors
         self._inputs = MotionInput(
             len(controller.joints), lambda: self._guard, _is_live, self.log
         )
@@ -33,8 +34,16 @@ class Beside(ABC):
         self._inputs.poll(self._guard)
         for kind, content in self._link.messages():
             self._take(kind, content)
+        self._tell_untrusted()
         self._report_now_and_then()
         self._link.flush()
+
+    def _tell_untrusted(self) -> None:
+        """Warn once of efforts that the law takes for those of no torque sensors."""
+        if self._guard.untrusted != self._untrusted:
+            self._untrusted = self._guard.untrusted
+            if self._untrusted:
+                self.log.warning(self._untrusted)
 
     @abstractmethod
     def _take(self, kind: int, content: bytes) -> None:

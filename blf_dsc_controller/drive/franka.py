@@ -122,9 +122,15 @@ class FrankaDriver(Driver):
             )
 
     def _remarks(self) -> Iterator[str]:
-        """Yield the robot's own payload, if the configuration has another mass."""
+        """Yield what the states of the robot at rest contradict."""
         with self._explained('no state was received'):
             state = self._robot.read_once()
+        if not any(state.tau_J):
+            yield (
+                'note: no joint has a torque (tau_J) while the robot rests, so it is a simulator '
+                'that reports commands alone. To go on, set safety.first_torque: send and '
+                'disturbance.observer_bandwidth: 0.0'
+            )
         known = self.controller.robot.drive_payload
         if self.config.set_load and abs(state.m_ee) > _SAME_MASS:
             yield (
@@ -151,12 +157,14 @@ class FrankaDriver(Driver):
     def read(self) -> RobotState:
         """Wait for the next state; libfranka gives up after a second.
 
-        Positions of motors are left out if all are 0, as simulators report them.
+        Positions of motors are left out if all are 0 or those of the joints, as of simulators
+        without gears.
         """
         with self._in_motion():
             state, _ = self._control.readOnce()
         self._load = state.m_load
-        motors = (state.theta, state.dtheta) if any(state.theta) else None
+        has_motors = any(state.theta) and list(state.theta) != list(state.q)
+        motors = (state.theta, state.dtheta) if has_motors else None
         return RobotState(state.time.to_sec(), state.q, state.dq, state.tau_J, motors)
 
     def load_in_force(self) -> float:

@@ -9,21 +9,26 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
 
 _ALONE = 'the load observer is off, and the law goes on without it'
+_DRIVER = (
+    '. A driver of `blf_dsc drive` knows robot.effort of its robot, and takes no other: with one, '
+    'set disturbance.observer_bandwidth to 0'
+)
 _TEXTS = {
     SHAKES: (
         'joint {joint!r} shakes by the load observer: efforts are not those of joint torque '
         f'sensors, or positions are those of the motors; {_ALONE}. If so, set robot.effort to '
         'unknown and robot.torque_loop to false; else disturbance.observer_bandwidth to 0'
+        f'{_DRIVER}'
     ),
     COMMANDS: (
         'the efforts are what is commanded, most of all that of joint {joint!r}, and not those '
         f'of joint torque sensors: {_ALONE}. Set robot.effort to commanded if they are commands '
-        'or unknown if they are currents of motors, and robot.torque_loop to false'
+        f'or unknown if they are currents of motors, and robot.torque_loop to false{_DRIVER}'
     ),
     OFF: (
         'the effort of joint {joint!r} is off {off:+.3g} N m from what is commanded while the '
         f'arm follows: a sensor is stuck, dead or in another unit; {_ALONE}. Mend it, or set '
-        'robot.effort to unknown'
+        f'robot.effort to unknown{_DRIVER}'
     ),
 }
 

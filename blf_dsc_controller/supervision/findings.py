@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the law finds in its arm, and what follows: contacts, oscillations, wrong sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.errors import TareError
+from blf_dsc_controller.law.check_state import CONTRADICTION, NOT_SENSORS, OSCILLATES
+from blf_dsc_controller.law.sensor import SLOW, is_late
+from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.supervision import not_sensors
+from blf_dsc_controller.supervision.contact import Contacts, contact_of, untarable
+from blf_dsc_controller.supervision.in_command import InCommand
+from blf_dsc_controller.supervision.supervisor import Fault, Reason
+
+Vector = NDArray[np.float64]
+
+
+class Findings:
+    """What the law of one arm has found.
+
+    Attributes:
+        contacts: what has touched the arm.
+        untrusted: what is wrong with the efforts that joint torque sensors should show; or empty.
+    """
+
+    def __init__(self, command: InCommand) -> None:
+        """React to what the law of `command` finds."""
+        self.contacts = Contacts()
+        self.untrusted = ''
+        self._command = command
+        self._n = len(command.config.joints)
+
+    def restart(self) -> None:
+        """Begin again before a start: the arm no longer holds after a contact."""
+        command = self._command
+        self.untrusted = not_sensors.text_of(command.controller, command.config.joints)
+        self.contacts.hold = False
+
+    def check_efforts(self) -> None:
+        """Tell that efforts are not those of joint torque sensors, when the law finds it."""
+        command, joints = self._command, self._command.config.joints
+        if not command.controller.flags & NOT_SENSORS:
+            return
+        joint = not_sensors.joint_of(command.controller, joints)
+        self.untrusted = not_sensors.text_of(command.controller, joints)
+        command.samples.compare_efforts()
+        command.note(EventType.TORQUE_SENSORS, joint=joint, text=self.untrusted)
+
+    def calm(self) -> Fault | None:
+        """Soften the feedback of an arm that oscillates; a fault if that has not helped."""
+        command, calming = self._command, self._command.calming
+        if not command.controller.flags & OSCILLATES:
+            return None
+        before = calming.count
+        if not calming.react(command.reference.time):
+            return Fault(Reason.OSCILLATION, calming.cause)
+        if calming.last is not None and calming.count > before:
+            command.note(
+                EventType.OSCILLATION,
+                **calming.last._asdict(),
+                share=calming.share,
+                text=calming.text,
+            )
+        return None
+
+    def react_to_contact(self) -> None:
+        """Do what `contact.reaction` wants when something touches the arm."""
+        command = self._command
+        reaction = command.config.contact.reaction
+        stamp = command.reference.last_stamp
+        contact = contact_of(command.controller, command.config, stamp)
+        self.contacts.add(contact)
+        text = contact.text
+        content = contact._asdict()
+        del content['stamp']
+        command.note(EventType.CONTACT, reaction=reaction, **content)
+        if reaction == 'hold':
+            command.reference.brake(command.config)
+            self.contacts.hold = True
+            command.supervisor.add(f'{text}: the reference brakes, and the arm holds')
+        elif reaction != 'none':
+            command.stop(Reason.CONTACT, text)
+            if reaction == 'yield':
+                command.safe_torque.yield_to_contact()
+
+    def tare(self) -> None:
+        """Take the external torque for zero where the arm rests now.
+
+        Raises:
+            TareError: it is not computed, the law is not in command, the arm moves or has
+                just come to rest, or something touches it.
+        """
+        if problem := self._untarable():
+            raise TareError(f'tare: {problem}; the external torque is as it was')
+        self._command.note(EventType.TARE)
+        self._command.controller.tare()
+
+    def _untarable(self) -> str:
+        """Return why the external torque cannot be tared now; empty if it can."""
+        command = self._command
+        law, supervisor = command.controller, command.supervisor
+        if not law.settings.contact.enabled:
+            return 'no external torque is computed: set contact.enabled'
+        if not (supervisor.running and command.has_sample):
+            why = supervisor.text or supervisor.phase
+            return f'the law is not in command ({why})'
+        stamp = command.reference.last_stamp
+        return untarable(law, command.config, stamp, rests=command.is_at_rest)
+
+    def stop_at_invalid(self, stamp: int, measurement: Vector) -> None:
+        """Stop because of a state that the law has not used."""
+        command = self._command
+        if command.controller.flags & CONTRADICTION:
+            self._distrust_velocities(stamp, measurement)
+            return
+        invalid = command.states.invalid(command.config.safety, measurement)
+        # of an arm that is too fast, why if it oscillates
+        cause = command.calming.cause if invalid.reason is Reason.VELOCITY else ''
+        command.stop(invalid.reason, '; '.join(filter(None, (cause, invalid.text))))
+
+    def compare_velocities(self, stamp: int, measurement: Vector) -> None:
+        """Distrust velocities that contradict the positions, in a state beside the law."""
+        if self._command.readings.compare_velocities(measurement):
+            self._distrust_velocities(stamp, measurement)
+
+    def _distrust_velocities(self, stamp: int, measurement: Vector) -> None:
+        """Stop, and difference all velocities from the positions from this state on."""
+        command = self._command
+        checks = command.controller.checks
+        sensor = checks.sensor
+        fault = command.states.contradicted(sensor.derived, sensor.measured)
+        worst = int(np.argmax(sensor.mismatch / (sensor.speed + SLOW**2)))
+        cause = command.calming.cause if command.supervisor.running else ''
+        if cause and is_late(sensor, worst):
+            fault = Fault(Reason.OSCILLATION, cause)
+        if command.supervisor.uses_states:
+            command.stop(*fault)
+        else:
+            command.supervisor.add(fault.text)
+            command.safe_torque.start_observing()  # this has let the error grow
+        command.readings.distrust_velocities(stamp, measurement)
+        # What the wrong velocities showed of the rotors is as wrong.
+        command.controller.state.rotors.gain_scale[:] = (
+            checks.estimates.consistent_scale
+        )
+        # Else the change from the wrong velocity would pass for an acceleration.
+        command.safe_torque.last.dq[:] = measurement[self._n : -self._n]

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who commands an arm: its law, the safe torque, or nobody; and how the law leaves command.
+
+`Supervisor` has the phase, `Readings` stamps, turns and velocities, `RunningReference`
+what is followed and the time, `HeldTorque` what holds the arm, `SafeTorque` and
+`SafeStop` what it gets without the law.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration import law_file
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.reference.approach import AT_REST
+from blf_dsc_controller.reference.retargeting import TrajectoryError
+from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.readings import Readings
+from blf_dsc_controller.supervision.running_reference import RunningReference
+from blf_dsc_controller.supervision.safe_stop import WINDING_UP, SafeStop
+from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.sample_check import SampleCheck
+from blf_dsc_controller.supervision.state_check import StateCheck, rate_mismatch
+from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, Watchdog
+from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
+
+Vector = NDArray[np.float64]
+_MANY = 0.5  # states missed for each that came
+
+
+class InCommand:
+    """The law of an arm, the safe torque in its place, and which of them is in command.
+
+    Attributes:
+        config: configuration in force.
+        controller: the law.
+        supervisor: phase, and the reason of a stop.
+        states, samples: the checks before and after the law.
+        watchdog: the check for missing states.
+        journal: events, and counts of what has been processed so far.
+        calming: what oscillates, and how much softer the feedback is since.
+        readings: stamps, turns and velocities of the joint states.
+        reference: what is followed, and the time of the law.
+        safe_torque: the ramp to the safe torque, and the last usable joint state.
+        held: what holds the arm, by its last motion.
+        safe_stop: what the arm gets while the law is not in command.
+        has_sample: whether the law used the last message, so that there is new telemetry.
+        silenced: whether nothing is commanded until the next reset or activation.
+        clean: whether the window of the law holds valid samples only.
+    """
+
+    def __init__(
+        self,
+        config: ControllerConfig,
+        steady: Callable[[], int] = time.monotonic_ns,
+        wall: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Compile the law; `steady` and `wall` are the clocks [ns]."""
+        n = len(config.joints)
+        self.config = config
+        self.controller = controller_of(config)
+        self.supervisor = Supervisor()
+        self.states = StateCheck(config.joints, config.sample_time)
+        self.calming = Calming(config, self.controller)
+        self.samples = SampleCheck(config, self.controller, self.calming)
+        self.watchdog = Watchdog(steady, wall)
+        self.journal = Journal()
+        self.has_sample = self.silenced = False
+        self.clean = True
+        self.readings = Readings(config, self.controller)
+        self.reference = RunningReference(self.controller)
+        self.safe_torque = SafeTorque(n)
+        self.safe_torque.scale = self.controller.state.rotors.gain_scale
+        sensor = self.controller.checks.sensor
+        self.safe_torque.noise = sensor.noise[:n]
+        self.safe_torque.resolution = sensor.resolution
+        self.held = HeldTorque(config, self.controller, self.samples)
+        self.safe_stop = SafeStop(
+            config, self.controller, self.samples, self.safe_torque, self.held
+        )
+        digest = (
+            {'law_digest': law_file.digest(config.law)}
+            if law_file.is_file(config.law)
+            else {}
+        )
+        self.journal.note(EventType.CONFIGURE, parameters=flatten(config), **digest)
+
+    @property
+    def commanding(self) -> bool:
+        """Whether a torque has been commanded since the controller was configured."""
+        return self.journal.commands > 0
+
+    @property
+    def commanded(self) -> Vector | None:
+        """The last torque (n,) [N m]; None before the first one."""
+        return self.safe_torque.commanded if self.commanding else None
+
+    @property
+    def slow(self) -> Vector:
+        """Velocities (n,) [rad/s] to be damped in a stop."""
+        return self.readings.slow(self.config.safety.velocity_limit)
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the reference and the arm rest, while the law is in command."""
+        signals = self.controller.signals
+        speed = np.abs(np.concatenate((signals.dq, signals.dqr))).max()
+        return bool(speed < AT_REST)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the arm rests under the safe torque."""
+        return not self.supervisor.running and self.safe_torque.is_settled
+
+    def check_running(self) -> None:
+        """Raise TrajectoryError if the law is not in command."""
+        supervisor = self.supervisor
+        if not supervisor.running:
+            why = supervisor.text or supervisor.phase
+            raise TrajectoryError([f'the controller is not in command: {why}'])
+
+    def note(self, event: EventType, **content: Any) -> None:
+        """Record an event in the journal, after what the watchdog has commanded."""
+        self.end_silence()
+        self.journal.note(event, **content)
+
+    def end_silence(self) -> None:
+        """Record in the journal how many torques the watchdog has commanded."""
+        if self.watchdog.torques:
+            self.journal.note(EventType.SILENCE, torques=self.watchdog.torques)
+            self.watchdog.torques = 0
+
+    def start_over(self) -> None:
+        """Wait for a state to start from, without the faults so far."""
+        self.supervisor.enter(Phase.STARTING)
+        self.calming.restart()
+        self.states.restart()
+        self.samples.restart()
+        self.silenced = self.has_sample = False
+        self.clean = True
+        self.readings.restart()
+        if self.safe_torque.last.age >= self.config.safety.fade_time:
+            # else a torque may have to fade, which a driver must not hold
+            self.watchdog.wait()
+
+    def stop(self, reason: Reason, text: str) -> None:
+        """Enter the safe stop, unless the law is not in command or about to be."""
+        missed = self.states.missed_for_each
+        if missed > _MANY and reason is not Reason.OVERRUN:
+            T = self.config.sample_time
+            text += f'; {rate_mismatch((1.0 + missed) * T, T)}'
+        was_running = self.supervisor.running
+        if not self.supervisor.stop(reason, text):
+            return
+        if was_running and reason in WINDING_UP:
+            self.samples.return_to_consistent()
+        self.journal.note(EventType.STOP, reason=reason, text=text)
+        self.clean = self.reference.resumable = False
+        self.safe_stop.begin(
+            self.config.safety,
+            reason,
+            self.readings.speed,
+            was_running=was_running,
+            oscillates=was_running and bool(self.calming.cause),
+        )
+
+    def deactivate(self) -> None:
+        """Leave command: the torque ramps to the safe torque."""
+        self.note(EventType.DEACTIVATE)
+        was_running = self.supervisor.running
+        self.reference.resumable = was_running
+        self.supervisor.enter(Phase.INACTIVE)
+        self.samples.relax()
+        self.watchdog.restart()
+        if was_running:
+            self.safe_stop.begin_deactivation(self.config.safety)
+
+    def withdraw(self, text: str) -> None:
+        """Command nothing until the next reset or activation, for a reason."""
+        self.note(EventType.WITHDRAW, text=text)
+        self.silenced = True
+        self.supervisor.add(text)
+
+    def withdraw_after_silence(self, gap: float) -> None:
+        """Stay silent after a long silence in which the law was not in command.
+
+        By then the safe torque has faded to zero, and whoever restarted the driver may
+        not expect another. `gap` [s] is the time since the state before.
+        """
+        faded = self.safe_torque.last.age >= self.config.safety.fade_time
+        if not self.silenced and faded and self.commanding and gap > LONG_SILENCE:
+            self.withdraw(
+                f'joint states are back after {gap:.3g} s, and no torque is commanded until the '
+                'next reset or activation'
+            )
+
+    def safe(self, dt: float) -> Vector | None:
+        """Return the safe torque, `dt` [s] further along the ramp.
+
+        None before the law has commanded any: a controller that never started stays
+        silent.
+        """
+        if not self.commanding:
+            return None
+        torque = self.safe_stop.advance(self.config.safety, dt)
+        self.journal.commands += torque is not None
+        missing = self.safe_stop.missing_effect
+        if missing and self.supervisor.reason is not Reason.NO_EFFECT:
+            self.supervisor.add(missing)
+        if swings := self.safe_stop.name_swings():
+            self.supervisor.add(swings)
+        return torque
+
+    def safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
+        """Return the safe torque for a state that the law has not used."""
+        limit = self.config.safety.velocity_limit
+        dt = self.config.sample_time
+        self.safe_torque.last.take_usable(stamp, measurement, limit, dt)
+        self._observe_speed()
+        return self.safe(dt)
+
+    def safe_without_state(self, dt: float) -> Vector | None:
+        """Return the safe torque, `dt` [s] later, by the last state."""
+        self.has_sample = False
+        self.safe_torque.last.miss(dt)
+        return self.safe(dt)
+
+    def _observe_speed(self) -> None:
+        """Return to the load known before if the arm speeds up in the safe stop."""
+        if self.supervisor.phase is not Phase.SAFE_STOP:
+            return
+        speed, gap = self.readings.speed, self.readings.gap
+        text = self.safe_stop.observe_speed(self.config.safety, speed, gap)
+        if text:
+            self.supervisor.add(text)
+
+    def release(self) -> Vector | None:
+        """Return the last torque, if any: the safe torque of an arm at rest."""
+        self.note(EventType.RELEASE, resting=bool(self.is_settled))
+        self.has_sample = False  # the last torque is not the law's
+        if not self.commanding or self.silenced:
+            return None
+        return self.safe_stop.leave(
+            self.config.safety, was_running=self.supervisor.running
+        )

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a law comes into command: activation and reset, the first state, the return after a gap."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.errors import BlfDscError, StartError
+from blf_dsc_controller.law.checks import is_valid_state
+from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.reference.approach import MotionError
+from blf_dsc_controller.supervision.findings import Findings
+from blf_dsc_controller.supervision.in_command import InCommand
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.support import check_support
+from blf_dsc_controller.supervision.takeover import Takeover
+from blf_dsc_controller.supervision.told_loads import ToldLoads
+
+Vector = NDArray[np.float64]
+
+
+class Starting:
+    """The starts of one arm's law.
+
+    Attributes:
+        error: why the law could not start; None if it could.
+        waiting_for: what is wrong with the last state that the law could not start from; or empty.
+    """
+
+    def __init__(
+        self, command: InCommand, findings: Findings, loads: ToldLoads
+    ) -> None:
+        """Bring the law of `command` into command, without earlier findings."""
+        self.error: BlfDscError | None = None
+        self.waiting_for = ''
+        self._command = command
+        self._findings = findings
+        self._loads = loads
+        self._takeover = Takeover(command.controller, command.reference, command.held)
+
+    def activate(self) -> None:
+        """Take command with the next state, and what was learned before a fault."""
+        command = self._command
+        command.note(EventType.ACTIVATE)
+        if command.clean:
+            command.controller.state.samples[0] = 0.0
+        else:
+            command.samples.restore()
+        self._start_over()
+        command.watchdog.restart()
+
+    def reset(self) -> None:
+        """Discard all estimates and faults, and restart with the next state.
+
+        A law in command goes on to carry what it carries besides the model.
+        """
+        command = self._command
+        command.note(EventType.RESET)
+        command.reference.resumable = False
+        command.controller.reset()
+        self._loads.forget()
+        load = self._takeover.carried  # of a reset just before
+        if command.supervisor.running:
+            load = command.held.load_before_learning()
+        command.samples.keep()
+        self._start_over()
+        self._takeover.carried = load
+
+    def prepare(self, positions: Vector) -> None:
+        """Plan the start from rest at `positions` (n,) [rad], before the first state.
+
+        The first torque is then ready within a sample.  If the arm is elsewhere by
+        then, the start is planned again.
+
+        Raises:
+            StartError: the law cannot take over there.
+            MotionError: no approach from there keeps the limits.
+        """
+        command = self._command
+        command.reference.prepare(command.config, positions)
+        command.note(EventType.PREPARE, positions=positions.tolist())
+
+    def take_over_from(self, torque: Vector) -> None:
+        """Start from a torque (n,) [N m] by which another node holds the arm.
+
+        The watchdog does so after a controller has died.  The first torque continues this
+        one, and what it carries besides the model is held from the start.
+        """
+        self._command.note(EventType.TAKEOVER, torque=torque.tolist())
+        self._takeover.acting = torque.copy()
+
+    def check_support(self, measurement: Vector) -> None:
+        """Refuse to start if nothing shows what holds a live arm."""
+        command = self._command
+        if not command.commanding:
+            try:
+                check_support(command.controller, command.config, measurement)
+            except StartError as error:
+                self.refuse(error)
+
+    def refuse(self, error: StartError | MotionError) -> None:
+        """Stop before the start, for a reason."""
+        self.error = error
+        self._command.stop(Reason.START_REJECTED, str(error))
+
+    def wait(self, problem: str) -> None:
+        """Go on waiting for a state to start from."""
+        self.waiting_for = problem
+        self._command.states.restart()
+
+    def start(self, stamp: int, measurement: Vector) -> bool:
+        """Resume the running reference if possible, otherwise start at t = 0.
+
+        Return whether the law is in command from the state with this stamp [ns] on.
+        """
+        command = self._command
+        try:
+            resumed = self._takeover.start(
+                command.config, stamp, measurement, command.commanded
+            )
+        except (StartError, MotionError) as error:
+            self.refuse(error)
+            return False
+        self._take_command(stamp, resumed=resumed)
+        return True
+
+    def rejoin(self, stamp: int, measurement: Vector) -> bool:
+        """Return to the reference from where the arm is after a gap, or stop if it is too far.
+
+        Whoever commanded it meanwhile may have braked it.  Without `safety.error_ratio` the
+        law goes on instead.  Of an invalid state, the law says what is wrong.
+        """
+        command = self._command
+        if not is_valid_state(command.controller.checks, measurement):
+            return True
+        if self._takeover.rejoin(command.config, stamp, measurement, command.commanded):
+            self._take_command(stamp, resumed=True)
+            return True
+        if command.config.safety.error_ratio == 0.0:
+            return True  # no error stops this arm
+        text = (
+            f'no joint state came for {command.readings.gap:.3g} s, and the arm is too far from '
+            'its reference now'
+        )
+        command.stop(Reason.STAMP_JUMP, text)
+        return False
+
+    def _take_command(self, stamp: int, *, resumed: bool) -> None:
+        """Go on from a start, or from the return to the reference, with this state."""
+        command = self._command
+        command.journal.note(EventType.START, resumed=resumed)
+        command.reference.last_stamp = stamp - command.config.sample_time_ns
+        self._takeover.acting = self._takeover.carried = None
+        command.held.recent.restart()
+        command.watchdog.switch(command.config.safety.watchdog, stamp)
+        command.supervisor.enter(Phase.APPROACHING)
+
+    def _start_over(self) -> None:
+        """Wait for a state to start from, with neither faults nor what they have led to."""
+        self.error = None
+        self._takeover.acting = self._takeover.carried = None
+        self._command.start_over()
+        self._findings.restart()
