@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 from random_arm import PANDA, PANDA_TEXT
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
+from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
@@ -81,6 +84,137 @@ def test_joints_that_come_in_two_messages_are_one_arm(tmp_path, late):
     is_the_motion(read_recording(bag, PANDA_TEXT), 2e-4, begin)
     with pytest.raises(BlfDscError, match='come in 2 messages'):
         read_recording(bag, PANDA_TEXT, commanded=True)
+
+
+# What is checked of tables is checked of bags.
+
+
+SLOW = 0.15 * np.sin(np.multiply.outer(TIME, SPEED))  # rad
+
+
+def ros2_folder(path, entries):
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag:
+        topic = bag.add_connection('/joint_states', JOINT_STATE, typestore=typestore())
+        for received, raw in entries:
+            bag.write(topic, received, raw)
+    return path
+
+
+def ros1_file(path, entries):
+    ros1 = get_typestore(Stores.ROS1_NOETIC)
+    ros2 = typestore()
+    path = path.with_suffix('.bag')
+    with Ros1Writer(path) as bag:
+        topic = bag.add_connection('/joint_states', JOINT_STATE, typestore=ros1)
+        for k, (received, raw) in enumerate(entries):
+            message = ros2.deserialize_cdr(raw, JOINT_STATE)
+            header = ros1.types['std_msgs/msg/Header'](
+                seq=k, stamp=message.header.stamp, frame_id=''
+            )
+            other = ros1.types[JOINT_STATE](
+                header, message.name, message.position, message.velocity, message.effort
+            )
+            bag.write(topic, received, ros1.serialize_ros1(other, JOINT_STATE))
+    return path
+
+
+FORMATS = {'mcap': written, 'sqlite': ros2_folder, 'ros1': ros1_file}
+
+
+def states_bag(path, q, torque, form='mcap'):
+    """A bag of states at TIME in a format."""
+    encoder = JointStateEncoder(PANDA)
+    zero = np.zeros(7)
+    entries = [
+        (stamp, bytes(encoder.encode(stamp, q[k], zero, torque[k])))
+        for k, stamp in enumerate(stamps_of(TIME))
+    ]
+    return FORMATS[form](path, entries)
+
+
+def refused(bag, *entries, urdf=PANDA_TEXT):
+    with pytest.raises(BlfDscError) as error:
+        read_recording(bag, urdf, names=NameMap.parse(entries))
+    assert '\n' not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize('form', FORMATS)
+@pytest.mark.parametrize('factor', [1.0, 10.0])
+def test_degrees_in_bags_are_refused_with_what_to_type(tmp_path, form, factor):
+    """Of small motions, which stay within two turns, by their speed."""
+    q = factor * SLOW
+    bag = states_bag(tmp_path / 'bag', np.degrees(q), TAU, form)
+    message = refused(bag)
+    assert 'the position of panda_joint' in message
+    assert "If it is in degrees: --map 'q=[deg]'; if it is in rad" in message
+    assert ('turns by at most' in message) == (factor > 1.0)
+    names = NameMap.parse(['q=[deg]'])
+    recording = read_recording(bag, PANDA_TEXT, names=names)
+    np.testing.assert_allclose(recording.q[:390], q[:390], atol=1e-6)
+    kept = read_recording(bag, PANDA_TEXT, names=NameMap.parse(['q=[rad]']))
+    np.testing.assert_allclose(kept.q[:390], np.degrees(q[:390]), atol=1e-5)
+
+
+@pytest.mark.parametrize('form', FORMATS)
+def test_stand_ins_and_torques_that_nobody_recorded_are_missing_in_bags(tmp_path, form):
+    q, torque = Q.copy(), TAU.copy()
+    q[[50, 51, 90], 2] = -9999.0
+    torque[60, 4] = 1e10
+    torque[200:205] = 0.0
+    recording = read_recording(
+        states_bag(tmp_path / 'bag', q, torque, form), PANDA_TEXT
+    )
+    for said in (
+        'the position of panda_joint3 is -9999 in 3 row(s), read as missing',
+        'the effort of panda_joint5 is 1e+10 in 1 row(s), read as missing',
+        'torques are exactly 0 in 5 row(s), read as missing',
+    ):
+        assert said in recording.source
+    # over two that are missing, the fastest is off by (7 rad/s x 15 ms)^2 / 8
+    is_the_motion(recording, 2e-3)
+    assert recording.gap[200:204].all()
+    assert not recording.gap[:190].any()
+
+
+@pytest.mark.parametrize('form', FORMATS)
+def test_torques_that_are_none_are_refused_in_bags(tmp_path, form):
+    constant, unknown = TAU.copy(), TAU.copy()
+    constant[:, 3] = 1.5
+    unknown[:, 3] = np.nan
+    for k, (torque, said) in enumerate(
+        (
+            (constant, 'the effort of panda_joint4: 1.5 in all rows'),
+            (unknown, 'the effort of panda_joint4 has no numbers'),
+            (Q, 'the effort of panda_joint1 is the position of panda_joint1'),
+        )
+    ):
+        message = refused(states_bag(tmp_path / f'{k}', Q, torque, form))
+        assert said in message
+        assert '--effort command' in message
+
+
+def test_joints_in_two_messages_are_checked_each(tmp_path):
+    first, second = messages(PANDA[:4], TIME), list(messages(PANDA[4:], TIME))
+    encoder = JointStateEncoder(PANDA[4:])
+    for k in (100, 101):
+        stamp, _ = second[k]
+        bad = np.array([-9999.0, 0.0, 0.0])
+        second[k] = stamp, bytes(encoder.encode(stamp, bad, np.zeros(3), np.ones(3)))
+    recording = read_recording(written(tmp_path / 'bag', first, second), PANDA_TEXT)
+    assert 'the position of panda_joint5 is -9999 in 2 row(s)' in recording.source
+    is_the_motion(recording, 2e-3)
+
+
+def test_torques_of_bags_may_have_another_unit(tmp_path):
+    bag = states_bag(tmp_path / 'bag', Q, 1e3 * TAU)
+    found = read_recording(bag, PANDA_TEXT, names=NameMap.parse(['tau=[Nmm]']))
+    np.testing.assert_allclose(found.torque[:390], TAU[:390], atol=1e-6)
+    assert not found.currents
+    found = read_recording(bag, PANDA_TEXT, names=NameMap.parse(['tau=[mA]']))
+    assert found.currents
+    assert "the unit 'ounce' of tau is not known" in refused(bag, 'tau=[ounce]')
+    assert 'q is neither a topic nor one of the joints' in refused(bag, 'q=position')
 
 
 def test_joints_that_are_missing_are_named_still(tmp_path):

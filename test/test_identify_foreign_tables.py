@@ -174,6 +174,28 @@ def test_columns_of_one_name_are_given_by_their_numbers(tmp_path):
     )
 
 
+def test_positions_and_torques_of_two_files_are_put_side_by_side(tmp_path):
+    """As it is advised; with other times in the second file, they are no rows of one table."""
+    first = written(tmp_path / 'q.csv', ['t', *named('position')], (TIME, Q))
+    message = refused(first)
+    assert (
+        'has no columns that are named as torques: t, position shoulder_pan' in message
+    )
+    assert f'paste -d, {first} OTHER.csv > both.csv' in message
+    for late, name in ((0.0, 'a.csv'), (0.004, 'b.csv')):
+        columns = TIME + late, TAU
+        second = written(tmp_path / 'tau.csv', ['t', *named('effort')], columns)
+        both = tmp_path / name
+        texts = [path.read_text().splitlines() for path in (first, second)]
+        lines = zip(*texts, strict=True)
+        both.write_text('\n'.join(','.join(pair) for pair in lines))
+        if late:
+            assert 'which column is the time is not clear' in refused(both)
+        else:
+            is_read(both)
+    assert 'named as positions' in refused(second)
+
+
 @pytest.mark.parametrize('rate', ['q_dot', 'position_velocity', 'joint_pos_acc'])
 def test_rates_of_positions_are_no_positions(tmp_path, rate):
     names = ['t', *numbered('q'), *numbered(rate), *numbered('tau')]
@@ -309,9 +331,45 @@ def test_degrees_without_a_unit_are_refused_with_what_to_type(tmp_path, names, p
     np.testing.assert_allclose(kept.q[:290][:, 0], degrees[:290, 0], atol=1e-6)
 
 
+@pytest.mark.parametrize('kind', ['revolute', 'continuous'])
+def test_degrees_of_small_or_endless_turns_are_told_by_their_speed(tmp_path, kind):
+    """A motion of 9 degrees stays within two turns if it is read in rad."""
+    text = UR5E_TEXT.replace('type="revolute"', f'type="{kind}"')
+    q = (0.16 if kind == 'revolute' else 1.6) * Q  # rad
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (TIME, np.degrees(q), TAU))
+    with pytest.raises(BlfDscError, match='so it is with most joints') as error:
+        read_table(path, text)
+    assert "If it is in degrees: --map 'q=q_*[deg]'" in str(error.value)
+    recording = read_table(path, text, names=NameMap.parse(['q=q_*[deg]']))
+    np.testing.assert_allclose(recording.q[:290], q[:290], atol=1e-6)
+    kept = read_table(path, text, names=NameMap.parse(['q=q_*[rad]']))
+    # the slowest one: others seem to wrap
+    np.testing.assert_allclose(kept.q[:290][:, 0], np.degrees(q[:290, 0]), atol=1e-6)
+
+
+@pytest.mark.parametrize('speed', [0.05, 1.0, 2.0])
+def test_speeds_that_arms_have_are_in_rad(tmp_path, speed):
+    """Up to 12 rad/s, of joints that reach 3.14, and wrap to one turn."""
+    turning = np.sin(np.multiply.outer(speed * TIME, NUMBERS)) + 3.0
+    wrapped = np.angle(np.exp(1j * turning))
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.csv', names, (TIME, wrapped, TAU))
+    recording = read_table(path, UR5E_TEXT)
+    np.testing.assert_allclose(recording.q[:290], turning[:290], atol=1e-5)
+
+
+def test_torques_that_are_the_positions_are_refused(tmp_path):
+    """Whatever their columns are called."""
+    path = written(tmp_path / 'a.csv', ['t', *'abcdefghijkl'], (TIME, Q, Q))
+    message = refused(path, 'q=1:7', 'tau=7:13')
+    assert "'g' is 'a' in all rows, so it is no torque" in message
+
+
 def test_joint_without_limits_may_turn_as_often_as_it_does(tmp_path):
     text = UR5E_TEXT.replace('type="revolute"', 'type="continuous"')
-    turned = Q + 100.0 * TIME[:, None] / TIME[-1]
+    turned = Q + 4.5 * TIME[:, None]  # beyond two turns, at speeds that such arms have
+    assert turned.max() > 4.0 * np.pi
     names = ['t', *numbered('q'), *numbered('tau')]
     path = written(tmp_path / 'a.csv', names, (TIME, turned, TAU))
     recording = read_table(path, text)

@@ -31,11 +31,13 @@ from blf_dsc_controller.identification.foresight import foresee, foresight_lines
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.recording import joined
 from blf_dsc_controller.identification.summary import (
+    interval,
     load_table,
     notes_of,
     problems_of,
 )
 from blf_dsc_controller.identification.values import base_matrix
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
 TRUTH = truth_of(PANDA_CHAIN, 1)
@@ -102,6 +104,26 @@ def test_joint_that_hardly_needs_a_torque_is_named(plain):
     found = identified(states)
     assert found.score.errors[2, 6] > found.score.torque[6]
     assert mentions(found, f'{PANDA[6]} hardly needs a torque (0.02 N m)')
+
+
+@pytest.mark.parametrize(
+    ('value', 'text'),
+    [(1e-6, '0 +- 0.1'), (2e-4, '0.0002 +- 0.1'), (-1e-5, '0 +- 0.1')],
+)
+def test_value_that_is_nothing_beside_its_interval_is_zero(value, text):
+    """Such as a rotor that the fit puts on its bound."""
+    assert interval(value, 0.1 / TWO_SIDED) == text
+
+
+def test_joints_with_the_same_fault_are_in_one_note(simple):
+    lasting = np.full(7, 2.0)
+    lasting[3] = 0.0
+    found = simple._replace(lasting=lasting, still=(PANDA[0], PANDA[5]))
+    notes = [note for note in notes_of(found) if 'lasts' in note]
+    others = ', '.join(f'that of {PANDA[k]} (2 s)' for k in (1, 2, 4, 5, 6))
+    assert len(notes) == 1
+    assert notes[0].startswith(f'the residual of {PANDA[0]} lasts (2 s), {others}: ')
+    assert mentions(found, f'{PANDA[0]}, {PANDA[5]} did not move')
 
 
 def test_corrected_urdf_that_predicts_worse_than_the_original_is_named(simple):

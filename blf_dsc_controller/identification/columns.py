@@ -38,6 +38,7 @@ _SIDES = {
 _RATES = {'dot', 'ddot', 'vel', 'velocity', 'speed', 'acc', 'acceleration'}
 _SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
 _NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
+_CALLED = {'q': 'positions', 'tau': 'torques', 'theta': 'positions of motors'}
 _SHOWN = 60  # names of columns in a message
 _RATE = re.compile(r'(\d*\.?\d+|\d+\.)\s*Hz', re.IGNORECASE)
 _RANGE = re.compile(r'(\d+):(\d+)')
@@ -145,6 +146,12 @@ def _of_joints(
     if found and len(found) <= len(joints):
         are_numbers = _RANGE.fullmatch(split_unit(given, kind).stem)
         return found if are_numbers else _by_number(found, kind)
+    if not (given or found) and any(_kind_of(name, joints) for name in names):
+        raise BlfDscError(
+            f'{path} has no columns that are named as {_CALLED[kind]}: {_listed(names)}. Are '
+            f'they in another file? Put both side by side: paste -d, {path} OTHER.csv > both.csv. '
+            f'Or choose columns, as in --map {kind}=1:7 (columns 1 to 6, the first is 0)'
+        )
     raise BlfDscError(
         f'{path}: which columns are {kind} of {", ".join(joints)} is not clear. Its columns are '
         f'{_listed(names)}: choose them, as in --map {kind}={kind}_* or --map {kind}=1:7 '
@@ -293,12 +300,13 @@ def _time(path: Path, names: Sequence[str], given: str) -> list[Column]:
 
 def _named_time(names: Sequence[str]) -> list[str]:
     """Return the columns that are the time by their names; of several, the stamps."""
-    found = [name for name in names if _is_time(name)]
+    found = [name for name in names if is_time(name)]
     stamps = [name for name in found if 'stamp' in name.lower()]
     return stamps if len(found) > 1 and stamps else found
 
 
-def _is_time(name: str) -> bool:
+def is_time(name: str) -> bool:
+    """Return whether a column is the time, or a part of it, by its name."""
     words = _meaning(name, ())
     is_time = _WORDS['time'] & words or any(map(_SECONDS.fullmatch, words))
     is_rest = any(map(_NANOSECONDS.fullmatch, words))

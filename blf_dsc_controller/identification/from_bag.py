@@ -3,26 +3,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.bad_values import stand_ins
+from blf_dsc_controller.identification.checks import Group, Motion, checked
 from blf_dsc_controller.identification.on_disk import blocks_of
 from blf_dsc_controller.identification.recording import (
     GAP,
     Recording,
+    Rows,
     interpolated,
     resampled,
 )
+from blf_dsc_controller.identification.units import factor_of, is_of_drive
 from blf_dsc_controller.messages.topics import JOINT_STATES, MOTOR_STATES
 from blf_dsc_controller.run import Floats, Stamps
+
+_BRACKETED = re.compile(r'\s*\[\s*([^\[\]]+?)\s*\]\s*')
+_OF_EFFORTS = 'record measured efforts, or take the commands: --effort command'
+_OF_COMMANDS = 'record measured efforts'
 
 
 def read_bag(
@@ -38,7 +50,7 @@ def read_bag(
     `text` is the URDF; `joints` are the arm's, from its base to its tip, by default all
     in the bag up to where the arm branches; `namespace` and `names` are as for
     `read_run`; `names.joints` may have `theta`, the topic of the motors' positions, by
-    default `motor_states` beside the joint states.
+    default `motor_states` beside the joint states, and `q` and `tau`, units in brackets.
 
     Raises:
         BlfDscError: the bag cannot be read, has no torques or too few states, or has the joints
@@ -46,6 +58,7 @@ def read_bag(
     """
     others = dict(names.joints)
     motors = others.pop('theta', '')
+    units = {kind: _unit(path, others, kind) for kind in ('q', 'tau')}
     names = NameMap(names.topics, others)
     content = read_content(path, namespace, names)
     messages = content.topics[JOINT_STATES]
@@ -57,7 +70,7 @@ def read_bag(
     if not _has_stamps(messages, groups[0]):
         messages.is_stamped = False
         source += ' (without stamps: by the times of reception)'
-    turning = Tree.of(text).turning(joints)
+    file = _File(path, Tree.of(text), dict(zip(theirs, joints, strict=True)), units)
 
     other = _motor_states(content, theirs)
     if motors:
@@ -66,31 +79,130 @@ def read_bag(
     if other is not None:
         source += f', positions of motors of {other.topics[JOINT_STATES].name}'
 
-    def of_motors(stamp: Stamps) -> Floats | None:
-        if other is None:
-            return None
-        return np.asarray(_at(stamp, single_run(other, theirs).states)[0])
-
     parts = [single_run(content, group).states for group in groups]
+    q: Rows
+    torque: Rows
     if len(parts) > 1:
         if commanded:
             raise BagError(
                 f'{path}: the joints come in {len(parts)} messages, to which commands cannot be '
                 'assigned: leave out --effort command'
             )
-        stamp, q, torque = _together(parts, theirs)
-        return resampled(joints, stamp, q, torque, source, turning, of_motors(stamp))
-    (states,) = parts
-    torque = states.field(2)
-    if commanded or not _any(torque, states.size):
-        source, applied = applied_torque(content, states)
-        torque = applied.field(2)
-        if not _any(torque, states.size):
-            raise BagError(
-                f'{path}: all torques in the {source} are zero: record measured efforts'
+        found = [file.sound(part, part, _OF_EFFORTS) for part in parts]
+        said = [each for _, remarks in found for each in remarks]
+        sound = [
+            part.select(rows) for part, (rows, _) in zip(parts, found, strict=True)
+        ]
+        stamp, q, torque = _together(sound, theirs)
+    else:
+        (states,) = parts
+        efforts, remedy = states, _OF_EFFORTS
+        if commanded or not _any(states.field(2), states.size):
+            source, efforts = applied_torque(content, states)
+            remedy = _OF_COMMANDS
+            if not _any(efforts.field(2), states.size):
+                raise BagError(
+                    f'{path}: all torques in the {source} are zero: record measured efforts'
+                )
+        rows, said = file.sound(states, efforts, remedy)
+        states, efforts = states.select(rows), efforts.select(rows)
+        stamp, q, torque = states.stamp, states.field(0), efforts.field(2)
+    theta = None
+    if other is not None:
+        theta = units['q'].factor * _motors_at(stamp, other, theirs)
+    recording = resampled(
+        joints,
+        stamp,
+        _Scaled(q, units['q'].factor),
+        _Scaled(torque, units['tau'].factor),
+        '; '.join([source, *said]),
+        file.tree.turning(joints),
+        theta,
+    )
+    return recording._replace(currents=is_of_drive(units['tau'].name))
+
+
+class _Unit(NamedTuple):
+    """The unit that positions or torques have in a bag, as it was given; empty: rad or N m."""
+
+    name: str
+    factor: float
+
+
+def _unit(path: Path, names: dict[str, str], kind: str) -> _Unit:
+    """Take the unit of q or tau out of names by `--map`, such as `q=[deg]`.
+
+    Raises:
+        BlfDscError: it is not known.
+    """
+    given = _BRACKETED.fullmatch(names.get(kind, ''))
+    if given is None:
+        return _Unit('', 1.0)
+    del names[kind]
+    try:
+        return _Unit(given[1], factor_of(given[1], kind))
+    except BlfDscError as error:
+        raise BlfDscError(f'{path}: {error}') from error
+
+
+class _Scaled(NamedTuple):
+    """Values in another unit, read by slices."""
+
+    values: Rows
+    factor: float
+
+    def __getitem__(self, rows: Any) -> Any:
+        """Return some rows."""
+        return self.factor * self.values[rows]
+
+
+class _File(NamedTuple):
+    """A bag, and what its values are checked by."""
+
+    path: Path
+    tree: Tree
+    joints: Mapping[str, str]  # of the URDF, by their names in the bag
+    units: Mapping[str, _Unit]
+
+    def sound(
+        self, states: JointStates, efforts: JointStates, others: str
+    ) -> tuple[NDArray[np.intp], list[str]]:
+        """Return which rows of states, and efforts at them, are sound, and what to say.
+
+        Raises:
+            BlfDscError: positions or torques cannot be what they are said to be.
+        """
+        groups = [
+            Group(
+                each.field(field),
+                [f'the {what} of {name}' for name in states.names],
+                np.full(len(states.names), self.units[kind].factor),
             )
-    stamp, q = states.stamp, states.field(0)
-    return resampled(joints, stamp, q, torque, source, turning, of_motors(stamp))
+            for each, field, what, kind in (
+                (states, 0, 'position', 'q'),
+                (efforts, 2, 'effort', 'tau'),
+            )
+        ]
+        motion = Motion(
+            path=self.path,
+            joints=[self.joints[name] for name in states.names],
+            stamp=states.stamp,
+            q=groups[0],
+            tau=groups[1],
+            theta=None,
+            unit='' if self.units['q'].name else 'q=',
+            others=others,
+        )
+        rows, said = checked(motion, self.tree)
+        return np.flatnonzero(rows), said
+
+
+def _motors_at(stamp: Stamps, content: Content, joints: Sequence[str]) -> Floats:
+    """Return the positions of motors (N, n) at these stamps."""
+    states = single_run(content, joints).states
+    missing, _ = stand_ins(states.field(0), states.size, states.names)
+    known = states.select(np.flatnonzero(~missing))
+    return np.asarray(_at(stamp, known)[0])
 
 
 def _motor_states(content: Content, joints: Sequence[str]) -> Content | None:

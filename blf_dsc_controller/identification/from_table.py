@@ -16,6 +16,8 @@ import numpy as np
 from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.bad_values import stand_ins
+from blf_dsc_controller.identification.checks import Group, Motion, checked
 from blf_dsc_controller.identification.columns import (
     KINDS,
     Column,
@@ -29,17 +31,10 @@ from blf_dsc_controller.identification.recording import (
     resampled,
 )
 from blf_dsc_controller.identification.table_files import Table, open_table
-from blf_dsc_controller.identification.table_values import (
-    blank_stand_ins,
-    constant,
-    unrecorded,
-)
-from blf_dsc_controller.identification.turns import TURN
 from blf_dsc_controller.identification.units import split_unit
 from blf_dsc_controller.run import Floats, Stamps
 
 _LEAST = 2  # rows
-_BEYOND = 2.0  # times what a joint reaches, and at least turns: no angle in rad
 _BETWEEN = 1.0  # s, least pause between runs in one table
 _MOST_RUNS = 100
 _BACK = 10.0  # intervals that the time falls back where another run begins
@@ -81,28 +76,43 @@ def read_table(
             f'{path} has the positions of {n} joints ({listed}), but from base to '
             f'tip there are {len(arm)}: {", ".join(arm)}'
         )
-    time, q, tau, theta, said = _values(path, table, columns)
-    q[~np.isfinite(time)] = np.nan
-    _check_rows(path, time, q)
+    groups = _groups(path, table, columns)
+    time, said = _seconds(path, columns, groups['time'])
+    q, tau, theta = (groups[kind] for kind in ('q', 'tau', 'theta'))
+    _check_rows(path, time, np.asarray(q.values))
     stamp, runs = _one_clock(path, time)
     if runs > 1:
         said.append(f'the time starts again {runs - 1} times: read as {runs} runs')
-    turning = tree.turning(arm[:n])
-    if not split_unit(given['q'], 'q').unit:
-        reach = np.where(turning, tree.reaches(arm[:n]), np.inf)
-        _check_angles(path, table.names, arm, q, columns, reach)
-    if not planned:
-        _check_torques(path, arm, tau, columns)
-        dropped = unrecorded(tau)
-        tau[dropped] = np.nan
-        if dropped.any():
-            said.append(
-                f'torques are exactly 0 in {dropped.sum()} row(s), read as missing'
-            )
-    source = '; '.join([f'{path.name}: {columns.text}', *said])
-    motors = theta if columns.theta else None
-    recording = resampled(arm[:n], stamp, q, tau, source, turning, motors)
+    has_unit = bool(split_unit(given['q'], 'q').unit)
+    motion = Motion(
+        path=path,
+        joints=arm[:n],
+        stamp=stamp,
+        q=q,
+        tau=None if planned else tau,
+        theta=theta if columns.theta else None,
+        unit='' if has_unit else f'q={_pattern(table, columns)}',
+        others='choose the columns that have it, as in --map tau=effort_*',
+    )
+    sound = checked(motion, tree)
+    source = '; '.join([f'{path.name}: {columns.text}', *said, *sound.said])
+    rows = sound.rows & np.isfinite(time)
+    torque = np.zeros_like(q.values) if planned else _scaled(tau)
+    recording = resampled(
+        arm[:n],
+        stamp[rows],
+        _scaled(q)[rows],
+        torque[rows],
+        source,
+        tree.turning(arm[:n]),
+        _scaled(theta)[rows] if columns.theta else None,
+    )
     return recording._replace(currents=columns.has_currents)
+
+
+def _pattern(table: Table, columns: Columns) -> str:
+    """Return what chooses the columns of the positions."""
+    return pattern_of(table.names, [column.name for column in columns.q])
 
 
 def _check_rows(path: Path, time: Floats, q: Floats) -> None:
@@ -116,84 +126,50 @@ def _check_rows(path: Path, time: Floats, q: Floats) -> None:
         )
 
 
-def _check_angles(
-    path: Path,
-    names: Sequence[str],
-    joints: Sequence[str],
-    q: Floats,
-    columns: Columns,
-    reach: Floats,
-) -> None:
-    """Raise BlfDscError if positions are far beyond what the joints can reach (n,) [rad]."""
-    largest = np.max(np.abs(q), axis=0, initial=0.0, where=np.isfinite(q))
-    beyond = np.flatnonzero(largest > _BEYOND * np.maximum(reach, TURN))
-    if beyond.size:
-        k = int(beyond[0])
-        pattern = pattern_of(names, [column.name for column in columns.q])
-        raise BlfDscError(
-            f'{path}: {columns.q[k].name!r} goes to {largest[k]:.3g} rad, but {joints[k]} turns by '
-            f"at most {reach[k]:.3g} rad. If it is in degrees: --map 'q={pattern}[deg]'; if it "
-            f"is in rad nevertheless: --map 'q={pattern}[rad]'"
-        )
-
-
-def _check_torques(
-    path: Path, joints: Sequence[str], tau: Floats, columns: Columns
-) -> None:
-    """Raise BlfDscError if the torques (N, n) of joints are the same in all rows."""
-    same = constant(tau)
-    if same.size:
-        listed = ', '.join(repr(columns.tau[k].name) for k in same)
-        moved = ', '.join(joints[k] for k in same)
-        value = tau[np.isfinite(tau[:, same[0]]), same[0]][0]
-        raise BlfDscError(
-            f'{path}: {listed}: {value:g} in all rows, so the torque of {moved} was not recorded '
-            'there: choose the columns that have it, as in --map tau=effort_*'
-        )
-
-
-def _values(
-    path: Path, table: Table, columns: Columns
-) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
-    """Return time (N,) [s], positions and torques (N, n), positions of motors, if any, and remarks.
+def _groups(path: Path, table: Table, columns: Columns) -> dict[str, Group]:
+    """Return the values of each of KINDS as they stand in a table.
 
     Raises:
         BlfDscError: there are hardly any.
     """
-    groups = columns.time, columns.q, columns.tau, columns.theta
-    values = table.read([column.name for group in groups for column in group])
+    chosen = columns.time, columns.q, columns.tau, columns.theta
+    values = table.read([column.name for group in chosen for column in group])
     if len(values) < _LEAST:
         raise BlfDscError(f'{path} has fewer than {_LEAST} rows of numbers')
-    ends = np.cumsum([len(group) for group in groups])[:-1]
-    said = []
-    scaled = []
-    for part, group in zip(np.split(values, ends, axis=1), groups, strict=True):
-        if group:
-            said += blank_stand_ins(part, [column.name for column in group])
-        scaled.append(_scaled(part, group))
-    time, q, tau, theta = scaled
-    _check_known(path, values, [column.name for group in groups for column in group])
-    if columns.rate:
-        seconds = np.arange(len(values)) / columns.rate
-    else:
-        first = time[np.isfinite(time).all(axis=1)][:1]
-        seconds = np.sum(time - first, axis=1)
-        seconds *= _unnamed_unit(path, columns.time, first, seconds)
-    return seconds, q, tau if columns.tau else np.zeros_like(q), theta, said
-
-
-def _check_known(path: Path, values: Floats, names: Sequence[str]) -> None:
-    """Raise BlfDscError if a column (N, k) has no numbers."""
-    empty = np.flatnonzero(~np.isfinite(values).any(axis=0))
-    if empty.size:
-        raise BlfDscError(
-            f'{path}: {names[int(empty[0])]!r} has no numbers: choose another column, as in '
-            '--map tau=effort_*'
+    ends = np.cumsum([len(group) for group in chosen])[:-1]
+    return {
+        kind: Group(
+            part,
+            [repr(column.name) for column in group],
+            np.array([column.factor for column in group]),
         )
+        for kind, part, group in zip(
+            KINDS, np.split(values, ends, axis=1), chosen, strict=True
+        )
+    }
 
 
-def _scaled(values: Floats, columns: Sequence[Column]) -> Floats:
-    return np.asarray(values * [column.factor for column in columns])
+def _seconds(path: Path, columns: Columns, time: Group) -> tuple[Floats, list[str]]:
+    """Return the time (N,) [s], NaN where it is unknown, and what to say of it."""
+    size = len(np.asarray(time.values))
+    if columns.rate:
+        return np.arange(size) / columns.rate, []
+    missing, said = stand_ins(time.values, size, time.names)
+    scaled = _scaled(time)
+    scaled[missing] = np.nan
+    known = np.isfinite(scaled).all(axis=1)
+    if not known.any():
+        raise BlfDscError(
+            f'{path}: {time.names[0]} has no numbers: choose another column, as in --map time=t'
+        )
+    first = scaled[known][0]
+    seconds = np.sum(scaled - first, axis=1)
+    seconds *= _unnamed_unit(path, columns.time, first, seconds)
+    return seconds, [f'{each}, read as missing' for each in said]
+
+
+def _scaled(group: Group) -> Floats:
+    return np.asarray(group.values[:] * group.factors)
 
 
 def _unnamed_unit(
@@ -204,7 +180,7 @@ def _unnamed_unit(
     Raises:
         BlfDscError: it is no time in seconds, but would be one in another unit.
     """
-    if len(columns) > 1 or columns[0].factor != 1.0 or not first.size:
+    if len(columns) > 1 or columns[0].factor != 1.0:
         return 1.0
     for factor in _SMALLER.values():
         if _EPOCH[0] < first.item() * factor < _EPOCH[1]:

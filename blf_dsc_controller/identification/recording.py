@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.topic_messages import Values
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.on_disk import (
     Samples,
@@ -27,6 +26,13 @@ _FASTEST = 1e-5  # s, likewise
 _SPARSE = 100.0  # times the intervals between states: longest bag
 GAP = 3.0
 """Intervals between two states from which something is missing."""
+
+
+class Rows(Protocol):
+    """Values (N, n) of which some rows are read, by a slice or by their numbers."""
+
+    def __getitem__(self, rows: Any, /) -> Any:
+        """Return some rows."""
 
 
 class Recording(NamedTuple):
@@ -52,8 +58,8 @@ class Recording(NamedTuple):
 def resampled(
     joints: tuple[str, ...],
     stamp: Stamps,
-    q: Floats | Values,
-    torque: Floats | Values,
+    q: Rows,
+    torque: Rows,
     source: str,
     turning: NDArray[np.bool_],
     motors: Floats | None = None,

@@ -38,6 +38,15 @@ _LARGE_OFFSET = 0.1  # of the torque
 _HARDLY = 0.01  # of the largest torque: a joint whose torque is mostly noise
 _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not explain
 
+_NOTHING = 1e-3  # of half of its interval, value that is printed as 0 ...
+_ROUNDING = 1e-9  # ... and value of a URDF
+_OF_OFFSETS = (
+    ', for which a URDF has no place: calibrate the torque sensors, or let the controller learn '
+    'them (learning.bias)'
+)
+_OF_RESIDUALS = (
+    ': these are torques, not noise, and may have shifted values beyond their intervals'
+)
 _FELT = 0.005  # of the torque, and of the largest: what the model leaves out is told
 _LEFT_OUT = (
     'friction that fades with speed',
@@ -58,8 +67,14 @@ _REMEDIES = {
 
 
 def interval(value: float, deviation: float, digits: str = '.4g') -> str:
-    """Return a value with its 95 % interval."""
-    return f'{value:{digits}} +- {TWO_SIDED * deviation:.2g}'
+    """Return a value with its 95 % interval; 0 if it is nothing beside that."""
+    half = TWO_SIDED * deviation
+    return f'{_beside(half, value, _NOTHING):{digits}} +- {half:.2g}'
+
+
+def _beside(half: float, value: float, nothing: float) -> float:
+    """Return a value, or 0 if it is less than that share of a half width."""
+    return 0.0 if abs(value) < nothing * half else value
 
 
 def header_of(found: Identified) -> str:
@@ -157,10 +172,12 @@ def base_table(found: Identified) -> Iterator[str]:
     posterior = np.einsum('ia,ab,ib->i', K, found.covariance, K)
     yield 'base parameters (all that torques can show), in kg, kg m, kg m^2:'
     for k, name in enumerate(parameters.combinations):
-        half = f'{TWO_SIDED * posterior[k] ** 0.5:<8.2g}'
+        half = TWO_SIDED * posterior[k] ** 0.5
+        old = _beside(half, before[k], _ROUNDING)
+        new = _beside(half, after[k], _NOTHING)
         unseen = posterior[k] > UNSEEN * prior[k]
         mark = '  NOT SHOWN by this recording: from the URDF' if unseen else ''
-        yield f'{before[k]:10.4g} -> {after[k]:10.4g} +- {half}  {name}{mark}'
+        yield f'{old:10.4g} -> {new:10.4g} +- {half:<8.2g}  {name}{mark}'
 
 
 def errors_table(found: Identified) -> str:
@@ -229,34 +246,39 @@ def _delay_notes(found: Identified) -> Iterator[str]:
 
 
 def _joint_notes(found: Identified) -> Iterator[str]:
+    """Yield what is odd with joints: one note for all that share it."""
     score = found.score
     share = score.errors[2] / score.torque
+    offsets: list[str] = []
+    lasting: list[str] = []
+    still: list[str] = []
+    idle: list[str] = []
     for i, joint in enumerate(found.chain.joints):
         name = joint.name
         unit = units_of(joint.kind)[OFFSET]
         offset = found.parts.terms[OFFSET, i]
         if abs(offset) > _LARGE_OFFSET * score.torque[i]:
-            yield (
-                f'{name} has an offset of {offset:.2g} {unit}, for which a URDF has no place: '
-                'calibrate its torque sensor, or let the controller learn it (learning.bias)'
-            )
+            offsets.append(f'{name} has an offset of {offset:.2g} {unit}')
         if found.clipped[i]:
             yield (
                 f'the torque of {name} is clipped, as by a limit: {100.0 * found.clipped[i]:.0f} % '
                 'of its rows were left out'
             )
         if found.lasting[i] > _LASTING:
-            yield (
-                f'the residual of {name} lasts ({found.lasting[i]:.2g} s): it is a torque, not '
-                'noise, and may have shifted values beyond their intervals'
-            )
+            of = f'that of {name}' if lasting else f'the residual of {name} lasts'
+            lasting.append(f'{of} ({found.lasting[i]:.2g} s)')
         if name in found.still:
-            yield f'{name} did not move: its rotor and friction are guesses'
+            still.append(name)
         elif share[i] > _ALL_WRONG and score.torque[i] < _HARDLY * score.torque.max():
-            yield (
-                f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit}), so its error in % '
-                'means little'
-            )
+            idle.append(f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit})')
+    for joints, ending in (
+        (offsets, _OF_OFFSETS),
+        (lasting, _OF_RESIDUALS),
+        (still, ' did not move: rotors and friction of these are guesses'),
+        (idle, ', so the error in % means little there'),
+    ):
+        if joints:
+            yield ', '.join(joints) + ending
 
 
 def _doubt_notes(found: Identified) -> Iterator[str]:

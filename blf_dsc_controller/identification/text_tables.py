@@ -14,14 +14,16 @@ from __future__ import annotations
 import csv
 import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
 import numpy as np
 
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.columns import is_time
 from blf_dsc_controller.run import Floats
 
 _DELIMITERS = (';', '\t', ',')
@@ -168,9 +170,24 @@ def text_table(path: Path) -> TextTable:
     layout = _layout_of(head[first])
     cells = layout.cells(head[first])
     names = _ros2_names(cells) or _header(head[:first], layout, cells)
-    # One that another column has as well names none.
-    names = [str(k) if names.count(each) > 1 else each for k, each in enumerate(names)]
+    rows = [layout.cells(line) for line in head[first:] if line.strip()]
+    names = _named_once(names, rows)
     return TextTable(path, tuple(names), first, layout)
+
+
+def _named_once(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the names, with numbers instead of those that several columns have.
+
+    The first of times that are copies, as of two tables side by side, keeps its name.
+    """
+    columns = list(zip_longest(*rows))
+    found = list(names)
+    for name in (each for each, count in Counter(names).items() if count > 1):
+        same = [k for k, each in enumerate(names) if each == name]
+        are_copies = len({columns[k] for k in same}) == 1
+        for k in same[1:] if are_copies and is_time(name) else same:
+            found[k] = str(k)
+    return found
 
 
 def _opened(path: Path) -> TextIO:
