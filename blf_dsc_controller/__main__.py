@@ -3,7 +3,7 @@
 
 import sys
 
-from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.start import main
 
 if __name__ == '__main__':
     sys.exit(main())

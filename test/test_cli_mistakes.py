@@ -154,6 +154,10 @@ def test_wrong_option_is_one_line_with_what_to_type(words, answer, capsys):
         ('identify BAG --urdf ur5 --out c.urdf', 'no /CWD/ur5, nor'),
         ('identify BAG --urdf ur5e --out c.urdf', 'did you mean ur5e.urdf?'),
         ('identify no.csv --urdf robot.urdf --out c.urdf', 'No such file'),
+        ('identify no.csv --urdf robot.urdf', 'No such file'),
+        ('identify BAG --urdf ur5', 'no /CWD/ur5, nor'),
+        ('drive --robot can0 --config openarm', 'can0 is a CAN bus, but'),
+        ('drive --robot 192.0.2.1 --config yam', 'give its channel, such as can0'),
     ],
 )
 def test_wrong_name_is_answered_with_what_may_be_meant(

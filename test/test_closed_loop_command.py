@@ -262,13 +262,14 @@ def test_interrupted_before_the_loop_began_a_run_leaves_nothing_and_may_be_repea
 
 
 def test_folder_of_a_run_without_a_bag_goes_at_an_interrupt(tmp_path):
-    """And no other: not that of a recorded run, nor what another command has made."""
+    """And one that is empty; not that of a recorded run, nor what another command has made."""
     made = [make_run_folder(tmp_path / name) for name in ('waiting', 'recorded')]
     (made[0] / 'config.yaml').touch()
     (made[1] / 'bag').mkdir()
-    other = make_folder(tmp_path / 'figures')
-    assert discard_unrecorded() == made[:1]
-    assert [each.exists() for each in (*made, other)] == [False, True, True]
+    others = [make_folder(tmp_path / name) for name in ('empty', 'figures')]
+    (others[1] / 'figures.json').touch()
+    assert discard_unrecorded() == [made[0], others[0]]
+    assert [made[1], others[1]] == [each for each in (*made, *others) if each.exists()]
     assert discard_unrecorded() == []
 
 

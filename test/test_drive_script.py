@@ -436,7 +436,11 @@ def test_a_process_that_is_killed_is_an_error_and_another_can_be_started(tmp_pat
     ('config', 'robot', 'message'),
     [
         ('pando', 'simulated', 'pando does not exist, did you mean panda'),
-        ('ur5e', '192.0.2.1', 'ur5e.yaml:\n  - joints: got 6, but the robot has 7'),
+        (
+            'ur5e',
+            '192.0.2.1',
+            'ur5e.yaml, for the driver franka:\n  - joints: got 6, but the robot has 7',
+        ),
     ],
 )
 def test_a_start_that_fails_says_why(config, robot, message):

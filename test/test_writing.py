@@ -36,10 +36,37 @@ def test_folder_that_the_disk_does_not_hold_leaves_nothing(full):
 
     with (
         pytest.raises(BlfDscError, match='nothing of it is left'),
-        writing(full / 'bag'),
+        writing(full / 'bag') as part,
     ):
-        fill(full / 'bag')
-    assert not (full / 'bag').exists()
+        fill(part)
+    assert not list(full.iterdir())
+
+
+def test_what_was_there_stays_until_the_new_one_is_whole(tmp_path):
+    path = tmp_path / 'page.html'
+    path.write_text('old')
+    with pytest.raises(KeyboardInterrupt), writing(path) as part:
+        part.write_text('ne')
+        raise KeyboardInterrupt
+    assert [each.read_text() for each in tmp_path.iterdir()] == ['old']
+    with writing(path) as part:
+        part.write_text('new')
+        assert path.read_text() == 'old'
+    assert [each.read_text() for each in tmp_path.iterdir()] == ['new']
+
+
+def test_device_is_written_itself_and_not_replaced(tmp_path):
+    link = tmp_path / 'nowhere'
+    link.symlink_to('/dev/null')
+    write_text(link, 'x')
+    assert link.is_symlink()
+    assert not link.is_file()
+
+
+def test_what_cannot_be_made_is_named_by_its_own_name(tmp_path):
+    with pytest.raises(FileNotFoundError) as raised:
+        write_text(tmp_path / 'none' / 'page.html', 'x')
+    assert raised.value.filename == str(tmp_path / 'none' / 'page.html')
 
 
 def test_what_cannot_be_opened_stays(tmp_path):

@@ -115,8 +115,8 @@ class Picture:
                 lowest.set_xlabel('time [s]')
                 lowest.tick_params(labelbottom=True)
             # Figure.savefig would draw twice, the first time for the layout only.
-            with writing(path):
-                self._canvas.print_png(path)  # type: ignore[no-untyped-call]
+            with writing(path) as part:
+                self._canvas.print_png(part)  # type: ignore[no-untyped-call]
 
 
 def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:

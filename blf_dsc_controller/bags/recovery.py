@@ -74,7 +74,10 @@ def recover(path: Path, out: Path) -> Recovery:
             f'{path} cannot be read as a bag: there is no MCAP file to recover'
         )
     files.sort(key=lambda file: (len(file.name), file.name))  # bag_10 after bag_9
-    with writing(out), BagWriter(out, flush_interval=None) as bag:
+    with (
+        writing(out) as part,
+        BagWriter(part, name=out.name, flush_interval=None) as bag,
+    ):
         losses = [
             f'{file.name}: {loss}' for file in files for loss in _copied(file, bag)
         ]

@@ -10,12 +10,14 @@ flipped, shows in the number of messages.
 from __future__ import annotations
 
 import difflib
+import errno
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import SEEK_CUR, SEEK_END, BytesIO
 from pathlib import Path
 from struct import Struct
+from tempfile import gettempdir
 from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
@@ -36,6 +38,7 @@ _TABLES = {'.csv', '.txt', '.npz', '.mat', '.parquet'}
 CDR = 'cdr'
 MAGIC_SIZE = 8
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _MESSAGE = Struct('<HIQQ')
 _MESSAGE_CODE = int(Opcode.MESSAGE)  # compared for each message: an enumeration is slow
 _KINDS: dict[int, Any] = {
@@ -211,7 +214,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
         raise BagError(
-            f'{path} cannot be read as a bag: {_reason(path, error)}'
+            f'{path} cannot be read as a bag: {_no_room(error) or _reason(path, error)}'
         ) from error
 
 
@@ -232,6 +235,15 @@ def check_regular(path: Path) -> None:
     for file in files:
         if file.exists() and not (file.is_file() or file.is_dir()):
             raise BagError(f'{file} is not a regular file, so it is no file of a bag')
+
+
+def _no_room(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno in _FULL:
+        return (
+            f'{gettempdir()} has no room for temporary data ({error.strerror}): free some, or set '
+            'TMPDIR to another folder'
+        )
+    return ''
 
 
 def _reason(path: Path, error: Exception) -> str:

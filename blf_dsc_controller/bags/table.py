@@ -108,9 +108,9 @@ def export(run: Run, path: Path) -> int:
     """
     check_format(path)
     blocks = (slice(begin, begin + _ROWS) for begin in range(0, run.stamp.size, _ROWS))
-    with writing(path):
+    with writing(path) as part:
         (_write_csv if path.suffix == '.csv' else _write_parquet)(
-            (table(run, rows) for rows in blocks), path
+            (table(run, rows) for rows in blocks), part
         )
     return len(table(run, slice(1)))
 

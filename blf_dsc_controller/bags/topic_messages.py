@@ -11,6 +11,7 @@ import os
 import tempfile
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -211,7 +212,9 @@ class TopicMessages:
         self._missed = self._before = 0
 
     def __del__(self) -> None:
-        self._file.close()
+        if '_file' in vars(self):  # not if Ctrl-C came while it was opened
+            with suppress(OSError):  # of a full disk, which has been told
+                self._file.close()
 
     def add(self, message: BagMessage) -> None:
         """Add a message; none may be added once a column was read."""

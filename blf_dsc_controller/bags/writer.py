@@ -20,6 +20,7 @@ from blf_dsc_controller.bags.background_file import BackgroundFile
 from blf_dsc_controller.bags.sources import METADATA, BagError
 from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
+from blf_dsc_controller.writing import whole
 
 _CHUNK_SIZE = 1 << 20
 _MOST_CHUNKS = 10_000  # in a file, whose index is kept in memory until it ends
@@ -68,7 +69,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     interval it leaves when a chunk is full. The compression of chunks is `none` or
     `zstd`. A file ends after 10,000 chunks. With `in_background`, a thread writes to
     the disk; errors are raised by a later call. After an OSError, such as that of a
-    full disk, `abandon` the bag.
+    full disk, `abandon` the bag. Its files have the `name` of the folder, or the given one.
 
     Raises:
         BagError: `path` exists already.
@@ -78,11 +79,13 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self,
         path: str | Path,
         *,
+        name: str = '',
         compression: str = 'none',
         flush_interval: float | None = 0.1,
         in_background: bool = False,
     ) -> None:
         self.path = Path(path)
+        self._name = name or self.path.name
         self._in_background = in_background
         self.closed = False
         self._compression = CompressionType[compression.upper()]
@@ -173,7 +176,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self.closed = True
         self._end_file()
         text = _dump({'rosbag2_bagfile_information': self._information()})
-        (self.path / METADATA).write_text(text, encoding='utf-8')
+        with whole(self.path / METADATA) as part:
+            part.write_text(text, encoding='utf-8')
 
     def abandon(self, error: OSError | BagError) -> BagError:
         """End the bag as it is after an error of the disk; return what to tell of it."""
@@ -202,7 +206,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
     def _begin_file(self) -> None:
         """Begin the next file, with the topics of the previous one."""
-        self._files.append(_File(f'{self.path.name}_{len(self._files)}.mcap'))
+        self._files.append(_File(f'{self._name}_{len(self._files)}.mcap'))
         path = self.path / self._files[-1].name
         make: Callable[[Path], Any] = partial(Path.open, mode='xb')
         if self._in_background:

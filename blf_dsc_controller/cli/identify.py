@@ -107,6 +107,8 @@ def _identified(options: Namespace, robot: Robot) -> Identified:
     with tqdm(total=len(STAGES), unit='stage', leave=False, disable=None) as bar:
 
         def begin(stage: str) -> None:
+            if stage == STAGES[1]:  # URDF and recordings have been read, and are right
+                _refuse_no_output(options)
             bar.set_description(stage)
             bar.update(STAGES.index(stage) - bar.n)
 
@@ -126,10 +128,6 @@ def _identified(options: Namespace, robot: Robot) -> Identified:
 def _outputs(options: Namespace) -> list[Path]:
     """Return the files to write, and make room for them and the page."""
     outputs: list[Path] = options.out
-    if not (outputs or options.report or options.payload):
-        raise BlfDscError(
-            'nothing to write: give --out, --report, --payload or --foresee'
-        )
     suffixes = [path.suffix for path in outputs]
     for path in outputs:
         if path.suffix not in _FORMATS:
@@ -147,6 +145,13 @@ def _outputs(options: Namespace) -> list[Path]:
     for path in (*outputs, *report):
         make_room(path, force=options.force)
     return outputs
+
+
+def _refuse_no_output(options: Namespace) -> None:
+    if not (options.out or options.report or options.payload):
+        raise BlfDscError(
+            'nothing to write: give --out, --report, --payload or --foresee'
+        )
 
 
 def _facts(found: Identified, options: Namespace) -> list[str]:

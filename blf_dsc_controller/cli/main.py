@@ -98,7 +98,7 @@ def _place_text(error: OSError) -> str:
     path = error.filename
     match error:
         case OSError(filename=None):
-            return f'{error}'
+            return error.strerror or f'{error}'
         case FileNotFoundError():
             return f'there is no {path}: make its folder, or choose another path'
         case PermissionError():

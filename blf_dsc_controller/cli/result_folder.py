@@ -9,19 +9,27 @@ from pathlib import Path
 from blf_dsc_controller.errors import BlfDscError
 
 _BAG = 'bag'
-_made: list[Path] = []
+_ANY = '*'
+_made: list[tuple[Path, str]] = []  # and the result in it
 
 
 def make_folder(path: Path) -> Path:
-    """Create a folder; raises BlfDscError if it exists already."""
-    refuse_existing(path)
-    path.mkdir(parents=True)
-    return path
+    """Create a folder, which `discard_unrecorded` may remove again while it is empty.
+
+    Raises BlfDscError if it exists already.
+    """
+    return _make(path, _ANY)
 
 
 def make_run_folder(path: Path) -> Path:
     """Create the folder of a run, which `discard_unrecorded` may remove again."""
-    _made.append(make_folder(path))
+    return _make(path, _BAG)
+
+
+def _make(path: Path, result: str) -> Path:
+    refuse_existing(path)
+    _made.append((path, result))
+    path.mkdir(parents=True)
     return path
 
 
@@ -34,12 +42,16 @@ def refuse_existing(path: Path) -> None:
 
 
 def discard_unrecorded() -> list[Path]:
-    """Remove the folders of this process's runs that have no bag, and return them.
+    """Remove this process's folders that are empty, or of a run without a bag; return them.
 
     It is for an interrupt: the same command can then be given again. After an error
     they stay, since their logs say why.
     """
-    discarded = [folder for folder in _made if not (folder / _BAG).exists()]
+    discarded = [
+        folder
+        for folder, result in _made
+        if folder.is_dir() and not any(folder.glob(result))
+    ]
     for folder in discarded:
         shutil.rmtree(folder)
     _made.clear()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.extras import import_extra
 
+FRANKA, DAMIAO = 'franka', 'damiao'  # drivers of this package
+_BUS = re.compile(r'[a-z]*can\d+$|[a-z_]+:(?!\d+$)')  # can0, vcan1, slcan:/dev/ttyACM0
+_HOST = re.compile(r'\d+(\.\d+){3}$')
 _SHORTEST = 3  # letters of an address that may mean `simulated`
 _LIKE = 0.7  # likeness of such an address
 
@@ -45,12 +49,32 @@ def driver_of(
                 f'there is no robot {address}, did you mean {SIMULATED}? The host of a robot that '
                 'is called so has an address in numbers, too'
             )
+        _check_kind(address, path, settings)
         made = find_driver(settings.driver)
     check_feedback(made, settings)
     problems = disagreements(made.facts_for(config), config)
     if problems:
-        raise ConfigurationError(problems, str(path))
+        of_driver = (
+            '' if address == SIMULATED else f', for the driver {settings.driver}'
+        )
+        raise ConfigurationError(problems, f'{path}{of_driver}')
     return made(address, config, settings)
+
+
+def _check_kind(address: str, path: Path, settings: DriveConfig) -> None:
+    """Raise BlfDscError if a CAN bus is given to the driver of a Franka, or no bus to motors'."""
+    is_bus = _BUS.match(address) is not None
+    if is_bus and settings.driver == FRANKA:
+        raise BlfDscError(
+            f'{address} is a CAN bus, but {path} names no driver of motors: drive.driver is '
+            f'{FRANKA}, whose robot has an address in the network. For Damiao motors add '
+            f'drive.driver: {DAMIAO}, as config/yam.yaml does'
+        )
+    if _HOST.match(address) and settings.driver == DAMIAO:
+        raise BlfDscError(
+            f'{address} is an address in the network, but drive.driver in {path} is {DAMIAO}, '
+            'whose motors are on a CAN bus: give its channel, such as can0'
+        )
 
 
 def is_nearly_simulated(address: str) -> bool:
@@ -69,12 +93,12 @@ def find_driver(name: str) -> type[Driver]:
     """
     if name.endswith('.py'):
         return _load(Path(name).expanduser())
-    if name == 'franka':
+    if name == FRANKA:
         import_extra('pylibfranka', 'franka', 'the driver franka')
         from blf_dsc_controller.drive.franka import FrankaDriver
 
         return FrankaDriver
-    if name == 'damiao':
+    if name == DAMIAO:
         import_extra('can', 'damiao', 'the driver damiao')
         from blf_dsc_controller.drive.damiao import DamiaoDriver
 

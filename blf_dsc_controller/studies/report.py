@@ -37,6 +37,7 @@ from blf_dsc_controller.studies.runs import (
     differences,
     figures_of,
 )
+from blf_dsc_controller.writing import write_text
 
 Summary = dict[str, Any]
 Studies = dict[str, tuple[Study, Columns]]
@@ -275,7 +276,7 @@ def write_comparison(stores: Sequence[Store], folder: Path) -> str:
     _draw_pairs(found, folder / 'changes.png')
     lines = [rows[0], ['---'] * len(rows[0]), *(row.values() for row in rows)]
     text = ''.join(f'| {" | ".join(line)} |\n' for line in lines)
-    (folder / 'changes.md').write_text(text, encoding='utf-8')
+    write_text(folder / 'changes.md', text)
     return text
 
 

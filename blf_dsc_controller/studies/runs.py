@@ -60,6 +60,7 @@ from blf_dsc_controller.studies.monte_carlo import (
     plant_with,
     torque_error,
 )
+from blf_dsc_controller.writing import whole, writing
 from sim_plant.elastic import run_elastic_plant
 from sim_plant.kernels import run_plant
 from sim_plant.plant import plant_of
@@ -258,9 +259,10 @@ class Store:
         version.
         """
         if not folder.exists():
-            (folder / _RUNS).mkdir(parents=True)
-            write_json(versions(), folder / _VERSIONS)
-            dump(folder / _STUDY, study.values())
+            with whole(folder) as part:
+                (part / _RUNS).mkdir(parents=True)
+                write_json(versions(), part / _VERSIONS)
+                dump(part / _STUDY, study.values())
         store = cls(folder)
         there = json.loads((folder / _VERSIONS).read_text(encoding='utf-8'))
         if different := differences(
@@ -276,12 +278,10 @@ class Store:
         """Write results of consecutive runs atomically."""
         pa = require_pyarrow()
         path = self._path(runs)
-        unfinished = path.with_name(f'.{path.name}')
-        with unfinished.open('wb') as file:
+        with writing(path) as part, part.open('wb') as file:
             pa.parquet.write_table(pa.table(columns), file)
             file.flush()
             os.fsync(file.fileno())
-        unfinished.replace(path)
 
     def missing(self) -> list[range]:
         """Return the chunks of runs without results."""
