@@ -45,6 +45,7 @@ LARGE = 3  # joints of shoulder and elbow
 SETTINGS = {  # how many joints lag, by how much [s]
     'none': (0, 0.0),
     '3 ms': (6, LAG),
+    f'2 ms, first {LARGE} joints': (LARGE, 0.002),
     f'3 ms, first {LARGE} joints': (LARGE, LAG),
     f'5 ms, first {LARGE} joints': (LARGE, 0.005),
 }

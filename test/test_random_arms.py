@@ -217,6 +217,29 @@ def test_published_gains_are_tried_where_this_law_does_not_hold(study, monkeypat
     assert found['settled [mrad]'] == '3 / 3 / 3'
 
 
+def test_what_does_not_hold_is_counted_by_the_joint_named_and_by_what_was_drawn(study):
+    """Of eight UR5es the three whose springs are damped least fail."""
+    kept, own = study.Kept(None), study.study_of('ur5e')
+    damping = [study.arm_of(own, k).joint.damping_ratio for k in range(8)]
+    fail = set(np.argsort(damping)[:3].tolist())
+    texts = iter(
+        ["joint 'pan' oscillates at 31 Hz with", "joint 'pan' at 1.9e+02 Hz,", '']
+    )
+    for k in range(8):
+        stopped = 2.0 if k in fail else np.nan
+        text = next(texts) if k in fail else ''
+        result = study.Result(stopped, text, 0, *[0.01] * 8)
+        kept.results[study.Key('ur5e', 'study', k, study.THIS)] = result
+        kept.results[study.Key('ur5e', 'study', k, study.STOCK)] = result
+    assert list(many_arms.named(kept)) == [
+        ['ur5e', 'study', 'pan', '2', '2', '31 to 190'],
+        ['ur5e', 'study', 'none', '1', '1', '-'],
+    ]
+    rows = {label: counts for _, _, label, *counts in many_arms.quarters(kept)}
+    assert rows['damping of the springs'] == ['2', '1', '0', '0']
+    assert all(sum(map(int, counts)) == 3 for counts in rows.values())
+
+
 def test_rivals_at_rest_have_the_gains_that_they_have_in_motion(monkeypatch):
     asked = []
     gains = soft_arms.Equal(0.2, 0.9, 10.0, ((0.9, 4.0), (0.7, 8.0), (0.5, 9.0)))

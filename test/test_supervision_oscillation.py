@@ -132,6 +132,11 @@ def test_feedback_is_softened_until_the_arm_is_calm_and_names_joint_and_frequenc
     assert np.abs(run.error[1000:]).max() < 0.02
 
 
+def test_oscillation_above_100_hz_has_no_exponent():
+    shaking = calming.Shaking('joint1', 194.0, 118.0)
+    assert shaking.text == "joint 'joint1' oscillates at 190 Hz with +-120 N m"
+
+
 def test_run_with_softer_gains_replays_and_its_bag_has_the_oscillation(tmp_path):
     record = softened()
     write_bag(tmp_path / 'bag', record)

@@ -21,6 +21,7 @@ from blf_dsc_controller.law.blf_dsc import shift_surface
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.oscillation import PATIENCE, VIOLENT, oscillates
 from blf_dsc_controller.law.state import Settings, settings_of
+from blf_dsc_controller.supervision.digits import two_digits
 
 _HALF = 0.5
 _SOFTEST = 0.25  # of the rates
@@ -46,8 +47,8 @@ class Shaking(NamedTuple):
 
     def _with(self, verb: str) -> str:
         return (
-            f'joint {self.joint!r} {verb} at {self.frequency:.2g} Hz with '
-            f'+-{self.torque:.2g} N m'
+            f'joint {self.joint!r} {verb} at {two_digits(self.frequency)} Hz with '
+            f'+-{two_digits(self.torque)} N m'
         )
 
 

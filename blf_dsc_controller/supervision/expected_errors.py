@@ -21,6 +21,7 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.tool_bound import REVERSAL
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.reference_load import along
 
 Floats = NDArray[np.float64]
@@ -134,13 +135,8 @@ def expectation(config: ControllerConfig) -> str:
     joint = config.joints[int(errors.pick_up.argmax())]
     sensed = config.disturbance.observer_bandwidth > 0.0
     return (
-        f'{_rounded(usual)} mrad by friction and unmodelled torque; {_rounded(most)} mrad of '
-        f'{joint} when '
+        f'{two_digits(usual)} mrad by friction and unmodelled torque; {two_digits(most)} '
+        f'mrad of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
         + (', less what joint torque sensors show in time' if sensed else '')
     )
-
-
-def _rounded(value: float) -> str:
-    """Return a number with two digits, without an exponent."""
-    return f'{float(f"{value:.2g}"):g}'

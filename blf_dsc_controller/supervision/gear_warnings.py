@@ -10,6 +10,7 @@ import numpy as np
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.expected_errors import linear_feedback
 
 LEAST_MARGIN = 0.2
@@ -53,6 +54,7 @@ def _of_margin(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     oscillates = 'is unstable' if margin.value == 0.0 else 'rings'
     yield (
         f'{softer}: with robot.joint_stiffness the loop {oscillates} near '
-        f'{margin.frequency:.2g} Hz, its modulus margin is {margin.value:.2g}: lower {softer}, or '
+        f'{two_digits(margin.frequency)} Hz, its modulus margin is {margin.value:.2g}: lower '
+        f'{softer}, or '
         'leave the gains out, so that they follow from robot.joint_stiffness'
     )
