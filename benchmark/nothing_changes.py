@@ -13,7 +13,8 @@ rad/s.  The motions are those that people have, with rests:
     insertion   fast between postures, and then 5 to 30 mrad/s for seconds
 
 Each run is made twice: with an empty hand and nothing that changes, and with one load of 2 kg
-that is picked up half-way.  A reading is what the law says it holds, each tenth of a second where
+that is picked up half-way.  Of some arms alone, the runs are those that the whole table has of
+them.  A reading is what the law says it holds, each tenth of a second where
 it says something; it is outside if its 95 % interval does not hold the truth.  *Certain* are
 readings to 5 % (50 g), which `load.tell_drive` declares.
 """
@@ -265,12 +266,14 @@ class Pair(NamedTuple):
 
 
 def pairs(arms: Iterable[str], runs: int) -> Iterator[Pair]:
-    """Yield so many pairs, arms and motions in turn."""
+    """Yield those of so many pairs that are of the `arms`; all arms and motions are in turn."""
     names = list(arms)
     motions = list(MOTIONS)
     for k in range(runs):
-        arm = names[k % len(names)]
-        motion = motions[(k + k // len(names)) % len(motions)]
+        arm = ARMS[k % len(ARMS)]
+        if arm not in names:
+            continue
+        motion = motions[(k + k // len(ARMS)) % len(motions)]
         both = (
             found(recorded(loop_of(arm, k, load), motion, k), load)
             for load in (0.0, LOAD)

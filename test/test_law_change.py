@@ -140,6 +140,29 @@ def test_rows_of_another_arm_contradict_those_before(parts, changed, found):
     assert contradicted == found
 
 
+@pytest.mark.parametrize(('rows', 'changed'), [(2, False), (500, True)])
+def test_noise_of_few_rows_is_doubted(parts, rows, changed):
+    """Eleven times the noise so far is no change after two rows, and is one after a window."""
+    found = False
+    sliding = parts.sliding._replace(settings=SIZES._replace(length=500))
+    for k, row in enumerate(rows_of(THETA, rows, 0.05)):
+        if k == rows - 1:
+            now = parts.change.innovation
+            now.recent[0] = 12.2 * now.noise[0]  # 11 in the mean with this row
+        found = change.compare_with_rows(
+            parts.change,
+            parts.work,
+            sliding,
+            PRIOR,
+            row.copy(),
+            1.0,
+            0.02,
+            k + 1,
+            DT,
+        )
+    assert found == changed
+
+
 def test_first_motion_after_a_rest_is_no_change(parts):
     """Rows at rest are all zeros.  As rows that fit, they would leave no noise to compare with."""
     rest = np.zeros((200, N, M + 1))

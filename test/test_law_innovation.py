@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal, multivariate_t
 from blf_dsc_controller.law.innovation import (
     CORRELATION,
     State,
+    alarm,
     begin,
-    doubted_alarm,
     forget_recent,
     has_begun,
     noise_of,
@@ -127,12 +127,25 @@ def test_rows_before_any_motion_leave_what_is_assumed():
     assert state.noise[0] == 0.1
 
 
-@pytest.mark.parametrize(('factor', 'changed'), [(7.9, False), (8.1, True)])
+@pytest.mark.parametrize(
+    ('rows', 'factor', 'changed'),
+    [
+        (MOST, 7.9, False),
+        (MOST, 8.1, True),
+        (
+            0.0,
+            12.3,
+            False,
+        ),  # s^2 is assumed, and doubted: 12.4 times by `as_improbable`
+        (0.0, 12.5, True),
+    ],
+)
 def test_arm_has_changed_from_eight_times_the_noise_on_average_over_a_tenth_of_a_second(
-    factor, changed
+    rows, factor, changed
 ):
     state = begun()
-    state.recent[0] = 0.1  # s^2: rows that fit
+    state.rows[0] = rows
+    state.mean[0] = state.recent[0] = 0.1  # s^2: rows that fit
     square = 0.1 * (1.0 + MEMORY * (factor - 1.0))  # moves that average to the factor
     assert update(state, square, 1.0, 1.0, PERIOD, MOST) == changed
     forget_recent(state)
@@ -167,4 +180,10 @@ def test_change_by_a_noise_of_few_rows_is_as_improbable_as_by_that_of_a_window(r
         as_improbable(each * PERIOD / CORRELATION) for each in (counted, MOST)
     )
     expected = 8.0 * 0.1 * few / window
-    assert doubted_alarm(state, PERIOD, MOST) == pytest.approx(expected)
+    assert alarm(state, PERIOD, MOST) == pytest.approx(expected)
+
+
+def test_noise_of_a_window_shorter_than_what_is_assumed_is_not_trusted_more():
+    """Of half a second, whose rows are fewer than the assumed ones."""
+    state = begun()
+    assert alarm(state, PERIOD, 50.0) == pytest.approx(8.0 * 0.1)

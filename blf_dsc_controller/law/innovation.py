@@ -22,12 +22,11 @@ weights: with the share w^2 of a row, the mean square of its joints' weights,
 
     mean = sum(e^T C^-1 e / n) / sum(w^2).
 
-The arm has changed where the mean over 0.1 s of motion exceeds eight times s^2.
+The arm has changed where the mean over 0.1 s of motion exceeds eight times s^2, and
+more where s^2, which is of few rows, may be too small (`alarm`).
 
 s^2 is assumed at first, and measured as the mean.  Rows that fit ever worse, as under a
 disturbance that lasts, raise it as they come, and contradict nothing.
-
-A s^2 of few rows may be too small (`doubted_alarm`).
 """
 
 from typing import NamedTuple
@@ -129,7 +128,7 @@ def update(
     """
     excess = square - share * state.recent[0]
     state.recent[0] += min(1.0, period / MEMORY) * excess
-    has_changed = state.recent[0] > _ALARM * state.noise[0]
+    has_changed = state.recent[0] > alarm(state, period, most)
     state.rows[0] = min(state.rows[0] + share, most)
     if state.rows[0] > 0.0:
         usual = min(square, _MOST * share * state.noise[0])
@@ -139,15 +138,15 @@ def update(
 
 
 @inner
-def doubted_alarm(state: State, period: float, most: float) -> float:
+def alarm(state: State, period: float, most: float) -> float:
     """Return the mean square [(N m)^2] that is a change although s^2 may be of few rows.
 
-    It is 8 s^2 of a window, of `most` rows, and more of fewer, as s^2 may be too small.
+    It is 8 s^2 where s^2 is of a window, of `most` rows, and more where it is of fewer.
     """
     rows = state.rows[0] + _ASSUMED_ROWS * (1.0 - state.rows[0] / most)
     excess = _excess(rows * period / CORRELATION)
     usual = _excess(most * period / CORRELATION)
-    return float(_ALARM * state.noise[0] * excess / usual)
+    return float(_ALARM * state.noise[0] * max(1.0, excess / usual))
 
 
 @inner

@@ -369,8 +369,6 @@ def update_innovation(
     """Compare a row with the solution; return whether the last ones contradict it."""
     e = work.torque
     x = state.solution
-    now = state.innovation
-    alarm = innovation.doubted_alarm(now, period, settings.window)
     fill_rows(settings, not is_first(state), row, work.rows)
     for i in range(e.size):
         e[i] = row[i, row.shape[1] - 1]
@@ -380,8 +378,9 @@ def update_innovation(
         work.rows, e, state.factor, period, work.covariance
     )
     share = counted_share(dqr, settings.motion_scale)
-    innovation.update(now, square, share, settings.unmodelled, period, settings.window)
-    return bool(now.recent[0] > alarm)
+    return innovation.update(
+        state.innovation, square, share, settings.unmodelled, period, settings.window
+    )
 
 
 @inner
