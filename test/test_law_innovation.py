@@ -132,11 +132,7 @@ def test_rows_before_any_motion_leave_what_is_assumed():
     [
         (MOST, 7.9, False),
         (MOST, 8.1, True),
-        (
-            0.0,
-            12.3,
-            False,
-        ),  # s^2 is assumed, and doubted: 12.4 times by `as_improbable`
+        (0.0, 12.3, False),  # s^2 is assumed, and doubted: 12.4 by `as_improbable`
         (0.0, 12.5, True),
     ],
 )
