@@ -281,6 +281,7 @@ class Guard:
             if not is_valid_state(law.checks, measurement):
                 self._wait(self.states.invalid(self.config.safety, measurement).text)
                 return self._safe_at(stamp, measurement)
+            self._forget_load_after_gap(stamp, measurement)
             last.take(stamp, measurement, self._slow)
             if not self._start(stamp, measurement):
                 return self._safe(self.config.sample_time)
@@ -305,6 +306,13 @@ class Guard:
         self.has_sample = True
         self.journal.commands += 1
         return torque
+
+    def _forget_load_after_gap(self, stamp: int, measurement: Vector) -> None:
+        """Carry nothing on in a state that does not follow the last one: others may hold it."""
+        fastest, period = self.config.safety.velocity_limit, self.config.sample_time
+        q = measurement[: self._n]
+        if not self._safe_torque.last.leads_to(stamp, q, fastest, period):
+            self._takeover.carried = None
 
     def _stop_at_invalid(self, stamp: int, measurement: Vector) -> None:
         """Stop because of a state that the law has not used."""
@@ -687,18 +695,28 @@ class Guard:
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state.
 
-        A law in command goes on to carry what it carries besides the model.
+        The law goes on to carry what it carries besides the model, or the safe torque does.
         """
         self._note(EventType.RESET)
+        load = self._carried()
         self._reference.resumable = False
         self.controller.reset()
         self._loads.forget()
-        load = self._takeover.carried  # of a reset just before
-        if self.supervisor.running:
-            load = self._held.load_before_learning()
         self.samples.keep()
         self._start_over()
         self._takeover.carried = load
+        if load is not None:
+            self._safe_stop.begin_anew(self.config.safety, load)
+
+    def _carried(self) -> Vector | None:
+        """Return the load (n,) [N m] besides the initial estimate that is carried now, if any."""
+        if self.supervisor.running:
+            return self._held.load_before_learning()
+        if self.supervisor.phase is Phase.STARTING:
+            return self._takeover.carried  # of a reset just before
+        if not self.commanding or self.silenced:
+            return None
+        return self._safe_stop.carried(self.config.safety)
 
     def plan(self, command: Trajectory | Target, at: float | None = None) -> Plan:
         """Plan a motion, in any thread, to `adopt` by the time `at` [s] (now).
