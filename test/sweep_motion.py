@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resets, activations and hangs at many moments of one motion, in lock-step.
+"""Resets, activations, stops and hangs at many moments of one motion, in lock-step.
 
 `python test/sweep_motion.py ur5e_driver reset --step 0.1 --seconds 10` prints by how much [rad/s]
 a joint is faster than before and than it was asked to be, as `soak_motion` measures it: worst,
@@ -20,6 +20,7 @@ BEGIN = 4.0  # s, from which on events happen
 BEFORE = 0.2  # s, whose speeds an arm may have again
 AFTER = 1.0  # s, that are looked at
 PAUSED = 0.15  # s
+STOPPED = 2.0  # s, in which an arm comes to rest
 
 
 def reset(loop, _):
@@ -32,6 +33,13 @@ def pause(loop, _):
     loop.guard.activate()
 
 
+def stop(loop, _):
+    """Stop, and reset the arm at rest."""
+    loop.guard.fail('by hand')
+    loop.run(STOPPED)
+    loop.guard.reset()
+
+
 def hang(loop, seconds):
     loop.hang(seconds, queued=False)
 
@@ -40,7 +48,7 @@ def hang_queued(loop, seconds):
     loop.hang(seconds, queued=True)
 
 
-EVENTS = {each.__name__: each for each in (reset, pause, hang, hang_queued)}
+EVENTS = {each.__name__: each for each in (reset, pause, stop, hang, hang_queued)}
 
 
 def in_fork(call):

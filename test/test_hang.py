@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.terms import evaluate
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision import running_reference
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import needed_torque
@@ -171,6 +172,38 @@ def test_law_that_goes_on_does_not_pull_a_braked_arm_to_its_reference(
     least = np.maximum(before[-200:].max(axis=0), loop.speed)
     speed, asked = loop.run(0.6)
     over = speed.max(axis=0) - np.maximum(least, asked.max(axis=0))
+    assert over.max() < SLACK
+
+
+@pytest.mark.parametrize('late', [0.033, 0.052])
+def test_plan_that_takes_longer_than_a_gap_is_not_made_again(monkeypatch, late):
+    """On a slow computer.  The law planned 20 to 31 times in a second, and a soak got 1 rad/s."""
+    plans = []
+    for name in ('plan_start', 'plan_resumption'):
+        plan = getattr(running_reference, name)
+
+        def counted(*given, plan=plan, **named):
+            plans.append(1)
+            return plan(*given, **named)
+
+        monkeypatch.setattr(running_reference, name, counted)
+    loop = Loop('fr3', PATIENT)
+    before, _ = loop.run(4.4)
+    assert len(plans) == 1
+    loop.guard.reset()
+    T = loop.config.sample_time
+    for _ in range(round(1.0 / T)):
+        state, made = loop.state(), len(plans)
+        torque = loop.guard.update(*state).copy()
+        if len(plans) > made:
+            loop.run(late, hangs=True)
+        loop.torque = torque
+        loop.line.torque_of_controller(torque, loop.plant.sample * T)
+        loop.plant.step(torque)
+    assert len(plans) == 2
+    assert loop.guard.supervisor.running, loop.guard.supervisor.text
+    speed, asked = loop.run(0.3)
+    over = speed.max(axis=0) - np.maximum(before[-200:].max(axis=0), asked.max(axis=0))
     assert over.max() < SLACK
 
 

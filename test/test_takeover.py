@@ -8,10 +8,12 @@ import pytest
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import load_loop
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.recent_motion import RecentMotion
+from blf_dsc_controller.supervision.last_state import LastState
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from sim_plant.plant import plant_of
 
 LOADED = {
@@ -85,19 +87,74 @@ def test_a_reset_in_command_forgets_what_was_learned_and_goes_on_to_carry_the_lo
     np.testing.assert_allclose(torques[0], held, atol=0.5)
 
 
-@pytest.mark.parametrize('forgets', ['stopped', 'gap'])
-def test_a_reset_of_a_stopped_law_or_before_a_gap_begins_without_a_load(forgets):
-    """What has held the arm since may be another."""
+def test_a_reset_of_an_arm_that_has_stopped_goes_on_to_carry_its_load(arm):
+    """As the safe torque does: else the arm falls until the feedback catches it."""
+    arm.guard.fail('by hand')
+    torques, _ = arm.run(2.0)
+    arm.guard.reset()
+    first, speed = arm.run(0.5)
+    assert arm.guard.supervisor.running, arm.guard.supervisor.text
+    assert speed < 0.02  # rad/s
+    np.testing.assert_allclose(first[0], torques[-1], atol=0.5)
+
+
+def test_a_start_that_is_refused_after_a_reset_leaves_the_load_to_the_safe_torque(arm):
+    arm.guard.fail('by hand')
+    arm.run(2.0)
+    arm.guard.reset()
+    arm.guard.refuse(StartError('by hand'))
+    _, speed = arm.run(0.5)
+    assert arm.guard.supervisor.phase is Phase.SAFE_STOP
+    assert speed < 0.04  # rad/s; a Panda that is left alone has up to 0.03
+
+
+def test_an_invalid_state_after_a_reset_lets_no_load_fall(arm):
+    """The law waits for another, and the safe torque carries the load meanwhile."""
+    arm.guard.reset()
+    n = len(arm.config.joints)
+    for _ in range(round(0.2 / arm.config.sample_time)):
+        measurement = arm.plant.measure().copy()
+        measurement[n : 2 * n] = np.nan
+        arm.plant.step(arm.guard.update(arm.stamp, measurement))
+        arm.stamp += arm.config.sample_time_ns
+    assert arm.guard.waiting_for
+    assert np.abs(arm.plant.truth()[-n:]).max() < 0.02  # rad/s
+    _, speed = arm.run(0.5)
+    assert arm.guard.supervisor.running, arm.guard.supervisor.text
+    assert speed < 0.02
+
+
+@pytest.mark.parametrize('torque', ['hold_gravity', 'damping'])
+@pytest.mark.parametrize('gap', [0.0, 0.1])
+@pytest.mark.parametrize('is_stopped', [True, False])
+def test_a_reset_begins_without_a_load_that_nothing_shows(torque, gap, is_stopped):
+    """After a gap, another may hold the arm; behind mere damping, something else does."""
     arm = Arm('fr3')
     arm.run(3.0)
     carried = np.abs(arm.guard.controller.state.disturbance).max()
-    if forgets == 'stopped':
+    arm.guard.retune(change(arm.config, {'safety.torque': torque}))
+    if is_stopped:
         arm.guard.fail('by hand')
         arm.run(0.1)
     arm.guard.reset()
-    arm.stamp += 10**8 * (forgets == 'gap')
+    arm.stamp += round(1e9 * gap)
     arm.run(arm.config.sample_time)
     assert arm.guard.supervisor.running, arm.guard.supervisor.text
+    begins = np.abs(arm.guard.controller.state.disturbance).max()
+    is_shown = gap == 0.0 and not (is_stopped and torque == 'damping')
+    assert begins > 0.5 * carried if is_shown else begins < 0.01 * carried
+
+
+@pytest.mark.parametrize('reason', [Reason.SATURATED, Reason.OUTSIDE_BOUND])
+def test_a_reset_begins_without_a_load_if_commands_may_not_have_reached_the_arm(reason):
+    """An arm at rest does not show it: brakes hold it as well."""
+    arm = Arm('fr3')
+    arm.run(3.0)
+    carried = np.abs(arm.guard.controller.state.disturbance).max()
+    arm.guard._stop(reason, 'by hand')
+    arm.run(arm.config.sample_time)
+    arm.guard.reset()
+    arm.run(arm.config.sample_time)
     assert np.abs(arm.guard.controller.state.disturbance).max() < 0.01 * carried
 
 
@@ -111,14 +168,15 @@ def test_a_reset_of_a_stopped_law_or_before_a_gap_begins_without_a_load(forgets)
         (0.0, 0.0, False),
     ],
 )
-def test_last_sample_leads_to_a_state_that_an_arm_of_3_rad_s_can_reach(
+def test_last_state_leads_to_one_that_an_arm_of_3_rad_s_can_reach(
     elapsed, moved, leads
 ):
-    recent = RecentMotion(1, 0.001)
-    assert not recent.leads_to(10**9, np.zeros(1), 3.0)
-    recent.take(10**9, np.array([0.5, 0.0, 0.0]), np.zeros(1))
+    last = LastState(1)
+    assert not last.leads_to(10**9, np.zeros(1), 3.0, 0.001)
+    last.take(10**9, np.array([0.5, 0.0, 0.0]), np.zeros(1))
     stamp = 10**9 + round(elapsed * 1e9)
-    assert recent.leads_to(stamp, np.array([0.5 + moved]), 3.0) == leads
+    q = np.array([0.5 + moved])
+    assert last.leads_to(stamp, q, 3.0, 0.001) == leads
 
 
 def test_two_resets_in_a_row_carry_the_load():

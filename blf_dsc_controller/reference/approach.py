@@ -4,10 +4,10 @@
 An arm in motion is taken over at its velocity, in a motion that brakes.  A reference to
 hold rests where this ends.  Any other reference is blended into the present motion (see
 `terms`), starting at t0, in the shortest time that keeps the limits, found in 10 %
-steps and refined by bisection; in motion with a share of the acceleration, if that is
-possible and soon enough.  A blend exceeds the speed of its parts only by a
-multiple of their distance over its duration, so one exists if both parts stay strictly
-within the limits and their distance is finite.
+steps and refined by bisection; in motion, and where a law starts again, with a share of
+the acceleration, if that is possible and soon enough.  A blend exceeds the speed of its
+parts only by a multiple of their distance over its duration, so one exists if both parts
+stay strictly within the limits and their distance is finite.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ _BRAKE = 3.0
 _IN_MOTION = 0.6
 """Share of limits.acceleration for a takeover in motion, where positions and time permit it.
 
-What the model lacks, as a load that a reset has made the law forget, acts by the acceleration.
+So for all starts of a law but its first one.  What the model lacks, as a load that a reset has
+made the law forget, acts by the acceleration.
 """
 _LONGEST_IN_MOTION = 4.0  # s
 _MOVING = 2.0 * AT_REST  # rad/s; steps of a motor's velocity reach AT_REST
@@ -314,11 +315,14 @@ def plan_start(
     q: np.ndarray,
     dq: np.ndarray,
     t: float = 0.0,
+    *,
+    again: bool = False,
 ) -> BlendedReference:
     """Plan the configured reference, with an approach if it is needed.
 
     At time t [s], the arm is at q (n,) [rad] with dq (n,) [rad/s], and the bound is
-    `bound` (n,) [rad].  Continuous joints go the short way (`turns`).
+    `bound` (n,) [rad].  Continuous joints go the short way (`turns`).  A law that starts
+    `again` does so with a share of the acceleration, also from rest.
 
     Raises:
         StartError: the law cannot take over (`check_takeover`), and approach.enabled is false;
@@ -338,9 +342,10 @@ def plan_start(
         if _joins(config, dq, vector, t) or not config.approach.enabled:
             return BlendedReference(vector, t)
     (target,) = unpack(vector)
-    motion = _gently(config, q, dq, target, t)
-    if motion is not None:
-        return motion
+    if again or np.abs(dq).max() > _MOVING:
+        motion = _gently(config, q, dq, target, t)
+        if motion is not None:
+            return motion
     begin = [stop(t, q, dq, config)]
     try:
         return blend(begin, target, t, config)
@@ -378,9 +383,7 @@ def plan_resumption(
 def _gently(
     config: ControllerConfig, q: np.ndarray, dq: np.ndarray, target: Term, t: float
 ) -> BlendedReference | None:
-    """Plan from motion to `target` with a share of the acceleration; None: rest, or no way."""
-    if np.abs(dq).max() <= _MOVING:
-        return None
+    """Plan a motion to `target` with a share of the acceleration; None: there is no way."""
     limits = config.limits
     acceleration = tuple(_IN_MOTION * each for each in limits.acceleration)
     gentle = replace(config, limits=replace(limits, acceleration=acceleration))

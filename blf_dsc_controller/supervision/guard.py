@@ -240,6 +240,7 @@ class Guard:
                 invalid = self.states.invalid(self.config.safety, measurement)
                 self._starting.wait(invalid.text)
                 return self._safe_at(stamp, measurement)
+            self._starting.forget_load_after_gap(stamp, measurement)
             last.take(stamp, measurement, command.slow)
             if not self._starting.start(stamp, measurement):
                 return command.safe(self.config.sample_time)
@@ -373,7 +374,7 @@ class Guard:
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state.
 
-        A law in command goes on to carry what it carries besides the model.
+        The law goes on to carry what it carries besides the model, or the safe torque does.
         """
         self._starting.reset()
 

@@ -83,6 +83,16 @@ class LastState:
         self.age = 0.0
         self._stamp = stamp
 
+    def leads_to(self, stamp: int, q: Vector, fastest: float, period: float) -> bool:
+        """Whether the arm at q (n,) [rad] comes from this state: no gap, and no jump.
+
+        `stamp` [ns] is that of q, `fastest` [rad/s] the largest speed of a joint, `period`
+        [s] the time between two states.
+        """
+        elapsed = (stamp - self._stamp) * 1e-9
+        is_next = elapsed > 0.0 and not is_gap(elapsed, period)
+        return bool(is_next and np.abs(q - self.q).max() <= fastest * elapsed)
+
     def miss(self, period: float) -> None:
         """Account for `period` [s] without a usable state."""
         self.dq[:] = self.slow[:] = 0.0

@@ -60,19 +60,6 @@ class RecentMotion:
         self._torques[at] = torque
         self._count += 1
 
-    def leads_to(self, stamp: int, q: Array, fastest: float) -> bool:
-        """Whether the arm at q (n,) [rad] comes from the last sample: no gap, and no jump.
-
-        `stamp` [ns] is that of q, `fastest` [rad/s] the largest speed of a joint.
-        """
-        if self._count == 0:
-            return False
-        last = (self._count - 1) % self.size
-        elapsed = 1e-9 * (stamp - self._stamps[last])
-        moved = np.abs(q - self._states[last, : q.size]).max()
-        is_next = elapsed > 0.0 and not is_gap(elapsed, self._sample_time)
-        return bool(is_next and moved <= fastest * elapsed)
-
     def load(self, settings: Settings, estimate: Array) -> Array | None:
         """Return the torque (n,) [N m] that the model lacks; None in the first 0.1 s."""
         if self._count < self.size:

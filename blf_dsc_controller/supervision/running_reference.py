@@ -19,7 +19,11 @@ from blf_dsc_controller.reference.retargeting import plan_stop
 from blf_dsc_controller.reference.terms import remaining
 from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.run import NANOSECOND
-from blf_dsc_controller.supervision.start import PreparedStart, prepared_start
+from blf_dsc_controller.supervision.start import (
+    PreparedStart,
+    can_take_over,
+    prepared_start,
+)
 
 Vector = NDArray[np.float64]
 
@@ -67,18 +71,19 @@ class RunningReference:
         self._prepared = None
 
     def plan_start(
-        self, config: ControllerConfig, q: Vector, dq: Vector
+        self, config: ControllerConfig, q: Vector, dq: Vector, *, again: bool
     ) -> BlendedReference:
         """Return the reference from q (n,) [rad] and dq (n,) [rad/s] on, at t = 0.
 
-        It is the one of `prepare`, once, if the arm rests there.  Raises as that does.
+        It is the one of `prepare`, once, if the arm rests there.  `again`: it is not the
+        first one of this controller.  Raises as `prepare` does.
         """
         prepared = self._prepared
         self._prepared = None
         bound = self._controller.bound_at(0.0)
         if prepared is not None and prepared.fits(config, bound, q, dq):
             return prepared.motion
-        return plan_start(config, bound, q, dq)
+        return plan_start(config, bound, q, dq, again=again)
 
     def plan_resumption(
         self, config: ControllerConfig, stamp: int, q: Vector, dq: Vector
@@ -96,6 +101,22 @@ class RunningReference:
             return plan_resumption(config, bound, q, dq, vector, t)
         except (StartError, MotionError):
             return None
+
+    def as_planned(
+        self, config: ControllerConfig, stamp: int, q: Vector, dq: Vector
+    ) -> BlendedReference | None:
+        """Return the reference as it is, None if the arm is too far from it.
+
+        The arguments are those of `plan_resumption`.
+        """
+        t = self.time_of(stamp)
+        bound = self._controller.bound_at(t)
+        vector = self._controller.reference_vector
+        if stamp <= self.last_stamp:
+            return None
+        if not can_take_over(config, bound, q, dq, vector, t):
+            return None
+        return BlendedReference(vector, self.settled)
 
     def start_at(self, stamp: int, config: ControllerConfig, q: Vector) -> None:
         """Let the time begin at a stamp [ns], at which the arm is at q (n,) [rad]."""

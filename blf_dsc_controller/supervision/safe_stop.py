@@ -10,6 +10,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.model_torque import model_torque
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.stop_speed import StopSpeed
@@ -63,7 +64,7 @@ class SafeStop:
         """Begin the ramp of a stop at a speed [rad/s], the largest of a joint."""
         self._speed.begin(speed)
         self._swings.begin()
-        load = self._load_at_stop(reason) if was_running else self._samples.disturbance
+        load = self._load_at_stop(reason) if was_running else self._torque.load.copy()
         reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
         self._torque.begin_ramp(
             safety.stop_ramp,
@@ -76,6 +77,22 @@ class SafeStop:
         """Begin the ramp of a law that leaves command in order."""
         self._swings.begin()
         self._torque.begin_ramp(safety.deactivation_ramp, self._held.load())
+
+    def begin_anew(self, safety: Safety, load: Vector) -> None:
+        """Begin the ramp of a law that forgets what it has learned, with this load (n,) [N m]."""
+        self._swings.begin()
+        self._torque.begin_ramp(safety.stop_ramp, load)
+
+    def carried(self, safety: Safety) -> Vector | None:
+        """Return the load (n,) [N m] besides the initial estimate that the safe torque carries.
+
+        None: it holds none, or the arm has not shown that it does.
+        """
+        if safety.torque != 'hold_gravity' or not self._torque.carries:
+            return None
+        settings, q = self._controller.settings, self._torque.last.q
+        held = model_torque(settings, self._samples.estimate, q) + self._torque.load
+        return held - model_torque(settings, settings.initial_estimate, q)
 
     def advance(self, safety: Safety, dt: float) -> Vector | None:
         """Return the torque (n,) [N m] `dt` [s] later; None before a usable state."""

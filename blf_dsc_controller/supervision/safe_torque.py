@@ -122,6 +122,11 @@ class SafeTorque:
         """Whether each joint (n,) has swung under the damping since the ramp began."""
         return self._swing.has_swung
 
+    @property
+    def carries(self) -> bool:
+        """Whether `load` is what the arm has shown that its commands carry."""
+        return self._observes and self._reached
+
     def begin_ramp(
         self,
         duration: float,

@@ -53,19 +53,41 @@ class Starting:
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state.
 
-        A law in command goes on to carry what it carries besides the model.
+        The law goes on to carry what it carries besides the model, or the safe torque does.
         """
         command = self._command
         command.note(EventType.RESET)
+        load = self._carried()
         command.reference.resumable = False
         command.controller.reset()
         self._loads.forget()
-        load = self._takeover.carried  # of a reset just before
-        if command.supervisor.running:
-            load = command.held.load_before_learning()
         command.samples.keep()
         self._start_over()
         self._takeover.carried = load
+        if load is not None:
+            command.safe_stop.begin_anew(command.config.safety, load)
+
+    def _carried(self) -> Vector | None:
+        """Return the load (n,) [N m] besides the initial estimate that is carried now, if any."""
+        command = self._command
+        if command.supervisor.running:
+            return command.held.load_before_learning()
+        if command.supervisor.phase is Phase.STARTING:
+            return self._takeover.carried  # of a reset just before
+        if not command.commanding or command.silenced:
+            return None
+        return command.safe_stop.carried(command.config.safety)
+
+    def forget_load_after_gap(self, stamp: int, measurement: Vector) -> None:
+        """Carry nothing on in a state that does not follow the last one: others may hold it."""
+        command = self._command
+        fastest, period = (
+            command.config.safety.velocity_limit,
+            command.config.sample_time,
+        )
+        q = measurement[: len(command.config.joints)]
+        if not command.safe_torque.last.leads_to(stamp, q, fastest, period):
+            self._takeover.carried = None
 
     def prepare(self, positions: Vector) -> None:
         """Plan the start from rest at `positions` (n,) [rad], before the first state.

@@ -21,8 +21,8 @@ class Takeover:
 
     Attributes:
         acting: torque (n,) [N m] by which another node holds the arm; None: none does.
-        carried: load (n,) [N m] of a law that was reset in command, which it goes on to carry
-            if nothing happens before it starts; None: it begins with its estimates.
+        carried: load (n,) [N m] that acts at a reset, which the law goes on to carry; None: it
+            begins with its estimates.
     """
 
     def __init__(
@@ -57,10 +57,12 @@ class Takeover:
             motion = reference.plan_resumption(config, stamp, q, dq)
         resumed = motion is not None
         if motion is None:
-            motion = reference.plan_start(config, q, dq)
+            again = commanded is not None
+            motion = reference.plan_start(config, q, dq, again=again)
         self._controller.reference_vector = motion.vector
         self._begin_at_acting(q)
-        self._go_on_carrying(config, stamp, q)
+        if self.carried is not None:
+            self._begin_with_load(self.carried)
         if commanded is None:
             check_first_torque(self._controller, config, measurement, self.acting)
         if not resumed:
@@ -77,10 +79,14 @@ class Takeover:
     ) -> bool:
         """Return to the running reference; return whether the arm is near enough for that.
 
-        The arguments are those of `start`.
+        The arguments are those of `start`.  If the sample before was the first one, its plan
+        may have taken all that time: another would take it again, and the law go on blind.
         """
         q, dq, _ = measurement.reshape(3, -1)
-        motion = self._reference.plan_resumption(config, stamp, q, dq)
+        reference = self._reference
+        has_just_planned = self._controller.samples == 1
+        way = reference.as_planned if has_just_planned else reference.plan_resumption
+        motion = way(config, stamp, q, dq)
         if motion is None:
             return False
         self._controller.state.samples[0] = 0.0
@@ -93,12 +99,6 @@ class Takeover:
             return
         self._begin_with_load(self._held.load_of(self.acting, q))
         self._controller.take_over(self.acting, q)
-
-    def _go_on_carrying(self, config: ControllerConfig, stamp: int, q: Vector) -> None:
-        """Let the law begin with the load that was carried until a reset, if any."""
-        fastest = config.safety.velocity_limit
-        if self.carried is not None and self._held.recent.leads_to(stamp, q, fastest):
-            self._begin_with_load(self.carried)
 
     def _begin_with_load(self, load: Vector) -> None:
         """Let d^3 begin with a load (n,) [N m]."""
