@@ -28,6 +28,7 @@ from blf_dsc_controller.commissioning import files, simulated
 from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
 from blf_dsc_controller.commissioning.chosen import kept_stop
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
+from blf_dsc_controller.commissioning.findings import findings_of
 from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
 from blf_dsc_controller.commissioning.own_loop import REPEATS
 from blf_dsc_controller.commissioning.page import sentences
@@ -42,7 +43,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
@@ -285,6 +286,23 @@ def test_inertia_and_lags_are_found():
     assert findings.rate == pytest.approx(1000.0)
     assert findings.lost == 0.0
     assert findings.jitter < 1e-12  # s, of rounding
+
+
+def test_friction_is_not_taken_for_a_lag_of_the_drives():
+    """Of an elastic arm with drives of 2.2 ms, whose friction is a spring with hysteresis.
+
+    At 2 to 5 Hz it asks for more than the inertia does, and turns D by up to half a turn.
+    """
+    loop = true_loop(found().start, found().loops.inertia)
+    timing = Timing(1e-3, delay=2, drive_lag=2.2e-3)
+    (response,) = found().responses
+    s = 2j * np.pi * response.frequency
+    free = arm_response(loop.links, loop.joints, timing, s)[0]
+    rubbed = np.linalg.inv(free) + (600.0 + 600.0j) * np.diag([1.0, 0.2])
+    position = np.linalg.inv(rubbed)
+    run, _ = simulated.measured(planned(), ARM)
+    seen = findings_of([run], [response._replace(position=position)])
+    assert seen.drive_lag == pytest.approx(4.7e-3, abs=1e-3)  # with half of a sample
 
 
 def test_steps_of_the_encoders_are_found_and_told():
@@ -705,6 +723,97 @@ def test_joint_whose_inertia_friction_hides_is_not_trusted():
     assert 'joints that stick' in told
     assert '--prove' in told
     assert 'stick' not in '\n'.join(sentences(seen))
+
+
+def test_inertia_that_fits_with_the_longest_lag_alone_is_not_believed():
+    """Of 1.8 + 1.5 kg m^2 the fit made 0.8, with the 30 ms that are tried at most.
+
+    What the file assumes stays, and the bound counts what may be missing.
+    """
+    seen = rubbing()
+    assert seen.findings.unfit.tolist() == [[True, False]]
+    assert np.isnan(seen.findings.inertia[0])
+    # the phase at higher frequencies shows the lag: a sample, and half of one for the hold
+    assert seen.findings.drive_lag == pytest.approx(1.5e-3, abs=1e-3)
+    assert seen.parameters()['robot.lag'] < 1e-3
+    assert seen.unseen[0] > STUCK.truth.rotor_inertia[0] - ROTORS[0]
+    told = '\n'.join(sentences(seen))
+    assert 'joint1: an inertia would fit best with a lag of 30 ms, the longest' in told
+    assert 'friction hides the inertia of joint2:' in told
+    assert not found().findings.unfit.any()
+    assert 'would fit best' not in '\n'.join(sentences(found()))
+
+
+def at_the_tool(**given):
+    """Return the moving arm with a bound of 5 mm at the end of its second link."""
+    moves = flatten(moving())
+    own = {name: moves[name] for name in moves if name.startswith('reference.')}
+    tool = (
+        '<link name="tool" /><joint name="flange" type="fixed"><parent link="link2" />'
+        '<child link="tool" /><origin xyz="1 0 0" /></joint></robot>'
+    )
+    values = {
+        'robot.urdf': ROBOT['robot.urdf'].replace('</robot>', tool),
+        'robot.tip': 'tool',
+        'barrier.tool_bound': 0.005,
+    }
+    return {**GIVEN, **own, **values, **given}
+
+
+def stiff(before, friction=None):
+    """Return the commissioning of an arm that bears twenty times the gains, for a file."""
+    seen = found()
+    choice = seen.choice._replace(gains=seen.choice.gains.scaled(20.0))
+    friction = seen.friction if friction is None else np.array(friction)
+    return seen._replace(before=before, choice=choice, friction=friction)
+
+
+def test_bound_at_the_tool_is_widened_as_those_of_the_joints_are():
+    """By friction of which the file knows nothing, and shared out by the same errors."""
+    config = build(ControllerConfig, at_the_tool())
+    bounds = []
+    for friction in (None, (3.0, 1.5), (3.0, 6.0)):
+        seen = stiff(config, friction)
+        values = seen.parameters()
+        assert 'barrier.bound' not in values
+        written = build(ControllerConfig, at_the_tool(**values))
+        assert written == seen.config
+        bounds.append(written.barrier)
+        errors = expected_errors(written, settings_of_config(written))
+        used = (errors.unmodelled + errors.pick_up) / written.barrier.bound
+        assert 0.85 < used.max() < 0.96  # 1.1 times as wide, in two digits
+        told = (
+            'barrier.tool_bound is widened for these errors: '
+            f'{written.barrier.tool_bound:g} m instead of 0.005'
+        )
+        assert any(told in each for each in sentences(seen))
+    wide, rubbed, second = bounds
+    assert 0.005 < wide.tool_bound < rubbed.tool_bound
+    shares = [each.bound[1] / each.bound[0] for each in (rubbed, second)]
+    assert shares[1] > 1.5 * shares[0]  # the second joint rubs four times as much
+
+
+def test_bound_at_the_tool_stays_where_it_is_wide_enough():
+    """The bounds of the joints follow from it by the chosen gains, as read from the file."""
+    given = at_the_tool(**{'barrier.tool_bound': 0.1})
+    seen = stiff(build(ControllerConfig, given))
+    values = seen.parameters()
+    assert 'barrier.tool_bound' not in values
+    assert build(ControllerConfig, {**given, **values}) == seen.config
+    assert seen.config.barrier.bound != seen.before.barrier.bound
+    assert not any('is widened' in each for each in sentences(seen))
+
+
+def test_bound_at_the_tool_that_cannot_be_widened_is_refused():
+    """A tenth of the reach bounds nothing; nor is a bound of joints overruled beside it."""
+    config = build(ControllerConfig, at_the_tool())
+    with pytest.raises(
+        BlfDscError, match=r'barrier\.tool_bound: .* m, which bounds nothi'
+    ):
+        stiff(config, (30.0, 15.0)).parameters()
+    both = at_the_tool(**{'barrier.bound': (0.001, 0.001)})
+    with pytest.raises(BlfDscError, match=r'drop barrier\.bound, which then follows'):
+        stiff(build(ControllerConfig, both)).parameters()
 
 
 def test_what_friction_and_inertia_do_to_the_gains_is_told():

@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.tuning import gains_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
-from blf_dsc_controller.configuration.plausibility import widest_bound
+from blf_dsc_controller.configuration.plausibility import (
+    widest_at_tool,
+    widest_bound,
+)
 from blf_dsc_controller.configuration.schema import Value, change, flatten
+from blf_dsc_controller.configuration.tool_bound import (
+    ANGLE,
+    POSITION,
+    joint_bounds,
+)
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.expected_errors import expected_errors
@@ -30,6 +38,10 @@ FOLLOWED = (
 )
 """Gains of the law that are always those of the joints, whatever a file gives."""
 
+_BOUNDS = 'barrier.bound', 'barrier.initial_bound'  # not of gains, with one at the tool
+
+_SOFT = 'noise or friction hide the response: measure again with a larger --torque or --travel'
+
 _ROOM = 1.1  # bound over the errors to expect
 
 
@@ -39,8 +51,19 @@ def with_gains(
     """Return a configuration with values, and what follows from them, as if read from a file.
 
     `values` have `feedback.joint_stiffness` and `feedback.joint_damping`, and may have
-    `robot.lag` and `robot.rotor_inertia`.
+    `robot.lag` and `robot.rotor_inertia`.  Bounds of joints that follow from one at the tool
+    follow again.
     """
+    changed = _with_gains(config, values)
+    if 'barrier.bound' in values or not _follow_from_tool(config):
+        return changed
+    return _with_gains(config, {**values, 'barrier.bound': _bounds_of_tool(changed)})
+
+
+def _with_gains(
+    config: ControllerConfig, values: Mapping[str, Value]
+) -> ControllerConfig:
+    """Return a configuration with values, and what follows from them but for the bounds."""
     names = 'feedback.joint_stiffness', 'feedback.joint_damping'
     gains = JointGains(*(np.array(values[name], float) for name in names))
     arm, _ = design_of(config)
@@ -51,12 +74,27 @@ def with_gains(
     follows = arm._replace(joints=gains, stiffness=1.0, lag=lag, rotors=rotors)
     after = gains_of(follows, bound)
     present = flatten(config)
+    of_tool = _BOUNDS if config.barrier.bounds_tool else ()
     followed = {
         name: value
         for name, value in after.items()
-        if name in FOLLOWED or (name in present and present[name] == before[name])
+        if name in FOLLOWED
+        or (name in present and present[name] == before[name] and name not in of_tool)
     }
     return change(config, {**followed, **values})
+
+
+def _follow_from_tool(config: ControllerConfig) -> bool:
+    """Whether the bounds of the joints are those that follow from one at the tool."""
+    barrier = config.barrier
+    return barrier.bounds_tool and barrier.bound == _bounds_of_tool(config)
+
+
+def _bounds_of_tool(config: ControllerConfig) -> tuple[float, ...]:
+    """Return the bounds (n,) [rad] of the joints that follow from one at the tool."""
+    arm, _ = design_of(config)
+    bounds = joint_bounds(flatten(config), config.robot, arm.chain, arm.parameters)
+    return config.barrier.bound if bounds is None else bounds
 
 
 def kept_stop(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
@@ -75,19 +113,19 @@ def kept_stop(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
 def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     """Return the bounds wide enough for the errors to expect, by dotted name.
 
-    Friction may act while a load is picked up, so the errors of both add.  None, if the
-    bounds of the joints follow from one at the tool.  Funnels that are given begin at these
-    bounds at least; others follow.  Raises BlfDscError if a joint needs one that bounds
-    nothing.
+    Friction may act while a load is picked up, so the errors of both add.  Where the bounds of
+    the joints follow from one at the tool, it is that one.  Funnels that are given begin at
+    these bounds at least; others follow.  Raises BlfDscError if a joint or the tool needs one
+    that bounds nothing, or joints one beside a bound at the tool from which it does not follow.
     """
     barrier = config.barrier
-    if barrier.bounds_tool:
-        return {}
     errors = expected_errors(config, settings_of_config(config))
     least = _ROOM * (errors.unmodelled + errors.pick_up)
     if (least <= barrier.bound).all():
         return {}
     _check_bound(config, least)
+    if barrier.bounds_tool:
+        return _kept_at_tool(config, least)
     wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
     values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
     arm, _ = design_of(config)
@@ -96,6 +134,37 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
         starts = np.array(barrier.initial_bound)
         starts = np.where(starts > 0.0, np.maximum(starts, wide), 0.0)
         values['barrier.initial_bound'] = tuple(starts.tolist())
+    return values
+
+
+def _kept_at_tool(config: ControllerConfig, least: Floats) -> dict[str, Value]:
+    """Return the bound at the tool from which bounds of the joints of `least` (n,) follow."""
+    barrier = config.barrier
+    over = least / barrier.bound
+    if not _follow_from_tool(config):
+        j = int(over.argmax())
+        raise BlfDscError(
+            f'barrier.bound: {config.joints[j]} would be off by up to {least[j] / _ROOM:.2g} rad '
+            f'with the gains that have the margin, past its bound of {barrier.bound[j]:g} rad: '
+            'drop barrier.bound, which then follows from that at the tool and is widened with it'
+        )
+    arm, _ = design_of(config)
+    values: dict[str, Value] = {}
+    for name, unit, bound, widest in zip(
+        (POSITION, ANGLE),
+        ('m', 'rad'),
+        (barrier.tool_bound, barrier.tool_angle_bound),
+        widest_at_tool(arm.chain),
+        strict=True,
+    ):
+        wide = float(f'{bound * over.max():.2g}')
+        if wide > max(bound, widest):
+            raise BlfDscError(
+                f'{name}: with the gains that have the margin it would be {wide:g} {unit}, '
+                f'which bounds nothing: {_SOFT}'
+            )
+        if wide > bound:
+            values[name] = wide
     return values
 
 
@@ -114,6 +183,5 @@ def _check_bound(config: ControllerConfig, least: Floats) -> None:
             unit = 'm' if kind == 'prismatic' else 'rad'
             raise BlfDscError(
                 f'the gains that have the margin are too soft for any bound: {joint} would be off '
-                f'by up to {needed / _ROOM:.2g} {unit}. Noise or friction hide the response: '
-                'measure again with a larger --torque or --travel'
+                f'by up to {needed / _ROOM:.2g} {unit}. {_SOFT[0].upper()}{_SOFT[1:]}'
             )

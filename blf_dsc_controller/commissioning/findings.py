@@ -6,10 +6,16 @@ diagonal what each joint asks for while the others are held, with a lag on the w
 
     D_jj = (J (i omega)^2 + F i omega) e^(i omega tau)
 
-so inertia J, damping F (friction in motion acts like it) and lag tau follow by least
-squares.  Constant friction f, at speeds v, dissipates what a damping f <|v|> / <v^2> does.
-An inertia that asks for less than the damping is not seen.  The lag of velocities is that
-of G_v against i omega G_y.  Where a joint is free, gears show as an antiresonance, at
+so inertia J and damping F (friction in motion acts like it) follow by least squares, tau with
+them.  That lag is no more than a part of the fit: at these frequencies friction turns D by more
+than drives do.  Theirs is taken from higher ones, where gears and what carries the arm answer in
+phase or against it, below and above their resonances: but for the damping, D is real without lag,
+
+    Im(D_jj e^(-i omega tau)) = F omega
+
+An inertia that asks for less than the damping is not seen, nor is one that fits best with
+the longest lag that is tried: friction and noise turn D by as much.  The lag of velocities is
+that of G_v against i omega G_y.  Where a joint is free, gears show as an antiresonance, at
 which the link absorbs what its motor does, and a resonance above it.
 """
 
@@ -31,7 +37,12 @@ Complex = NDArray[np.complex128]
 _RIGID = (2.0, 12.0)  # Hz, of the fit
 _BELOW, _FEWEST = 0.35, 5.0  # of a resonance, up to which an arm is rigid; Hz
 _SEEN = 1.0  # of the damping, what inertia asks for at the fastest of these
-_LAGS = np.linspace(0.0, 0.03, 301)  # s
+LONGEST_LAG = 0.03
+"""Lag from a torque to its motion, up to which one is looked for [s]."""
+
+_LAGS = np.linspace(0.0, LONGEST_LAG, 301)  # s
+_PHASED = (8.0, 40.0)  # Hz, of the lag of the drives
+_OUT_OF_PHASE = 0.1  # mean square of what is left of D, that is believed to be a lag
 _SHOWN = 10.0  # times the doubt of a response, from which it shows resonances
 _PEAK = 1.5  # over its neighbours
 _APART = 16  # frequencies to either side of a peak, that it is compared with
@@ -49,13 +60,14 @@ class Resonance(NamedTuple):
 class Findings(NamedTuple):
     """What was measured of an arm, over its postures."""
 
-    inertia: (
-        Floats  # (n,) kg m^2, the largest with the others held; nan: friction hides it
-    )
+    inertia: Floats  # (n,) kg m^2, the largest with the others held; nan: not seen
     inertias: Floats  # (k, n) likewise in each run
     damping: Floats  # (n,) N m s/rad, the mean
     friction: Floats  # (n,) N m, the largest: constant, it takes as much power
-    hidden: Floats  # (k, n) kg m^2, inertias up to which friction hides one; 0: none
+    hidden: (
+        Floats  # (k, n) kg m^2, inertias up to which one would not be seen; 0: it is
+    )
+    unfit: NDArray[np.bool_]  # (k, n) whether the longest lag that is tried fits best
     drive_lag: float  # s, from a torque to the motion, sampling included; nan likewise
     velocity_lag: float  # s, of velocities against positions
     resonances: tuple[Resonance, ...]
@@ -88,9 +100,11 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
     fits = [
         _rigid_fit(each, found) for each, found in zip(responses, peaks, strict=True)
     ]
-    inertia, damping, lag = (np.array(each) for each in zip(*fits, strict=True))
-    hidden = _is_hidden(inertia, damping)
-    inertia[hidden] = lag[hidden] = np.nan
+    inertia, damping, lag, asked = (np.array(each) for each in zip(*fits, strict=True))
+    unfit = lag >= LONGEST_LAG
+    by_friction = _SEEN * damping / (2.0 * np.pi * _RIGID[1])
+    hidden = np.where(unfit, asked, np.where(inertia < by_friction, by_friction, 0.0))
+    inertia[hidden > 0.0] = np.nan
     friction = np.maximum(
         damping.clip(0.0) * np.array([each.speed for each in responses]),
         np.array([each.friction for each in responses]),
@@ -102,8 +116,9 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
         inertias=inertia,
         damping=damping.mean(axis=0),
         friction=friction.max(axis=0),
-        hidden=np.where(hidden, _hidden_by(damping), 0.0),
-        drive_lag=_middle(lag),
+        hidden=hidden,
+        unfit=unfit,
+        drive_lag=_drive_lag(responses),
         velocity_lag=float(np.median([_velocity_lag(each) for each in responses])),
         resonances=tuple(each for found in peaks for each in found),
         rate=1.0 / usual,
@@ -118,23 +133,21 @@ def rubs(response: Response, damping: Floats) -> bool:
 
     Those with which it was measured have `damping` (n,) [N m s/rad].
     """
-    _, found, _ = _rigid_fit(response, _resonances(response, 0))
-    return bool((found > damping).any())
+    fit = _rigid_fit(response, _resonances(response, 0))
+    return bool((fit.damping > damping).any())
 
 
-def _is_hidden(inertia: Floats, damping: Floats) -> NDArray[np.bool_]:
-    return np.asarray(inertia < _hidden_by(damping))
+class _RigidFit(NamedTuple):
+    """What joints (n,) look like while the arm is rigid."""
+
+    inertia: Floats  # kg m^2
+    damping: Floats  # N m s/rad
+    lag: Floats  # s
+    asked: Floats  # kg m^2, that would ask for all that is seen at the fastest of these
 
 
-def _hidden_by(damping: Floats) -> Floats:
-    """Return the inertias [kg m^2] up to which a damping [N m s/rad] hides one."""
-    return np.asarray(_SEEN * damping / (2.0 * np.pi * _RIGID[1]))
-
-
-def _rigid_fit(
-    response: Response, peaks: Sequence[Resonance]
-) -> tuple[Floats, Floats, Floats]:
-    """Return inertia, damping and lag (n,) of the joints, below the lowest resonance."""
+def _rigid_fit(response: Response, peaks: Sequence[Resonance]) -> _RigidFit:
+    """Return what the joints look like below the lowest resonance."""
     peak = min((each.frequency for each in peaks), default=np.inf)
     low, high = _RIGID[0], max(_FEWEST, min(_RIGID[1], _BELOW * peak))
     rows = (response.frequency >= low) & (response.frequency <= high)
@@ -142,7 +155,10 @@ def _rigid_fit(
     D: Complex = np.asarray(np.linalg.inv(response.position[rows]), complex)
     joints = [_fit_of_joint(s, D[:, j, j]) for j in range(D.shape[-1])]
     J, F, tau = np.array(joints).T
-    return J, F, tau
+    fast = s.size // 2
+    own = np.diagonal(D, axis1=1, axis2=2)[fast:]
+    asked = np.median(np.abs(own / s[fast:, None] ** 2), axis=0)
+    return _RigidFit(J, F, tau, np.asarray(asked))
 
 
 def _fit_of_joint(s: Complex, D: Complex) -> tuple[float, float, float]:
@@ -167,9 +183,33 @@ def _largest(values: Floats) -> Floats:
     return np.where(np.isinf(known), np.nan, known)
 
 
-def _middle(values: Floats) -> float:
-    known = values[~np.isnan(values)]
+def _drive_lag(responses: Sequence[Response]) -> float:
+    """Return the lag [s] from torques to motion, in the median; nan: no joint shows it."""
+    found = [_lags_by_phase(each) for each in responses]
+    lags, left = (np.concatenate(each) for each in zip(*found, strict=True))
+    known = lags[(left < _OUT_OF_PHASE) & (lags < LONGEST_LAG)]
     return float(np.median(known)) if known.size else float('nan')
+
+
+def _lags_by_phase(response: Response) -> tuple[Floats, Floats]:
+    """Return the lag (n,) [s] of each joint, and the mean square (n,) of what is left of D.
+
+    It is a share of D: a half, if its phase is any.
+    """
+    low, high = _PHASED
+    rows = (response.frequency >= low) & (response.frequency <= high)
+    rate = 2.0 * np.pi * response.frequency[rows]
+    own = np.diagonal(np.linalg.inv(response.position[rows]), axis1=1, axis2=2)
+    turns = np.exp(-1j * rate * _LAGS[:, None])  # (lags, f)
+    lags, left = [], []
+    for D in own.T:
+        across = (turns * D).imag / np.abs(D)
+        damped = rate / np.abs(D)
+        F = (across @ damped / (damped @ damped)).clip(0.0)
+        squares = ((across - F[:, None] * damped) ** 2).mean(axis=1)
+        lags.append(_LAGS[squares.argmin()])
+        left.append(squares.min())
+    return np.array(lags), np.array(left)
 
 
 def _velocity_lag(response: Response) -> float:

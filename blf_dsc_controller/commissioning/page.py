@@ -18,8 +18,10 @@ from blf_dsc_controller.commissioning.commissioning import (
     Commissioned,
     Planned,
 )
+from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
+from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.supervision.expected_errors import expectation
 
 Floats = NDArray[np.float64]
@@ -98,6 +100,7 @@ def sentences(found: Commissioned) -> Iterator[str]:
             f'velocities are {1e3 * arm.velocity_lag:.2g} ms old'
         )
     choice = found.choice
+    yield from _of_hidden(found)
     yield from _of_friction(found)
     limit = choice.margin
     joint = found.joints[limit.joint]
@@ -138,26 +141,41 @@ def sentences(found: Commissioned) -> Iterator[str]:
     )
 
 
-def _of_friction(found: Commissioned) -> Iterator[str]:
-    """Yield of which joints friction hides the inertia, or adds damping that motion lacks."""
+def _of_hidden(found: Commissioned) -> Iterator[str]:
+    """Yield of which joints no inertia is seen, why, and how much there may be."""
     names = np.array(found.joints)
     hidden = np.isnan(found.findings.inertia)
-    if hidden.any():
+    unfit = hidden & found.findings.unfit.any(axis=0)
+    stuck = hidden & ~unfit
+    if stuck.any():
         yield (
-            f'friction hides the inertia of {", ".join(names[hidden])}: that of the URDF is used, '
+            f'friction hides the inertia of {", ".join(names[stuck])}: that of the URDF is used, '
             'and the margin is that of joints that stick, not that of joints that slide: prove '
             'the gains (--prove), or take half of feedback.stiffness and a wider bound'
         )
-        unseen = ', '.join(
-            f'{joint} {more:.2g}'
-            for joint, more in zip(found.joints, found.unseen, strict=True)
-            if more > 0.0
+    if unfit.any():
+        yield (
+            f'{", ".join(names[unfit])}: an inertia would fit best with a lag of '
+            f'{1e3 * LONGEST_LAG:g} ms, the longest that is tried, so it is not believed and '
+            'that of the URDF is used: friction or noise hide it, or the drives are as late. '
+            'Measure again with a larger --torque or --travel, and prove the gains (--prove)'
         )
-        if unseen:
-            yield (
-                f'so much more inertia would not show, and the errors to expect count it: {unseen} '
-                'kg m^2'
-            )
+    unseen = ', '.join(
+        f'{joint} {more:.2g}'
+        for joint, more in zip(found.joints, found.unseen, strict=True)
+        if more > 0.0
+    )
+    if unseen:
+        yield (
+            f'so much more inertia would not show, and the errors to expect count it: {unseen} '
+            'kg m^2'
+        )
+
+
+def _of_friction(found: Commissioned) -> Iterator[str]:
+    """Yield in which joints friction adds damping that motion lacks, or is not in the file."""
+    names = np.array(found.joints)
+    hidden = np.isnan(found.findings.inertia)
     rubbing = ~hidden & (found.findings.damping > found.choice.gains.damping)
     if rubbing.any():
         yield (
@@ -186,17 +204,12 @@ def _of_friction(found: Commissioned) -> Iterator[str]:
 
 def _of_bound(found: Commissioned) -> Iterator[str]:
     """Yield which bounds are wider than they were, and what softer gains mean for others."""
-    bounds = found.config.barrier.bound, found.before.barrier.bound
-    wider = [
-        f'{joint} {after:g} rad instead of {before:g}'
-        for joint, after, before in zip(found.joints, *bounds, strict=True)
-        if after > before
-    ]
-    if wider:
-        yield (
-            f'barrier.bound is widened for these errors: {"; ".join(wider)}. With less '
-            'robot.payload less will do'
-        )
+    for name, wider in _wider(found).items():
+        if wider:
+            yield (
+                f'{name} is widened for these errors: {"; ".join(wider)}. With less '
+                'robot.payload less will do'
+            )
     share = found.choice.gains.stiffness / found.start.stiffness
     if share.min() < _SOFTER:
         yield (
@@ -205,6 +218,28 @@ def _of_bound(found: Commissioned) -> Iterator[str]:
             'friction, grow by as much; a bound that was given for the stiffer gains may be too '
             'narrow'
         )
+
+
+def _wider(found: Commissioned) -> dict[str, list[str]]:
+    """Return by the name of a bound what is wider than it was: of the tool, or of each joint."""
+    after, before = found.config.barrier, found.before.barrier
+    if before.bounds_tool:
+        bounds = {
+            POSITION: ('m', after.tool_bound, before.tool_bound),
+            ANGLE: ('rad', after.tool_angle_bound, before.tool_angle_bound),
+        }
+        return {
+            name: [f'{wide:g} {unit} instead of {usual:g}'] if wide > usual else []
+            for name, (unit, wide, usual) in bounds.items()
+        }
+    wider = [
+        f'{joint} {wide:g} rad instead of {usual:g}'
+        for joint, wide, usual in zip(
+            found.joints, after.bound, before.bound, strict=True
+        )
+        if wide > usual
+    ]
+    return {'barrier.bound': wider}
 
 
 def errors_table(joints: Sequence[str], errors: Errors) -> str:

@@ -202,18 +202,24 @@ def _of_errors(config: Checked) -> Iterator[_Doubt]:
             )
 
 
+def widest_at_tool(chain: Chain) -> tuple[float, float]:
+    """Return the largest bounds [m, rad] on the error of a tool by the reach of its arm."""
+    return _WIDEST * chain.reach or math.inf, _QUARTER
+
+
 def _of_tool(config: Checked, chain: Chain) -> Iterator[_Doubt]:
     """Check the bounds at the tool against the reach of the arm."""
     reach = chain.reach
     bound = config.barrier.tool_bound
-    if bound > _WIDEST * reach > 0.0:
+    widest, turned = widest_at_tool(chain)
+    if bound > widest:
         yield _Doubt(
             POSITION,
             f'got {bound:g} m, more than a tenth of the reach, {reach:.3g} m: is it in mm? '
             f'Give {1e-3 * bound:g}',
         )
     angle = config.barrier.tool_angle_bound
-    if angle > _QUARTER:
+    if angle > turned:
         yield _Doubt(
             ANGLE, f'got {angle:g} rad, more than a quarter turn: {_of_degrees(angle)}'
         )

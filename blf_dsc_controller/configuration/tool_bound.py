@@ -7,7 +7,8 @@ the arm turns a torque d that its model lacks into errors in proportion to M^-1 
 friction and the residual floor in d, or the weight of the rated payload.  Where each
 joint has a stiffness of its own, it is d over that, with the torque of a payload that
 moves: a first joint bears no weight, but a load that is accelerated.  So all joints use
-about the same part of their bounds, which leaves the most room.
+about the same part of their bounds, which leaves the most room.  What commissioning has measured
+of friction, and not seen of inertia, is in d.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ Floats = NDArray[np.float64]
 POSITION = 'barrier.tool_bound'
 ANGLE = 'barrier.tool_angle_bound'
 
+_FRICTION, _UNSEEN = 'commissioning.friction', 'commissioning.unseen_inertia'
+
 _POSTURES = 40
-REVERSAL = 0.75
+_REVERSAL = 0.75
 """Of Coulomb friction, an error of it: half of it too much at breakaway, with either sign."""
 
 _MEAN = 0.5
@@ -44,6 +47,16 @@ _MEAN = 0.5
 _DOWN = 0.9995  # four digits of a joint bound round up by less
 _FINEST = 1e-6  # rad, a sixth of a step of a 20 bit encoder
 _ROUNDED = 1.0 + 1e-9
+
+
+def at_reversal(known: Floats, measured: tuple[float, ...]) -> Floats:
+    """Return the torque (n,) [N m] that friction may add at a reversal.
+
+    The law compensates what is `known` (n,) [N m]; what was `measured` beyond it (n,), or nothing,
+    has either sign.
+    """
+    friction = np.maximum(known, measured or 0.0)
+    return np.asarray(_REVERSAL * (friction + 2.0 * (friction - known)))
 
 
 def is_given(values: Mapping[str, Any]) -> bool:
@@ -76,20 +89,28 @@ def joint_bounds(
     upper = tuple(values['limits.position_upper'])
     floor = tuple(values['learning.residual_floor'])
     P0 = tuple(values['learning.initial_estimate'])
-    friction = robot.friction(chain)['coulomb']
+    coulomb = robot.friction(chain)['coulomb']
     n = len(chain.joints)
-    lengths = {len(each) for each in (lower, upper, floor, friction)}
+    seen, unseen = (
+        tuple(values.get(name, ())) or (0.0,) * n for name in (_FRICTION, _UNSEEN)
+    )
+    lengths = {len(each) for each in (lower, upper, floor, coulomb, seen, unseen)}
     if lengths != {n} or len(P0) != base.model.p or n > MOST_JOINTS:
         return None
-    unmodelled = tuple(
-        rms + REVERSAL * coulomb for rms, coulomb in zip(floor, friction, strict=True)
-    )
     region = _region(values, n) or (lower, upper)
     stiffness = _stiffness(values)
     limits = values['limits.acceleration']
     acceleration = tuple(_MEAN * a for a in limits) if stiffness else (0.0,) * n
+    unmodelled = floor + at_reversal(np.array(coulomb), seen)
+    unmodelled += np.array(acceleration) * unseen
     expected = _expected(
-        base, P0, robot.payload, unmodelled, stiffness, acceleration, *region
+        base,
+        P0,
+        robot.payload,
+        tuple(unmodelled.tolist()),
+        stiffness,
+        acceleration,
+        *region,
     )
     k = _scaled(
         _tool(chain, lower, upper),

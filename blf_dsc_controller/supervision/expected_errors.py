@@ -18,7 +18,7 @@ from blf_dsc_controller.arms.linear_loop import Feedback, Joints, Loop, Timing
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.tool_bound import REVERSAL
+from blf_dsc_controller.configuration.tool_bound import at_reversal
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.digits import two_digits
@@ -120,9 +120,8 @@ def _unmodelled(config: ControllerConfig, ddq: Floats) -> Floats:
     """
     robot, measured = config.robot, config.commissioning
     known = np.array(robot.friction(robot.chain(config.joints))['coulomb'])
-    friction = np.maximum(known, measured.friction or 0.0)
     floor = np.array(config.learning.residual_floor)
-    floor += REVERSAL * (friction + 2.0 * (friction - known))
+    floor += at_reversal(known, measured.friction)
     return np.asarray(floor + np.abs(ddq) * np.array(measured.unseen_inertia or 0.0))
 
 
