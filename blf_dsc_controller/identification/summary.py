@@ -367,8 +367,8 @@ def _size_problems(found: Identified, effort: str) -> Iterator[str]:
         yield (
             f'GRAVITY IS MISSING: {share}, so that masses in kg cannot be told from them. If they '
             'are currents, give --gains; if the drives compensate it, --effort without-gravity; '
-            'if the arm is not mounted upright, --gravity; if joints have other zeros or directions '
-            'than in the URDF, as in a DH convention, convert their positions'
+            'if the arm is not mounted upright, --gravity; if joints have other zeros or '
+            'directions than in the URDF, as in a DH convention, convert their positions'
         )
     elif found.gravity > most:
         cause = (
