@@ -206,6 +206,27 @@ def test_joints_in_two_messages_are_checked_each(tmp_path):
     is_the_motion(recording, 2e-3)
 
 
+@pytest.mark.parametrize('others', [(), ('fer_finger_joint1', 'fer_finger_joint2')])
+def test_joints_with_another_prefix_are_told_what_to_type(tmp_path, others):
+    """Every joint needs its name, as those of a Panda, which is called fer now."""
+    names = tuple(f'fer_joint{k}' for k in range(1, 8))
+    encoder = JointStateEncoder((*others, *names))
+    zero = np.zeros(len(others))
+    entries = []
+    for k, stamp in enumerate(stamps_of(TIME)):
+        q, torque = np.append(zero, Q[k]), np.append(zero, TAU[k])
+        entries.append((stamp, bytes(encoder.encode(stamp, q, 0.0 * q, torque))))
+    bag = written(tmp_path / 'bag', entries)
+    _, typed = refused(bag).split('if these are the same joints, give --map ')
+    assert typed.startswith(
+        'panda_joint1=fer_joint1 --map panda_joint2=fer_joint2 --map'
+    )
+    recording = read_recording(
+        bag, PANDA_TEXT, names=NameMap.parse(typed.split(' --map '))
+    )
+    is_the_motion(recording, 1e-6)
+
+
 def test_torques_of_bags_may_have_another_unit(tmp_path):
     bag = states_bag(tmp_path / 'bag', Q, 1e3 * TAU)
     found = read_recording(bag, PANDA_TEXT, names=NameMap.parse(['tau=[Nmm]']))

@@ -126,6 +126,12 @@ def test_joints_with_the_same_fault_are_in_one_note(simple):
     assert mentions(found, f'{PANDA[0]}, {PANDA[5]} did not move')
 
 
+def test_other_zeros_of_joints_are_among_what_may_be_wrong(simple):
+    """Of a public UR10, whose table has two joints shifted by a quarter turn."""
+    (problem,) = problems_of(simple._replace(gravity=-0.2), 'torque')
+    assert 'other zeros or directions than in the URDF' in problem
+
+
 def test_corrected_urdf_that_predicts_worse_than_the_original_is_named(simple):
     errors = simple.score.errors.copy()
     errors[1] = 1.1 * errors[0]

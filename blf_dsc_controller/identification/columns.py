@@ -217,8 +217,8 @@ def pattern_of(names: Sequence[str], columns: Sequence[str]) -> str:
     """Return what chooses exactly these columns: a pattern or numbers."""
     first = names.index(columns[0])
     for found in (
-        f'{_begin(columns)}*',
-        f'*{_begin([name[::-1] for name in columns])[::-1]}',
+        f'{beginning(columns)}*',
+        f'*{beginning([name[::-1] for name in columns])[::-1]}',
         f'{first}:{first + len(columns)}',
     ):
         if set(_matching(names, found, 'q')) == set(columns):
@@ -226,7 +226,7 @@ def pattern_of(names: Sequence[str], columns: Sequence[str]) -> str:
     return '...'
 
 
-def _begin(names: Sequence[str]) -> str:
+def beginning(names: Sequence[str]) -> str:
     """Return the letters with which all names begin."""
     first, last = min(names), max(names)
     differs = (k for k in range(len(first)) if first[k] != last[k : k + 1])

@@ -20,6 +20,7 @@ from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, V
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.bad_values import stand_ins
 from blf_dsc_controller.identification.checks import Group, Motion, checked
+from blf_dsc_controller.identification.columns import beginning
 from blf_dsc_controller.identification.on_disk import blocks_of
 from blf_dsc_controller.identification.recording import (
     GAP,
@@ -288,12 +289,31 @@ def _any(values: Values, size: int) -> bool:
 def _arm_joints(text: str, in_bag: set[str], names: NameMap) -> tuple[str, ...]:
     """Return the joints of the arm: from the root of the URDF to the last that the bag has."""
     ours = in_bag | {our for our, their in names.joints.items() if their in in_bag}
-    arm = Tree.of(text).trunk()
+    trunk = Tree.of(text).trunk()
+    arm = trunk
     while arm and arm[-1] not in ours:
         arm = arm[:-1]
     if not arm:
+        other = _with_another_prefix(trunk, in_bag)
+        remedy = "choose an arm with --tip, or give the bag's names, as in --map joint1=shoulder"
+        if other:
+            remedy = 'if these are the same joints, give ' + ' '.join(
+                f'--map {joint}={name}'
+                for joint, name in zip(trunk, other, strict=True)
+            )
         raise BagError(
-            f'the bag has no joint of the URDF; it names {", ".join(sorted(in_bag))}: choose an '
-            "arm with --tip, or give the bag's names, as in --map joint1=shoulder"
+            f'the bag has no joint of the URDF; it names {", ".join(sorted(in_bag))}: {remedy}'
         )
     return arm
+
+
+def _with_another_prefix(joints: Sequence[str], in_bag: set[str]) -> tuple[str, ...]:
+    """Return names of a bag that differ from those of joints only in how all of them begin."""
+    for begin in range(len(beginning(joints)) + 1) if joints else ():
+        rest = joints[0][begin:]
+        for name in sorted(in_bag):
+            prefix = name.removesuffix(rest)
+            others = tuple(prefix + joint[begin:] for joint in joints)
+            if rest and {*others} <= in_bag:
+                return others
+    return ()

@@ -93,7 +93,7 @@ def resampled(
     if period > _JITTER * LONGEST_PERIOD:
         raise BlfDscError(
             f'the joint states are {period:.3g} s apart; at least one in {LONGEST_PERIOD:g} s is '
-            'needed'
+            f'needed: record them at {1.0 / LONGEST_PERIOD:.0f} Hz or more'
         )
     if period < _FASTEST or time[-1] > _SPARSE * period * time.size:
         raise BlfDscError(

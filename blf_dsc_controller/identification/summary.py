@@ -353,8 +353,8 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
     if not _is_explained(found):
         yield (
             'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
-            'N m (currents need --gains), is --gravity given in the base frame, and was the load '
-            'the same throughout?'
+            'N m (currents need --gains), is --gravity given in the base frame, are the zeros and '
+            'directions of the joints those of the URDF, and was the load the same throughout?'
         )
     yield from _joint_problems(found)
 
@@ -367,7 +367,8 @@ def _size_problems(found: Identified, effort: str) -> Iterator[str]:
         yield (
             f'GRAVITY IS MISSING: {share}, so that masses in kg cannot be told from them. If they '
             'are currents, give --gains; if the drives compensate it, --effort without-gravity; '
-            'if the arm is not mounted upright, --gravity'
+            'if the arm is not mounted upright, --gravity; if joints have other zeros or '
+            'directions than in the URDF, as in a DH convention, convert their positions'
         )
     elif found.gravity > most:
         cause = (
