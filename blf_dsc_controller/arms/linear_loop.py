@@ -102,8 +102,8 @@ class Loop(NamedTuple):
 
         d [N m] is held for a sample; the first n of x are the positions q [rad].
         """
-        A, G, own, sensed = _sampled_arm(self.links, self.joints, self.timing)
-        return _with_law(A, G, own, sensed, self.timing, self.feedback)
+        A, G, sensed = _sampled_arm(self.links, self.joints, self.timing)
+        return _with_law(A, G, sensed, self.timing, self.feedback)
 
     def is_stable(self) -> bool:
         """Return whether the errors decay in all postures."""
@@ -224,97 +224,133 @@ def _damping(links: Floats, joints: Joints, K: Floats) -> Floats:
 
 def _sampled_arm(
     links: Floats, joints: Joints, timing: Timing
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the arm over a sample: x+ = A x + G [tau, d], with q = own x, y = sensed x.
+) -> tuple[Floats, Floats, Floats]:
+    """Return the arm over a sample: x+ = A x + G [tau, d], with y = sensed x.
 
     x has q and q', those of the motors and the torque loop of elastic joints, and the
     torque of the drives.
     """
     k, n, _ = links.shape
-    one = np.eye(n)
-    blocks = 3 if joints.stiffness is None else 6
-    rate = np.zeros((k, blocks * n, blocks * n))
-    push = np.zeros((k, blocks * n, 2 * n))  # of tau and d
-    rows = np.eye(blocks * n).reshape(blocks, n, blocks * n)
+    arm = _rigid_arm if joints.stiffness is None else _elastic_arm
+    rate, push, sensed = arm(links, joints)
+    drive = slice(-n, None)
     lag = max(timing.drive_lag, _SHORTEST)
-    q, dq, drive = rows[0], rows[1], rows[-1]
-    rate[:, :n] = dq
-    if joints.stiffness is None:
-        free = np.linalg.inv(links + np.diag(joints.motors))
-        rate[:, n : 2 * n] = free @ (drive - joints.viscous[:, None] * dq)
-        push[:, n : 2 * n, n:] = free
-        sensed = q
-    else:
-        th, dth, behind = rows[2], rows[3], rows[4]
-        K = joints.stiffness
-        D = _damping(links, joints, K)
-        spring = K[:, None] * (th - q) + D[:, None] * (dth - dq)
-        loop = joints.torque_loop or TorqueLoop(0.0, 0.0)
-        change = (spring - behind) / loop.lag
-        u = (1.0 + loop.gain) * drive - loop.gain * behind - loop.damping * change
-        free = np.linalg.inv(links)
-        rate[:, n : 2 * n] = free @ spring
-        push[:, n : 2 * n, n:] = free
-        rate[:, 2 * n : 3 * n] = dth
-        friction = joints.viscous[:, None] * dth
-        rate[:, 3 * n : 4 * n] = (u - spring - friction) / joints.motors[:, None]
-        rate[:, 4 * n : 5 * n] = change
-        sensed = th if joints.motor_side else q
-    rate[:, -n:] = -drive / lag
-    push[:, -n:, :n] = one / lag
-    size = (blocks + 2) * n
-    whole = np.zeros((k, size, size))
-    whole[:, : blocks * n, : blocks * n] = rate
-    whole[:, : blocks * n, blocks * n :] = push
+    rate[:, drive, drive] = -np.eye(n) / lag
+    push[:, drive, :n] = np.eye(n) / lag
+    size = rate.shape[1]
+    whole = np.zeros((k, size + 2 * n, size + 2 * n))
+    whole[:, :size, :size] = rate
+    whole[:, :size, size:] = push
     from scipy.linalg import expm  # 0.1 s and a pool of threads: only where it is used
 
-    over = expm(timing.period * whole)[:, : blocks * n]
-    return over[..., : blocks * n], over[..., blocks * n :], q, sensed
+    over = expm(timing.period * whole)[:, :size]
+    return over[..., :size], over[..., size:], sensed
+
+
+def _rigid_arm(links: Floats, joints: Joints) -> tuple[Floats, Floats, Floats]:
+    """Return x' = A x + G [tau, d], with y = sensed x, but for the drives: x = [q, q', drive]."""
+    k, n, _ = links.shape
+    q, dq, drive = np.eye(3 * n).reshape(3, n, 3 * n)
+    rate, push = np.zeros((k, 3 * n, 3 * n)), np.zeros((k, 3 * n, 2 * n))
+    free = np.linalg.inv(links + np.diag(joints.motors))
+    rate[:, :n] = dq
+    rate[:, n : 2 * n] = free @ (drive - joints.viscous[:, None] * dq)
+    push[:, n : 2 * n, n:] = free
+    return rate, push, q
+
+
+def _elastic_arm(links: Floats, joints: Joints) -> tuple[Floats, Floats, Floats]:
+    """Return the same for x = [q, q', th, th', s, drive]."""
+    k, n, _ = links.shape
+    q, dq, th, dth, behind, drive = np.eye(6 * n).reshape(6, n, 6 * n)
+    K = np.asarray(joints.stiffness)
+    D = _damping(links, joints, K)
+    spring = K[:, None] * (th - q) + D[:, None] * (dth - dq)
+    loop = joints.torque_loop or TorqueLoop(0.0, 0.0)
+    change = (spring - behind) / loop.lag
+    u = (1.0 + loop.gain) * drive - loop.gain * behind - loop.damping * change
+    friction = joints.viscous[:, None] * dth
+    free = np.linalg.inv(links)
+    rate, push = np.zeros((k, 6 * n, 6 * n)), np.zeros((k, 6 * n, 2 * n))
+    rate[:, :n] = dq
+    rate[:, n : 2 * n] = free @ spring
+    rate[:, 2 * n : 3 * n] = dth
+    rate[:, 3 * n : 4 * n] = (u - spring - friction) / joints.motors[:, None]
+    rate[:, 4 * n : 5 * n] = change
+    push[:, n : 2 * n, n:] = free
+    return rate, push, th if joints.motor_side else q
+
+
+class _Held(NamedTuple):
+    """What the law and the way to the drives keep for the next sample.
+
+    Each is a matrix (n, N) or (k, n, N) that takes it from the whole state x (N,).
+    """
+
+    under_way: tuple[Floats, ...]  # torques, the oldest first, N m
+    y: Floats  # rad
+    v: Floats  # rad/s
+    alpha2: Floats  # rad/s
+    d3: Floats  # N m
+    late: tuple[Floats, ...]  # xi2 behind `damping_lag`, if there is one
+
+    @property
+    def parts(self) -> tuple[Floats, ...]:
+        """All of them, in the order of the state."""
+        return (*self.under_way, self.y, self.v, self.alpha2, self.d3, *self.late)
+
+
+def _held(size: int, n: int, delay: int, *, lags: bool) -> _Held:
+    """Return what is held before a sample: behind the `size` states of the arm."""
+    blocks = delay + 4 + lags
+    rows = np.eye(size + blocks * n)[size:].reshape(blocks, n, -1)
+    y, v, alpha2, d3 = rows[delay : delay + 4]
+    return _Held(tuple(rows[:delay]), y, v, alpha2, d3, tuple(rows[delay + 4 :]))
+
+
+def _law_step(
+    held: _Held, y: Floats, T: float, velocity_lag: float, law: Feedback
+) -> tuple[Floats, _Held]:
+    """Return the law's torque at the measured position y, and what is held after it.
+
+    Both are matrices, as is y, that take them from the whole state.
+    """
+    decay = _decay(velocity_lag, T)
+    v = decay * held.v + (1.0 - decay) * (y - held.y) / T
+    rate = law.rate[:, None]
+    g = 1.0 - np.exp(-T / law.time_constant)
+    dalpha2 = g * (-rate * y - held.alpha2) / T
+    if law.known_rate:
+        dalpha2 = dalpha2 - rate * v
+    xi2 = v - held.alpha2
+    decay = _damping_decay(law, T)[..., None]
+    late = tuple(decay * each + (1.0 - decay) * xi2 for each in held.late)
+    damped = late[0] if late else xi2
+    tau = law.inertia @ dalpha2 - law.position @ y - law.surface @ damped
+    tau = tau + held.d3
+    alpha2 = held.alpha2 + T * dalpha2
+    d3 = held.d3 - T * (law.integral @ xi2)
+    under_way = (*held.under_way, tau)[1:]
+    return tau, _Held(under_way, y, v, alpha2, d3, late)
 
 
 def _with_law(
-    arm: Floats,
-    push: Floats,
-    own: Floats,
-    sensed: Floats,
-    timing: Timing,
-    feedback: Feedback,
+    arm: Floats, push: Floats, sensed: Floats, timing: Timing, law: Feedback
 ) -> tuple[Floats, Floats]:
     """Return A and B of arm, torques under way and law together."""
     k, size, _ = arm.shape
-    n = own.shape[0]
-    T = timing.period
-    waiting = timing.delay
-    lags = bool(np.any(feedback.damping_lag))
-    blocks = waiting + 4 + lags  # last y, its velocity, alpha2, d3, late xi2
-    N = size + blocks * n
-    wide = np.zeros((n, N))
-    wide[:, :size] = sensed
-    y = wide
-    rows = np.eye(N)[size:].reshape(blocks, n, N)
-    under_way, (before, speed, alpha2, d3) = rows[:waiting], rows[waiting:][:4]
-    decay = _decay(timing.velocity_lag, T)
-    v = decay * speed + (1.0 - decay) * (y - before) / T
-    g = 1.0 - np.exp(-T / feedback.time_constant)
-    rate = feedback.rate[:, None]
-    dalpha2 = g * (-rate * y - alpha2) / T
-    if feedback.known_rate:
-        dalpha2 = dalpha2 - rate * v
-    xi2 = v - alpha2
-    left = _damping_decay(feedback, T)[..., None]
-    late = left * rows[-1] + (1.0 - left) * xi2 if lags else xi2
-    tau = feedback.inertia @ dalpha2 - feedback.position @ y - feedback.surface @ late
-    tau = tau + d3
-    acting = under_way[0] if waiting else tau
+    n = len(sensed)
+    before = _held(size, n, timing.delay, lags=bool(np.any(law.damping_lag)))
+    N = before.y.shape[1]
+    y = np.zeros((n, N))
+    y[:, :size] = sensed
+    tau, after = _law_step(before, y, timing.period, timing.velocity_lag, law)
+    acting = before.under_way[0] if timing.delay else tau
     A = np.zeros((k, N, N))
     A[:, :size, :size] = arm
     A[:, :size] += push[..., :n] @ acting
-    later = [*under_way[1:], tau] if waiting else []
-    integrated = d3 - T * (feedback.integral @ xi2)
-    parts = [*later, y, v, alpha2 + T * dalpha2, integrated, *([late] if lags else [])]
-    A[:, size:] = np.concatenate(
-        [np.broadcast_to(part, (k, n, N)) for part in parts], axis=1
-    )
+    kept = [np.broadcast_to(part, (k, n, N)) for part in after.parts]
+    A[:, size:] = np.concatenate(kept, axis=1)
     B = np.zeros((k, N, n))
     B[:, :size] = push[..., n:]
     return A, B

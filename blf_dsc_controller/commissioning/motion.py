@@ -23,19 +23,21 @@ begin at zero, so an arm at rest is not jerked.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.arms.urdf import Chain, frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.errors import BlfDscError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+_Shrink = Callable[[Floats, Floats], None]
 
 SETTLING = 6.0
 """Time [s] from the start until the period that is looked at."""
@@ -158,42 +160,62 @@ def excitation(
     bins = _bins(n, period, config.sample_time)
     slow = _swings(n, period) if sliding else _slow(n, period)
     chain = config.robot.chain(config.joints)
-    base = parameters_of(config.robot, chain)
-    P = base.of(chain.inertias, config.robot.rotors(chain))
-    inertia = np.diagonal(inertia_matrices(base.model, P, posture[None])[0])
+    inertia = _inertias(config, chain, posture)
     rated = config.robot.efforts(chain)
-    rate = 2.0 * np.pi / period * bins
-    torque = share * rated / math.sqrt(0.5 * bins.shape[1])
-    lines = torque[:, None] / (inertia[:, None] * rate**2)
+    lines = _by_torque(share, rated, inertia, bins, period)
     rates = 2.0 * np.pi / period * slow if sliding else 2.0 * np.pi * _SLOW
     swing = np.full(slow.shape, SLIDING / rates / SLOW_TONES)
     shape = _Shape(np.column_stack((bins, slow)), period, SLOW_TONES * sliding)
-    limit = _SPEED * np.array(config.limits.velocity)
-    middle = frames(chain, posture)[-1][:3, 3]
-    factors = np.ones((n, 2))  # of lines and of slow tones or swings
-    for _ in range(_SHRINKS):
-        amplitude = np.column_stack((factors[:, :1] * lines, factors[:, 1:] * swing))
-        phase, moved, speed = shape.motion(amplitude)
-        tips = frames(chain, posture + moved)[-1][:, :3, 3]
-        far = float(np.linalg.norm(tips - middle, axis=1).max())
-        excess = np.maximum(speed / limit, far / travel)
-        if (excess <= 1.0).all():
-            break
-        shrink = _shrink_each if sliding else _shrink_all
-        shrink(factors, excess)
+    room = _Room(chain, posture, travel, _SPEED * np.array(config.limits.velocity))
+    shrink = _shrink_each if sliding else _shrink_all
+    amplitude, moves = _shrunk(lines, swing, shape, room, shrink)
     accelerations = amplitude * shape.rates**2
     return Excitation(
         period=period,
         bins=bins,
         slow=slow,
         amplitude=amplitude,
-        phase=phase,
-        travel=far,
-        speed=speed,
+        phase=moves.phase,
+        travel=room.travel(moves),
+        speed=moves.speed,
         acceleration=accelerations.sum(axis=1),
         swing=inertia * accelerations[:, -SLOW_TONES:].sum(axis=1),
         sliding=sliding,
     )
+
+
+def _inertias(config: ControllerConfig, chain: Chain, posture: Floats) -> Floats:
+    """Return the inertia (n,) [kg m^2] of each joint in a posture (n,) [rad], others at rest."""
+    base = parameters_of(config.robot, chain)
+    P = base.of(chain.inertias, config.robot.rotors(chain))
+    return np.diagonal(inertia_matrices(base.model, P, posture[None])[0])
+
+
+def _by_torque(
+    share: float, rated: Floats, inertia: Floats, bins: Ints, period: float
+) -> Floats:
+    """Return amplitudes (n, K) [rad] of lines (n, K) whose torques are `share` of the rated ones.
+
+    These are (n,) [N m], the inertias that they move (n,) [kg m^2].
+    """
+    rate = 2.0 * np.pi / period * bins
+    torque = share * rated / math.sqrt(0.5 * bins.shape[1])
+    return np.asarray(torque[:, None] / (inertia[:, None] * rate**2))
+
+
+def _shrunk(
+    lines: Floats, swing: Floats, shape: _Shape, room: _Room, shrink: _Shrink
+) -> tuple[Floats, _Moves]:
+    """Return the amplitudes (n, K + 2) of a motion that has room, and how it moves."""
+    factors = np.ones((len(lines), 2))  # of lines and of slow tones or swings
+    for _ in range(_SHRINKS):
+        amplitude = np.column_stack((factors[:, :1] * lines, factors[:, 1:] * swing))
+        moves = shape.motion(amplitude)
+        excess = room.excess(moves)
+        if (excess <= 1.0).all():
+            break
+        shrink(factors, excess)
+    return amplitude, moves
 
 
 def _shrink_all(factors: Floats, excess: Floats) -> None:
@@ -205,6 +227,33 @@ def _shrink_all(factors: Floats, excess: Floats) -> None:
 def _shrink_each(factors: Floats, excess: Floats) -> None:
     """Make lines and swing of each joint smaller that exceeds (n,) something."""
     factors /= np.where(excess > 1.0, excess.clip(1.02, 2.0), 1.0)[:, None]
+
+
+class _Moves(NamedTuple):
+    """How an arm moves over a period."""
+
+    phase: Floats  # (n, K) rad, of its tones
+    moved: Floats  # (N, n) rad, from its posture
+    speed: Floats  # (n,) rad/s, the largest
+
+
+class _Room(NamedTuple):
+    """How far and how fast an arm may move around a posture."""
+
+    chain: Chain
+    posture: Floats  # (n,) rad
+    most: float  # m, travel of the tool
+    limit: Floats  # (n,) rad/s
+
+    def travel(self, moves: _Moves) -> float:
+        """Return how far the tool moves from its middle [m]."""
+        middle = frames(self.chain, self.posture)[-1][:3, 3]
+        tips = frames(self.chain, self.posture + moves.moved)[-1][:, :3, 3]
+        return float(np.linalg.norm(tips - middle, axis=1).max())
+
+    def excess(self, moves: _Moves) -> Floats:
+        """Return for each joint (n,) how many times more it moves than it may."""
+        return np.maximum(moves.speed / self.limit, self.travel(moves) / self.most)
 
 
 class _Shape:
@@ -221,13 +270,13 @@ class _Shape:
         # against each other at the start
         self._phase[:, -1] = self._phase[:, -2] + np.pi
 
-    def motion(self, amplitude: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return phases (n, K), motion (N, n) [rad] over a period, and speeds (n,) [rad/s]."""
+    def motion(self, amplitude: Floats) -> _Moves:
+        """Return the motion with these amplitudes (n, K) [rad]."""
         rows = zip(amplitude, self._bins, self._phase, strict=True)
         phase = np.array([_from_rest(*row, self._held) for row in rows])
         moved = _over_a_period(amplitude, phase, self._bins)
         rate = np.gradient(moved, self._period / len(moved), axis=0)
-        return phase, moved, np.abs(rate).max(axis=0)
+        return _Moves(phase, moved, np.abs(rate).max(axis=0))
 
 
 def shaken(

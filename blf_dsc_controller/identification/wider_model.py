@@ -54,35 +54,75 @@ class Doubt(NamedTuple):
 
 def doubt(problem: Problem, prior: Prior, fit: Fit, distances: Floats) -> Doubt:
     """Return the doubt in a fit to all motion with this prior, and these distances of contacts."""
-    rows = problem.rows
     model = problem.parameters.model
-    columns = left_out(rows, model, problem.G, fit.values, distances)
-    k = prior.mean.size
-    kinds = np.concatenate((np.full(k, len(KINDS)), columns.kind))
-    products = _products(_blocks(problem, prior, fit, columns))
-    deviation = fit.problem.deviation
-    lengths = fit.problem.lasting / HOP
-    # the size of what the model has is that of its prior
-    sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
-    narrow, _ = _solved(products, (kinds == len(KINDS)) * 1.0, deviation**2)
-    of_gains = k + np.flatnonzero(columns.kind == KINDS.index('gain'))
-    z = np.zeros(narrow.size)
-    for turn in range(_MOST_ROUNDS):
-        about = _linearised(narrow, z, k, of_gains)
-        before = z[of_gains]
-        linear = np.swapaxes(about, 1, 2) @ products @ about
-        for _ in range(_STEPS):
-            z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
-            sizes[:-1] = _sizes(kinds, z, H, sizes)
-        left = _left(problem, prior, fit, columns, about @ np.append(z, -1.0))
-        deviation, lengths = _residual(problem, prior, fit, left)
-        change = np.abs(z[of_gains] - before).max()
-        if turn >= _ROUNDS - 1 and change < _AGREE:
-            break
-    z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
+    columns = left_out(problem.rows, model, problem.G, fit.values, distances)
+    wider = _WiderModel(problem, prior, fit, columns)
+    z, H = wider.fit()
+    k = wider.k
     d = prior.D @ z[:k]
     covariance = prior.D @ H[:k, :k] @ prior.D.T + np.outer(d, d)
     return Doubt(covariance, _torques(problem, columns, z[k:]))
+
+
+class _WiderModel:
+    """The model of a fit, with the columns left out as well.
+
+    Its values z are k of the model, relative to those of the fit, and one for each
+    column left out.
+    """
+
+    def __init__(
+        self, problem: Problem, prior: Prior, fit: Fit, columns: LeftOut
+    ) -> None:
+        self.k = k = prior.mean.size
+        of_model = np.full(k, len(KINDS))
+        self._kinds = np.concatenate((of_model, columns.kind))
+        self._gains = k + np.flatnonzero(columns.kind == KINDS.index('gain'))
+        self._products = _products(_blocks(problem, prior, fit, columns))
+        self._narrow = self._narrow_values(fit.problem.deviation)
+        self._given = (problem, prior, fit, columns)
+
+    def _narrow_values(self, deviation: Floats) -> Floats:
+        """Return the values of the model alone, with 0 for what it leaves out."""
+        is_of_model = self._kinds == len(KINDS)
+        values, _ = _solved(self._products, is_of_model * 1.0, deviation**2)
+        return values
+
+    def fit(self) -> tuple[Floats, Floats]:
+        """Return z and its covariance.
+
+        Sizes of the kinds, residuals and the linearisation follow from one another, in turns.
+        """
+        problem, prior, fit, columns = self._given
+        deviation = fit.problem.deviation
+        lengths = fit.problem.lasting / HOP
+        # the size of what the model has is that of its prior
+        sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
+        z = np.zeros(self._kinds.size)
+        for turn in range(_MOST_ROUNDS):
+            about = _linearised(self._narrow, z, self.k, self._gains)
+            linear = np.swapaxes(about, 1, 2) @ self._products @ about
+            before = z[self._gains]
+            z, sizes = self._sized(linear, sizes, deviation**2 * lengths)
+            left = _left(problem, prior, fit, columns, about @ np.append(z, -1.0))
+            deviation, lengths = _residual(problem, prior, fit, left)
+            change = np.abs(z[self._gains] - before).max()
+            if turn >= _ROUNDS - 1 and change < _AGREE:
+                break
+        return _solved(linear, sizes[self._kinds], deviation**2 * lengths)
+
+    def _sized(
+        self, linear: Floats, sizes: Floats, variance: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return z, and the sizes of the kinds that it shows, from sizes before.
+
+        `linear` are the products of linearised columns, `variance` (n,) that of the rows.
+        """
+        sizes = sizes.copy()
+        for _ in range(_STEPS):
+            z, H = _solved(linear, sizes[self._kinds], variance)
+            sizes[:-1] = _sizes(self._kinds, z, H, sizes)
+        return z, sizes
 
 
 def _linearised(narrow: Floats, z: Floats, k: int, of_gains: Indices) -> Floats:
