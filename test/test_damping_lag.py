@@ -10,7 +10,7 @@ import pytest
 
 from benchmark import damping_lag, random_arms
 from blf_dsc_controller.arms.linear_loop import law_responses
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.simulation.loop import simulate
@@ -109,6 +109,17 @@ def test_a_ur5e_gets_half_as_much_margin_again_unless_encoders_are_at_its_motors
     assert 0.4 < own < 0.5
     assert late > 1.35 * own
     assert late_motors < 0.8 * own_motors
+
+
+def test_a_lag_of_shoulder_and_elbow_alone_leaves_light_wrists_their_margin():
+    """Motors as the controller guesses, with encoders at the links."""
+    loop = load_loop('ur5e', {PLANT: random_arms.picks_up('ur5e')})
+    motors = random_arms.guessed_rotors(loop.controller).tolist()
+    plant = change(loop.plant, {'truth.rotor_inertia': motors})
+    margins = damping_lag.margins_of(loop.controller, plant)
+    of = dict(zip(damping_lag.SETTINGS, margins, strict=True))
+    assert of['3 ms'] < 0.5 * of['none']
+    assert of['3 ms, first 3 joints'] > 0.95 * of['none']
 
 
 @pytest.mark.parametrize(('given', 'reports'), [({}, True), (LAG, False)])
