@@ -42,16 +42,17 @@ def test_folder_that_the_disk_does_not_hold_leaves_nothing(full):
     assert not list(full.iterdir())
 
 
-def interrupted(part):
-    part.write_text('ne')
-    raise KeyboardInterrupt
-
-
 def test_what_was_there_stays_until_the_new_one_is_whole(tmp_path):
     path = tmp_path / 'page.html'
     path.write_text('old')
-    with pytest.raises(KeyboardInterrupt), writing(path) as part:
-        interrupted(part)
+
+    def interrupted():
+        with writing(path) as part:
+            part.write_text('ne')
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert [each.read_text() for each in tmp_path.iterdir()] == ['old']
     with writing(path) as part:
         part.write_text('new')
