@@ -323,8 +323,8 @@ def _law_step(
     if law.known_rate:
         dalpha2 = dalpha2 - rate * v
     xi2 = v - held.alpha2
-    decay = _damping_decay(law, T)[..., None]
-    late = tuple(decay * each + (1.0 - decay) * xi2 for each in held.late)
+    left = _damping_decay(law, T)[..., None]
+    late = tuple(left * each + (1.0 - left) * xi2 for each in held.late)
     damped = late[0] if late else xi2
     tau = law.inertia @ dalpha2 - law.position @ y - law.surface @ damped
     tau = tau + held.d3
