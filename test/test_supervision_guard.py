@@ -560,6 +560,20 @@ def test_law_without_a_barrier_is_not_stopped_by_its_bound():
     assert rig.guard.samples.saturated > 0
 
 
+def test_states_of_a_run_relieve_saturation_as_those_that_come_one_by_one():
+    """A quarter of their time: as of a compiled run, whose states were all checked."""
+    rig = Rig({'law': 'backstepping', 'safety.saturation_time': 10.0})
+    rig.push = np.array([40.0, 0.0])
+    rig.step(60)
+    guard, T, k = rig.guard, rig.guard.config.sample_time, 20
+    before = guard.samples.saturated_time
+    assert before > 0.25 * k * T
+    stamps = guard.last_stamp + guard.config.sample_time_ns * np.arange(1, k + 1)
+    measurements = np.tile(guard.last_state.measurement, (k, 1))
+    guard.advance(stamps, measurements, np.zeros((k, 2)))
+    assert guard.samples.saturated_time == pytest.approx(before - 0.25 * k * T)
+
+
 def test_stop_names_both_rates_where_the_states_come_at_another():
     rig = Rig({'safety.overrun_fraction': 1.0})
     sparse(3)(rig)
