@@ -157,7 +157,8 @@ def commissioning_of(
 ) -> tuple[Commissioned, PlantConfig]:
     """Return what is found of an arm of a study, with a seed of its noise, and its plant."""
     study = load_study(name)
-    plant = plant_with(study, draw(study, number))
+    # motors are drawn, which leaves nothing to scale
+    plant = change(plant_with(study, draw(study, number)), {'truth.rotor_factor': 1.0})
     if seed is not None:
         plant = change(plant, {'seed': seed})
     loop = LoopConfig(plant, study.controller, RecorderConfig())

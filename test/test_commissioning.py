@@ -291,7 +291,8 @@ def test_inertia_and_lags_are_found():
 def test_friction_is_not_taken_for_a_lag_of_the_drives():
     """Of an elastic arm with drives of 2.2 ms, whose friction is a spring with hysteresis.
 
-    At 2 to 5 Hz it asks for more than the inertia does, and turns D by up to half a turn.
+    At 2 to 5 Hz it asks for more than the inertia does, and the fit there makes 19 ms of it.  The
+    damping of the gears, which resonate at 26 Hz, takes 1 ms off at 8 to 40 Hz.
     """
     loop = true_loop(found().start, found().loops.inertia)
     timing = Timing(1e-3, delay=2, drive_lag=2.2e-3)
@@ -302,7 +303,7 @@ def test_friction_is_not_taken_for_a_lag_of_the_drives():
     position = np.linalg.inv(rubbed)
     run, _ = simulated.measured(planned(), ARM)
     seen = findings_of([run], [response._replace(position=position)])
-    assert seen.drive_lag == pytest.approx(4.7e-3, abs=1e-3)  # with half of a sample
+    assert seen.drive_lag == pytest.approx(4.7e-3, abs=1.5e-3)  # with half of a sample
 
 
 def test_steps_of_the_encoders_are_found_and_told():
@@ -728,18 +729,18 @@ def test_joint_whose_inertia_friction_hides_is_not_trusted():
 def test_inertia_that_fits_with_the_longest_lag_alone_is_not_believed():
     """Of 1.8 + 1.5 kg m^2 the fit made 0.8, with the 30 ms that are tried at most.
 
-    What the file assumes stays, and the bound counts what may be missing.
+    What the file assumes stays, so does its `robot.lag`, and the bound counts what may be missing.
     """
     seen = rubbing()
     assert seen.findings.unfit.tolist() == [[True, False]]
     assert np.isnan(seen.findings.inertia[0])
-    # the phase at higher frequencies shows the lag: a sample, and half of one for the hold
-    assert seen.findings.drive_lag == pytest.approx(1.5e-3, abs=1e-3)
-    assert seen.parameters()['robot.lag'] < 1e-3
+    assert np.isnan(seen.findings.drive_lag)  # nor is one seen at higher frequencies
+    assert seen.parameters()['robot.lag'] == CONFIG.robot.lag
     assert seen.unseen[0] > STUCK.truth.rotor_inertia[0] - ROTORS[0]
     told = '\n'.join(sentences(seen))
     assert 'joint1: an inertia would fit best with a lag of 30 ms, the longest' in told
     assert 'friction hides the inertia of joint2:' in told
+    assert 'a torque takes' not in told
     assert not found().findings.unfit.any()
     assert 'would fit best' not in '\n'.join(sentences(found()))
 
