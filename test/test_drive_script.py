@@ -12,6 +12,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -271,6 +272,40 @@ def test_a_motion_is_waited_for_stopped_and_given_up(arm):
     arm.move_to(start + STEP, speed=0.1, wait=False)
     arm.move_to(start, speed=1.0)
     np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
+
+
+def test_ctrl_c_in_a_motion_brakes_the_arm_also_where_no_block_ends(arm):
+    """As in a notebook, whose kernel goes on."""
+    start = arm.state.q
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        arm.move_to(start + STEP, speed=0.02)
+    wait_for(lambda: rests(arm))
+    assert np.abs(arm.state.reference - start - STEP).max() > 0.1
+    assert not arm.is_moving
+    assert arm.state.phase == 'tracking'
+
+
+def test_a_fork_of_the_script_neither_commands_nor_closes_the_arm(arm):
+    """It would wait for ever, since the thread that listens is not there."""
+    child = os.fork()
+    if not child:
+        arm.close()
+        try:
+            arm.stop()
+        except DriveError as error:
+            os._exit(42 if 'a fork of it: command the arm there' in str(error) else 1)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 42
+    arm.stop()
+    assert arm.state.phase == 'tracking'
+
+
+def test_settings_that_other_packages_have_are_refused(arm):
+    """`robot.relative_dynamics_factor = 0.05` would leave the arm ten times as fast."""
+    for name in ('relative_dynamics_factor', 'speed'):
+        with pytest.raises(DriveError, match=rf'{name}: .*move_to\(q, speed=0\.1\)'):
+            setattr(arm, name, 0.05)
 
 
 def test_a_long_trajectory_is_read_beside_the_loop(arm):

@@ -7,6 +7,7 @@ brakes the arm.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import os
@@ -106,10 +107,20 @@ class Drive:
         self._record = checked_record(record)
         self._starts = 0
         self._news = threading.Condition()
+        self._owner = os.getpid()
         self._number = 0
         self._last = 0  # number of the last motion
         self._hint = 0, ''  # of which motion, and what its error ends with
         self._start()
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Refuse what other packages have as settings: here it would change nothing."""
+        if not name.startswith('_') and name != 'joints':
+            raise DriveError(
+                f'{name}: a Drive has no such setting. The speed is given with each motion, as in '
+                'move_to(q, speed=0.1), and limits in the parameter file, or in overrides'
+            )
+        super().__setattr__(name, value)
 
     def __enter__(self) -> Drive:
         return self
@@ -359,6 +370,8 @@ class Drive:
 
     def close(self) -> None:
         """Bring the arm to rest, and end its loop; a second Ctrl-C ends it at once."""
+        if os.getpid() != self._owner:
+            return  # a fork of the script ends, and not the script
         self._closed = True
         if self._process.poll() is None:
             try:
@@ -533,6 +546,11 @@ class Drive:
         except NotInTimeError as error:
             self.stop()
             raise NotInTimeError(f'{error}: the arm has braked') from None
+        except KeyboardInterrupt:
+            # where no block ends with it, as in a notebook, the arm would go on
+            with contextlib.suppress(LoopEndedError):
+                self._put(script_link.BRAKE, topic_link.encode(number))
+            raise
 
     def _ask(
         self, kind: int, wanted: Callable[[int], Any], timeout: float | None
@@ -567,7 +585,16 @@ class Drive:
                 self._news.wait(_POLL)
 
     def _check(self) -> None:
-        """Raise LoopEndedError if the loop has ended, or says nothing any more."""
+        """Raise LoopEndedError if the loop has ended, or says nothing any more.
+
+        Raises:
+            DriveError: in a fork of the script, which hears nothing of the loop.
+        """
+        if os.getpid() != self._owner:
+            raise DriveError(
+                f'this Drive is of process {self._owner}, and this is a fork of it: command the '
+                'arm there'
+            )
         if self._ended and self._closed:
             raise LoopEndedError(
                 'this Drive was closed, as at the end of its block: make another one, or '

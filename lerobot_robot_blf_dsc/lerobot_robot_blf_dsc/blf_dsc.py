@@ -34,6 +34,7 @@ class BlfDsc(Robot):
         self.config = config
         self.cameras = make_cameras_from_configs(config.cameras)
         self._arm: blf.Drive | None = None
+        self._is_open = False
 
     @cached_property
     def joints(self) -> tuple[str, ...]:
@@ -61,23 +62,32 @@ class BlfDsc(Robot):
     def is_connected(self) -> bool:
         """Whether the law is in command of the arm, and all cameras are connected."""
         commands = self._arm is not None and not self._arm.ended
-        return commands and all(each.is_connected for each in self.cameras.values())
+        has_cameras = all(each.is_connected for each in self.cameras.values())
+        return self._is_open and commands and has_cameras
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: FBT001, FBT002, ARG002 - LeRobot's
         """Take command: the arm holds where it is; there is nothing to calibrate.
 
+        After a stop, or after `disconnect`, take command again; a bag then has another
+        number in its name.
+
         Raises:
             DriveError: file, robot or arm are not as they should be.
         """
-        if self._arm is not None:
+        if self.is_connected:
             raise DeviceAlreadyConnectedError(f'{self} is already connected')
-        record = self.config.record or None
-        self._arm = blf.Drive(
-            self.config.config, robot=self.config.address, record=record
-        )
+        if self._arm is None:
+            record = self.config.record or None
+            self._arm = blf.Drive(
+                self.config.config, robot=self.config.address, record=record
+            )
+        else:
+            self._arm.recover()
+        self._is_open = True
         try:
             for camera in self.cameras.values():
-                camera.connect()
+                if not camera.is_connected:
+                    camera.connect()
         except BaseException:
             self.disconnect()
             raise
@@ -117,16 +127,24 @@ class BlfDsc(Robot):
 
         Raises:
             LoopEndedError: the controller or the robot has stopped.
+            ValueError: the action lacks a joint, as one for another robot does.
         """
         arm = self._connected()
         names = list(self.action_features)
-        arm.stream(np.array([float(action[name]) for name in names]))
-        return {name: action[name] for name in names}
+        lacking = [name for name in names if name not in action]
+        if lacking:
+            raise ValueError(
+                f'action: got {", ".join(action) or "nothing"}, but {", ".join(lacking)} '
+                f'{"is" if len(lacking) == 1 else "are"} needed, too [rad]'
+            )
+        wanted = {name: float(action[name]) for name in names}
+        arm.stream(np.array(list(wanted.values())))
+        return wanted
 
     def disconnect(self) -> None:
         """Bring the arm to rest; the robot then holds it by its own means."""
         arm = self._connected()
-        self._arm = None
+        self._is_open = False
         try:
             arm.close()
         finally:
@@ -135,6 +153,6 @@ class BlfDsc(Robot):
                     camera.disconnect()
 
     def _connected(self) -> blf.Drive:
-        if self._arm is None:
+        if self._arm is None or not self._is_open:
             raise DeviceNotConnectedError(f'{self} is not connected: call connect()')
         return self._arm
