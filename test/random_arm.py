@@ -205,7 +205,7 @@ def reference_of(chain, seed, tones=3):
 
 
 @kernel
-def _shake(arm, viscous, coulomb, motion, gains, work, states):
+def fill_states(arm, viscous, coulomb, motion, gains, work, states):
     """Follow `motion` (N, 3, n) by PD, torques held for a period.
 
     Fill states (N, 3, n).
@@ -257,7 +257,7 @@ def shake(chain, truth, reference, duration):
     n = len(chain.joints)
     states = np.zeros((times.size, 3, n))
     work = np.zeros((8, n))
-    _shake(arm, truth.viscous, truth.coulomb, motion, gains, work, states)
+    fill_states(arm, truth.viscous, truth.coulomb, motion, gains, work, states)
     return states
 
 

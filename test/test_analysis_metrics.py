@@ -19,7 +19,7 @@ from blf_dsc_controller.analysis.estimates import (
     errors_of_bodies,
     estimates_of,
 )
-from blf_dsc_controller.analysis.figures import _close_up, draw
+from blf_dsc_controller.analysis.figures import close_up, draw
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.output import plain, write_json
@@ -124,7 +124,7 @@ def test_parameter_error_is_shown_in_percent(run):
 
 
 def test_close_up_of_a_change_without_errors_shows_torques_and_parameters(run):
-    shown = [panel.title for panel in _close_up(replace(run, error=None), 5.0)]
+    shown = [panel.title for panel in close_up(replace(run, error=None), 5.0)]
     assert shown == ['torque of each joint', 'relative parameter error']
 
 

@@ -83,7 +83,7 @@ def connected(ros, type_, topic, quality=100):
 
 def until_recorded(ros, recorder, **counts):
     """Spin until the recorder has at least these numbers of messages by topic."""
-    found = recorder._bag
+    found = recorder.bag
     ros.until(
         lambda: all(
             found.message_counts.get(f'/{k}', 0) >= n for k, n in counts.items()
@@ -123,7 +123,7 @@ def test_plant_as_the_clock_logs_at_the_stamp_of_the_last_joint_state(ros, bag):
     for publisher, numbers in ((early, (1, 2)), (states, (70, 90, 80))):
         for number in numbers:
             publisher.publish(encoded(number))
-        ros.until(lambda: len(recorder._waiting) == 2 or recorder._plant_time == 90)
+        ros.until(lambda: len(recorder.waiting) == 2 or recorder.plant_time == 90)
     until_recorded(ros, recorder, early=2, joint_states=3)
     recorder.close()
     assert [(topic[1:], at) for topic, at, _ in read(bag)] == [
@@ -225,7 +225,7 @@ def test_received_messages_are_on_disk_before_a_type_is_imported(ros, bag, monke
         publisher.publish(JointState())
     assert publisher.wait_for_all_acked()
     while not on_disk:  # only the topic discovery runs, nothing else of the recorder
-        recorder._discover()
+        recorder.discover()
     assert on_disk == [50]
 
 

@@ -151,7 +151,7 @@ def test_somebody_who_also_commands_ends_it(rig):
     def command():
         rig.ros.publisher(topics.COMMANDS)
         rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
-        rig.node._on_second()  # it looks every second
+        rig.node.on_second()  # it looks every second
 
     rig.at(500, command)
     with pytest.raises(EndedError, match='another node publishes torques on') as caught:
@@ -181,7 +181,7 @@ def test_what_would_spoil_a_motion_ends_it(rig, name, told):
         if name == 'deactivate':
             rig.node.trigger_deactivate()
         elif name == 'stop':
-            rig.node._status.trajectories.take_stop()
+            rig.node.status.trajectories.take_stop()
         else:
             rig.node.reset()
 
@@ -199,7 +199,7 @@ def test_somebody_who_came_between_two_runs_is_noticed(rig):
             rig.always = lambda: None
             found.append(rig.ros.publisher(topics.COMMANDS))
             rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
-            rig.node._on_second()
+            rig.node.on_second()
 
     rig.always = come
     with pytest.raises(EndedError, match='another node publishes torques on'):

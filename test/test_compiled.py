@@ -29,7 +29,7 @@ from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
 from numba.core.errors import TypingError, UnsupportedError
 from planted import Planted
-from random_arm import _shake, random_urdf
+from random_arm import fill_states, random_urdf
 
 import blf_dsc_controller
 from blf_dsc_controller.arms import model
@@ -108,7 +108,7 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
         update
     )[1]
     # a kernel of these tests
-    outside = {path.name for path in dependencies.dependencies(_shake)[0]}
+    outside = {path.name for path in dependencies.dependencies(fill_states)[0]}
     assert outside >= {'random_arm.py', 'arm.py', 'algebra.py'}
     assert 'controller.py' not in outside
 
@@ -166,7 +166,8 @@ from blf_dsc_controller.compiled import announcement, kernel_cache
 
 with announcement.announced_compilation(lambda text: print(text, file=sys.stderr)):
     H = model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
-print(float(H[0, 0, 0]), *(sum(model._fill_regressors.stats[k].values()) for k in (1, 2)))
+(filled,) = [k for k in kernel_cache.KERNELS if k.__name__ == '_fill_regressors']
+print(float(H[0, 0, 0]), *(sum(filled.stats[k].values()) for k in (1, 2)))
 """
 
 
@@ -466,15 +467,14 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.law.controller import update
-from blf_dsc_controller.messages.codecs import _read
-from blf_dsc_controller.reference.terms import _sample
 from sim_plant.kernels import run_plant
 
 if __name__ == '__main__':  # the command has processes of its own
     config = load_loop('recommended')
-    run._compile(config.controller)
-    run._compile(config.plant)
-    for kernel in (update, run_plant, _read, _sample):
+    run.compile_kernels(config.controller)
+    run.compile_kernels(config.plant)
+    named = {each.__name__: each for each in kernel_cache.KERNELS}
+    for kernel in (update, run_plant, named['_read'], named['_sample']):
         print(kernel.__name__, len(kernel.signatures))
     assert main(['precompile', '--config', 'recommended']) == 0
     kernel_cache.SHIPPED = Path(sys.argv[1])
@@ -497,13 +497,13 @@ def signatures():
     return {(each.__name__, found) for each in kernels for found in each.signatures}
 
 first, *others = (blf.load_loop(path) for path in sys.argv[1:])
-run._compile(first.controller)
-run._compile(first.plant)
+run.compile_kernels(first.controller)
+run.compile_kernels(first.plant)
 known = signatures()
 assert len(known) >= 7, known
 for arm in (first, *others):
     n = len(arm.controller.joints)
-    run._compile(arm.plant)
+    run.compile_kernels(arm.plant)
     with blf.ArmController(arm.controller) as controller:
         for k in range(200):
             controller.update(0.001 * k, np.full(n, 0.3), np.zeros(n), np.zeros(n))

@@ -91,7 +91,7 @@ def test_unknowns_of_the_search_are_in_units_of_the_limits():
         found = two.parameters(x)
         middle = 0.5 * (lower + upper)
         np.testing.assert_allclose(
-            found['offset'] - middle, 0.5 * two._reach, atol=1e-12
+            found['offset'] - middle, 0.5 * two.reach, atol=1e-12
         )
         amplitude = np.reshape(found['amplitude'], (n, 2 * h))
         assert np.count_nonzero(amplitude) == 1
@@ -105,7 +105,7 @@ def test_unknowns_of_the_search_are_in_units_of_the_limits():
             2.0 * np.pi / config.learning.window * (at % h + 1)
         )
         reached = amplitude[joint, tone] * rate ** np.arange(3.0)
-        assert (reached / two._limits[:3, joint]).max() == pytest.approx(1.0)
+        assert (reached / two.limits[:3, joint]).max() == pytest.approx(1.0)
 
 
 def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions():

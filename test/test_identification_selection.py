@@ -8,7 +8,7 @@ import pytest
 
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.regression import Regression
-from blf_dsc_controller.identification.selection import _widths
+from blf_dsc_controller.identification.selection import prior_widths
 
 BODY = 0  # index of the first value of a body
 
@@ -45,7 +45,7 @@ def folds_that_show(values, weight=0.2):
     ],
 )
 def test_prior_is_widened_only_if_that_predicts_every_part_better(values, width):
-    widths = _widths(folds_that_show(values), prior_of_one_joint())
+    widths = prior_widths(folds_that_show(values), prior_of_one_joint())
     assert widths['bodies'] == width
     others = [found for group, found in widths.items() if group != 'bodies']
     assert set(others) == {1.0}

@@ -27,7 +27,7 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification import signs as signs_module
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.joint_alone import _Fit, _sign
-from blf_dsc_controller.identification.left_out import _transmitted
+from blf_dsc_controller.identification.left_out import transmitted_torques
 from blf_dsc_controller.identification.mounting import gravity_columns
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.summary import (
@@ -237,6 +237,6 @@ def test_link_gets_the_torque_without_rotor_friction_and_offset():
     terms = parts(values).terms
     terms[[ROTOR_INERTIA, VISCOUS, COULOMB, OFFSET]] = [[0.1], [0.5], [0.7], [0.2]]
     rows = SimpleNamespace(period=h, q=t, dq=dq, torque=torque, sliding=s)
-    found = np.array(_transmitted(rows, values))
+    found = np.array(transmitted_torques(rows, values))
     np.testing.assert_allclose(found[:, :1], link, atol=1e-9)
     np.testing.assert_allclose(found[:, 1:], 4.0, atol=1e-6)

@@ -177,7 +177,7 @@ def loop(shared):
     """Provide the loop with the arm at rest at START."""
     arm, law, client = shared
     client.feedback.clear()
-    law._status.trajectories._is_stopped = False
+    law.status.trajectories._is_stopped = False
     by_the_topic(law, client, START)
     client.ros.run(arm, 1500)
     np.testing.assert_allclose(rests_at(law), START, atol=1e-9)
@@ -319,12 +319,12 @@ def test_tolerance_of_minus_one_allows_everything(loop):
     _, law, client = loop
     free = [(joint, -1.0, -1.0) for joint in JOINTS]
     handle = client.follow(point(NEAR, 0.5), path=free, arrival=free, time=-1.0)
-    followed = law._action._goals._followed
+    followed = law.action._goals._followed
     assert np.isinf(followed.path.position).all()
     assert np.isinf(followed.latest)
     assert client.result(handle)[0] == SUCCEEDED
     handle = client.follow(point(FAR, 1.0))
-    followed = law._action._goals._followed
+    followed = law.action._goals._followed
     outside = np.array([[0.0, 1.01], [9.0, 9.0]]) * law.guard.controller.sample.bound
     found = followed.path.violation(JOINTS, outside, law.guard.controller.sample.bound)
     assert "'joint2' is " in found
@@ -335,7 +335,7 @@ def test_cancel_of_a_goal_does_not_brake_the_motion_that_has_replaced_it(loop):
     """Both arrive between two samples."""
     _, law, client = loop
     sent = []
-    inputs = law._status.trajectories
+    inputs = law.status.trajectories
     goals = Goals(inputs, JOINTS, sent.append, law.get_logger())
     far = JointTrajectory(joint_names=JOINTS, points=[point(FAR, 1.0)])
     goals.take(law.guard, Goal(7, serialize_message(far), (), (), 0.0))
@@ -371,7 +371,7 @@ def by_a_goal(_law, client):
 
 def by_the_topic(law, _client, q=NEAR):
     sent = JointTrajectory(joint_names=JOINTS, points=[point(q, 1.0)])
-    law._status.trajectories.take_trajectory(serialize_message(sent))
+    law.status.trajectories.take_trajectory(serialize_message(sent))
 
 
 def by_stop(_law, client):
@@ -422,7 +422,7 @@ def test_deactivation_aborts_the_goal(loop):
     assert 'not in command any more' in result.error_string
     rejected = client.send(client.goal(point(NEAR, 1.0)))
     assert not rejected.accepted
-    assert 'not in command: inactive' in law._status.trajectories.reason
+    assert 'not in command: inactive' in law.status.trajectories.reason
     assert activate(client.ros, law)
     client.ros.run(arm, 50)
 
@@ -482,7 +482,7 @@ def test_goal_that_cannot_be_followed_is_rejected_and_the_one_before_goes_on(
     client.ros.run(arm, 100)
     good = client.follow(point(NEAR, 1.0))
     assert not client.send(spoilt(client, law)).accepted
-    assert REJECTED[spoilt] in law._status.trajectories.reason
+    assert REJECTED[spoilt] in law.status.trajectories.reason
     assert client.result(good)[0] == SUCCEEDED
 
 
@@ -536,7 +536,7 @@ def test_long_goal_is_followed(loop):
 
 def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd):
     arm, law, client = own_loop
-    process = law._action._process._process
+    process = law.action._process._process
     client.follow(point(NEAR, 0.5))
     process.kill()
     process.wait()
@@ -550,7 +550,7 @@ def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd)
 def test_process_of_the_action_ends_with_its_node(own_loop, capfd):
     """Without a word, and not by Ctrl-C, which a terminal sends it, too: goals still end."""
     _, law, client = own_loop
-    process = law._action._process._process
+    process = law.action._process._process
     os.kill(process.pid, signal.SIGINT)
     assert client.result(client.follow(point(NEAR, 0.5)))[0] == SUCCEEDED
     client.ros.kill(law)
@@ -566,7 +566,7 @@ def test_streams_chunks_stops_and_goals_in_one_bag_replay_bit_for_bit(
     """All of them in motion, each replacing the one before."""
     run = Recording(tmp_path / 'bag', **BRISK)
     ros, law = run.ros, run.law
-    inputs = law._status.trajectories
+    inputs = law.status.trajectories
     client = Client(ros, control_msgs)
     streamed = ros.publisher(topics.JOINT_POSITIONS)
     chunks = ros.publisher(topics.JOINT_TRAJECTORY)

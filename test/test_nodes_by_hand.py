@@ -102,11 +102,11 @@ def test_state_is_reported_when_it_changes_not_with_each_torque(ros):
     arm = Arm(ros)
     for k in range(3):
         arm.torque_for(k, START)
-        assert not node._status.has_news(node.guard)
+        assert not node.status.has_news(node.guard)
     node.guard.supervisor.add('of the test')
-    assert node._status.has_news(node.guard)
+    assert node.status.has_news(node.guard)
     arm.torque_for(3, START)
-    assert not node._status.has_news(node.guard)
+    assert not node.status.has_news(node.guard)
 
 
 def test_cleanup_commands_the_torque_that_a_driver_may_hold(ros):
@@ -175,7 +175,7 @@ def test_live_arm_is_measured_before_the_start(ros, steps, given, failure):
     for k in range(12):
         stamp += steps[k % len(steps)] * 10**6
         arm.send(stamp, np.zeros(3) if given else START)
-        ros.until(lambda k=k: node.finished or node._start.count > k or arm.commands)
+        ros.until(lambda k=k: node.finished or node.starting.count > k or arm.commands)
         assert bool(arm.commands) <= (k > 9 and not failure)
     ros.until(lambda: node.finished if failure else arm.commands)
     assert failure in str(node.failure)
@@ -394,7 +394,7 @@ def test_reset_measures_the_rate_again_and_a_later_refusal_ends_nothing(ros):
     stamp = start_live(ros, node, arm)
     # rejected once, of an arm that has been in command
     node.guard.refuse(StartError('of the test'))
-    node._report_if_changed(node.guard)
+    node.report_if_changed(node.guard)
     assert not node.finished
     assert ros.reset(node).success
     count = len(arm.commands)

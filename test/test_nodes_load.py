@@ -80,9 +80,7 @@ class Arm:
         self.plant = ros.add(PlantNode, flatten(FR3.plant) | EVENT | waiting)
         self.law = ros.add(ControllerNode, given)
         # the law looks for the service by the clock, lock-step does not wait for it
-        ros.until(
-            lambda: self.law._load_service._client or self.law._load_service.problem
-        )
+        ros.until(lambda: self.law.load_service.client or self.law.load_service.problem)
         assert configure(ros, self.plant)
         assert activate(ros, self.plant)
 
@@ -146,7 +144,7 @@ def test_driver_that_refuses_is_asked_once(services, ros):
     arm.run_until(8.0)
     assert len(arm.requests) == 1
     asked = f'/driver/set_load refused {arm.requests[0].mass:.2f} kg'
-    assert arm.law._load_service.problem == f'{asked}: a controller is active'
+    assert arm.law.load_service.problem == f'{asked}: a controller is active'
     assert arm.requests[0].center_of_mass[2] != 0.0
     assert arm.law.guard.supervisor.running
 
@@ -155,7 +153,7 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     """After a reset it knows of no load: nor may its commands take away what the drives add."""
     arm = Arm(ros, services['ur'], **{'load.in_motion': True})
     arm.run_until(8.5)
-    told = arm.law._load_service.told
+    told = arm.law.load_service.told
     assert told.mass == pytest.approx(2.0, abs=0.1)
     ros.reset(arm.law)
     guard = arm.law.guard
@@ -168,7 +166,7 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     ros.until(lambda: guard.is_settled)
     assert cleanup(ros, arm.law)
     assert configure(ros, arm.law)
-    problem = arm.law._load_service.problem
+    problem = arm.law.load_service.problem
     assert problem.startswith('a load of 2.0')
     assert 'set it back to robot.drive_payload, and restart the node' in problem
     assert activate(ros, arm.law)
@@ -183,7 +181,7 @@ def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
     ros.tester.create_service(Trigger, SERVICE, lambda *_: None)
     law = ros.add(ControllerNode, given)
     assert configure(ros, law)
-    service = law._load_service
+    service = law.load_service
     ros.until(lambda: service.look() or service.problem)
     assert re.fullmatch(
         r'/driver/set_load is a std_srvs/srv/Trigger, but only ur_msgs/srv/SetPayload and .* '
@@ -223,7 +221,7 @@ def test_centre_is_in_the_frame_that_the_service_wants(ros):
     """The flange, link 8, is 0.107 m beyond the frame of the last joint, link 7."""
     given = TOLD | {'robot.tip': 'fr3_link7', 'load.frame': 'fr3_link8'}
     service = load_service.LoadService(ros.tester, change(FR3.controller, given))
-    found = service._to_frame @ (0.01, 0.02, 0.03, 1.0)
+    found = service.to_frame @ (0.01, 0.02, 0.03, 1.0)
     np.testing.assert_allclose(found[:3], (0.01, 0.02, 0.03 - 0.107), atol=1e-12)
 
 
@@ -240,9 +238,9 @@ def test_load_that_is_put_down_has_no_centre(services, ros, kind, mass):
 
     ros.tester.create_service(services[kind], SERVICE, take)
     service = load_service.LoadService(ros.tester, change(FR3.controller, given))
-    ros.until(lambda: service.look() or service._client)
-    ros.until(service._client.service_is_ready)
-    service._ask(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
+    ros.until(lambda: service.look() or service.client)
+    ros.until(service.client.service_is_ready)
+    service.ask(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
     ros.until(lambda: requests)
     (request,) = requests
     at = getattr(request, 'center_of_gravity', None)

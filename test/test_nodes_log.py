@@ -116,9 +116,9 @@ def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
     for k in (0, 1, 2, 60, 61, 62):
         states.publish(encoder.encode(10**9 + k * 10**6, START, ZERO, ZERO))
         ros.until(lambda k=k: node.guard.journal.stamp == 10**9 + k * 10**6)
-        node._report_if_changed(node.guard)
+        node.report_if_changed(node.guard)
     node.guard.journal.note(EventType.SILENCE, torques=1)
-    node._report_if_changed(node.guard)
+    node.report_if_changed(node.guard)
     ros.until(lambda: log('real', '', FATAL))
     ros.spin(0.2)
     (stop,) = log('real', '', FATAL)
@@ -126,7 +126,7 @@ def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
     node.guard.supervisor.add(
         'the arm speeds up in the safe stop'
     )  # as it may do later
-    node._report_if_changed(node.guard)
+    node.report_if_changed(node.guard)
     ros.until(lambda: len(log('real', '', FATAL)) == 2)
     assert log('real', 'the arm speeds up in the safe stop', FATAL)
 
@@ -273,7 +273,7 @@ def test_stamps_that_disable_the_watchdog_cause_one_warning_except_in_lockstep(
             JointStateEncoder(JOINTS).encode(10**9, START, ZERO, ZERO)
         )
     ros.until(
-        lambda: law.guard.start_stamp > 0 and law._warned_at == law.guard.start_stamp
+        lambda: law.guard.start_stamp > 0 and law.warned_at == law.guard.start_stamp
     )
     ros.spin(0.3)
     assert len(log(space, 'a silence is not detected')) == (not simulated)
@@ -291,7 +291,7 @@ def test_second_publisher_on_the_same_topic_is_reported(ros, log, kind):
     does = 'publishes joint states' if is_plant else 'commands torques'
     warnings = partial(log, space, f'another node publishes on /{space}/{name}, too')
     ros.until(lambda: len(warnings()) == 2)
-    first._on_second()
+    first.on_second()
     ros.spin(0.2)
     assert len(warnings()) == 2  # one of each
     ros.until(lambda: statuses(diagnostics, f'another node {does}, too'))

@@ -273,7 +273,7 @@ def test_plant_counts_real_time_in_whole_samples(ros):
     ros.until(plant.input.torque.any)
     # In time, except for three steps that the plant has to take at once.
     for steps in [1] * 100 + [3] + [1] * 197:
-        ros.until(lambda: plant._has_torque)
+        ros.until(lambda: plant.has_torque)
         goal = plant.plant.sample + steps
         clock.advance(1e-3 * steps)
         ros.until(lambda k=goal: plant.plant.sample == k)
@@ -430,8 +430,8 @@ def test_reset_of_both_nodes_repeats_the_run(ros):
     clock = FakeClock()
     arm, law = ros.loop({'sensor__position_noise': 1e-5, 'seed': 3}, clock=clock)
     ros.spin(0.3)
-    assert not arm._offered  # peers need time to settle
-    ros.until(lambda: clock.advance(0.01) or arm._offered)
+    assert not arm.is_offered  # peers need time to settle
+    ros.until(lambda: clock.advance(0.01) or arm.is_offered)
     ros.run(arm, 100)
     begin = arm.stamp - arm.plant.elapsed_ns
     ros.reset(arm)
@@ -441,7 +441,7 @@ def test_reset_of_both_nodes_repeats_the_run(ros):
     assert arm.plant.sample == 0
     first = torques(commands)[:100]
     commands.clear()
-    ros.until(lambda: clock.advance(0.01) or arm._offered)
+    ros.until(lambda: clock.advance(0.01) or arm.is_offered)
     assert law.guard.controller.samples < 50  # it has been reset before
     ros.until(lambda: len(commands) >= 100)
     np.testing.assert_array_equal(torques(commands)[:100], first)
@@ -470,7 +470,7 @@ def test_stale_torque_is_not_applied_in_real_time(ros):
     ros.until(arm.input.torque.any)
     for sample in range(1, 21):
         clock.advance(0.001)
-        ros.until(lambda k=sample: arm.plant.sample == k and arm._has_torque)
+        ros.until(lambda k=sample: arm.plant.sample == k and arm.has_torque)
     assert arm.plant.measure()[4:].any()
     ros.kill(law)
     ros.until(lambda: clock.advance(0.001) or arm.input.stale_steps > 5)
@@ -496,7 +496,7 @@ def test_state_is_latched_and_gives_the_reason(ros):
     ros.until(lambda: msgs)
     assert msgs[-1].message == 'tracking'
     assert values(msgs[-1])['phase'] == 'tracking'
-    arm._start_stamp -= 10**9
+    arm.start_stamp -= 10**9
     ros.until(lambda: len(msgs) > 1)
     assert msgs[-1].level == b'\2'
     assert msgs[-1].message.startswith(

@@ -140,7 +140,7 @@ def test_controller_survives_arbitrary_input(ros, sequence):
     node = ControllerNode(context=ros.context, cli_args=[], enable_rosout=False)
     commands = []
     node._command = lambda torque: torque is None or commands.append(torque.copy())
-    node._start._was_observed = True
+    node.starting._was_observed = True
     stamp = 10**9
     try:
         for kind, content in sequence:

@@ -54,7 +54,7 @@ def test_controller_refuses_to_start_without_the_watchdog_that_it_expects(ros):
     state = JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2))
     ros.driver()
     ros.until(states.get_subscription_count)
-    ros.until(lambda: states.publish(state) or law._start.held)
+    ros.until(lambda: states.publish(state) or law.starting.held)
     clock.advance(59.0)
     ros.spin(0.2)  # it looks every 8 ms
     assert not law.finished
@@ -196,7 +196,7 @@ def test_gains_that_nobody_measured_are_told_once_where_a_robot_sends_states(
     for _ in range(2):
         ros.until(go_on)
         starts.append(law.guard.start_stamp)
-        law._on_second()
+        law.on_second()
         law.guard.reset()
     assert starts[0] < starts[1]
 
@@ -213,7 +213,7 @@ def test_gains_of_a_simulated_arm_need_no_measuring(ros):
     log = ros.listen(LOG)
     arm, law = ros.loop(controller=URDF_ARM)
     ros.run(arm, 20)
-    law._on_second()
+    law.on_second()
     ros.spin(0.1)
     assert law.guard.start_stamp > 0  # it has begun
     assert not [line for line in log if 'nobody has measured' in line.msg]

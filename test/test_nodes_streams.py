@@ -29,7 +29,7 @@ PATIENT = {
 
 
 def inputs(law):
-    return law._status.trajectories
+    return law.status.trajectories
 
 
 def positions(values):

@@ -64,7 +64,7 @@ def trajectory(joints, shift, *, duration, fields=3, stamp=0, spacing=0.05):
 
 def inputs(law):
     """Return the status of the trajectories that a controller was sent."""
-    return law._status.trajectories
+    return law.status.trajectories
 
 
 def send(ros, law, sent):

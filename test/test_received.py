@@ -264,7 +264,7 @@ def test_law_that_a_journal_names_does_not_run_in_view_and_watchdog(ros, law):
     journal.note(EventType.CONFIGURE, parameters=given)
     publisher.publish(String(data=json.dumps(journal.pending[0]._asdict())))
     ros.until(lambda: watchdog.watchdog is not None)
-    ros.until(lambda: all(view._config is not None for view in views))
+    ros.until(lambda: all(view.config is not None for view in views))
     assert not law.has_run
     for view in views:
         view.close()

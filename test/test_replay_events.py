@@ -440,4 +440,4 @@ def test_event_that_cannot_be_repeated_is_named(tmp_path, kind, content, words):
 )
 def test_only_what_messages_show_is_decided_by_the_controller_itself(kind, own):
     event = SimpleNamespace(type=rerun.EventType[kind.upper()], content={})
-    assert rerun._is_own(event) == own
+    assert rerun.is_own(event) == own

@@ -115,13 +115,13 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
     """A pause, a stop in which a gain changes, a reset, a stop since no state comes any more."""
     clock = FakeClock()
     run = Recording(tmp_path / 'bag', clock, safety__watchdog='on', **DAMPED)
-    run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
+    run.ros.until(lambda: clock.advance(0.01) or run.arm.is_offered)
     run.run(100)
     deactivate(run.ros, run.law)
     run.run(600)  # past the ramp
     activate(run.ros, run.law)
     run.run(200)
-    run.arm._start_stamp += SECOND // 10  # the next state is too late
+    run.arm.start_stamp += SECOND // 10  # the next state is too late
     run.ros.until(lambda: run.law.guard.supervisor.text)
     run.run(50)
     run.change('safety.damping', [4.0, 3.0])
@@ -137,7 +137,7 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
     run.ros.until(lambda: run.law.guard.supervisor.text)
     silent = run.law.guard.last_stamp
     activate(run.ros, run.arm)
-    run.ros.until(lambda: clock.advance(0.01) or run.arm._offered)
+    run.ros.until(lambda: clock.advance(0.01) or run.arm.is_offered)
     run.run(20)
     deactivate(run.ros, run.law)
     activate(run.ros, run.law)  # after a stop, keeping only the estimates

@@ -24,7 +24,7 @@ from random_arm import random_urdf
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
 
-from command import COMMAND, wait_for
+from command import COMMAND, NO_PICTURES, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
@@ -96,24 +96,24 @@ def test_arm_ghost_and_path_are_drawn(page):
     tip = tip_of(past[-1].position)
     np.testing.assert_allclose(node(page, '/payload').position, tip, atol=1e-6)
     assert not node(page, '/payload').visible
-    assert not page._ghost.show_visual  # the error is too small to be seen
+    assert not page.ghost.show_visual  # the error is too small to be seen
     page.move([*past, past[-1]._replace(error=np.array([0.02, 0.0]), loaded=True)])
-    assert page._ghost.show_visual
+    assert page.ghost.show_visual
     assert node(page, '/payload').visible
 
 
 def test_plots_show_the_share_of_the_bound_and_a_caption_what_is_held(page):
     page.plot(moving(1.0, error=-0.001))
-    assert 't = 0.97 s' in page._caption.content
-    assert 'held' not in page._caption.content
+    assert 't = 0.97 s' in page.caption.content
+    assert 'held' not in page.caption.content
     page.plot(moving(2.0, error=-0.001))
-    assert 'held: 2.000 +- 0.05 kg' in page._caption.content
-    errors, torques = (plot.data for plot in page._plots[:2])
+    assert 'held: 2.000 +- 0.05 kg' in page.caption.content
+    errors, torques = (plot.data for plot in page.plots[:2])
     assert errors[0][-1] == pytest.approx(1.97, abs=0.01)  # s
     np.testing.assert_allclose(errors[1], 50.0)  # % of the bound
     np.testing.assert_allclose(errors[3], 100.0)
     assert (torques[1][-1], torques[2][-1]) == (3.0, -1.0)  # unknown: below the axis
-    model, weight = (plot.data for plot in page._plots[2:])
+    model, weight = (plot.data for plot in page.plots[2:])
     assert (model[1][-1], model[2][-1]) == pytest.approx((10.0, 30.0))  # %
     assert [line[-1] for line in weight[1:4]] == pytest.approx([2.0, 1.95, 2.05])  # kg
 
@@ -123,13 +123,13 @@ def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
     page.events([(1.0, 'plant', '2 kg picked up')])
     page.move(past)
     page.plot(past)
-    for plot in page._plots:
+    for plot in page.plots:
         (at,) = np.flatnonzero(plot.data[-1] == 1.0)
         assert plot.data[0][at - 1 : at + 2] == pytest.approx([1.0, 1.0, 1.0])
         assert np.all(np.diff(plot.data[0]) >= 0.0)
         assert np.isfinite(plot.data).all()
     assert node(page, '/event').text == 'plant: 2 kg picked up'
-    assert '2 kg picked up' in page._list.content
+    assert '2 kg picked up' in page.event_list.content
 
 
 def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
@@ -147,30 +147,30 @@ def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
     assert text.text.endswith('at most 0.4 N m')
     shown = [each._replace(**felt) for each in past]
     page.plot([*shown, touched])
-    assert text.text in page._caption.content
-    assert (page._plots[2].data[1][-1], page._plots[2].data[2][-1]) == (0.1, -2.0)
+    assert text.text in page.caption.content
+    assert (page.plots[2].data[1][-1], page.plots[2].data[2][-1]) == (0.1, -2.0)
     page.move(shown)
     page.plot(shown)
     assert not node(page, '/contact').visible
-    assert 'external' not in page._caption.content
+    assert 'external' not in page.caption.content
     page.draw_arm(ControllerConfig(), {})
 
 
 def test_run_that_has_ended_is_replayed_by_a_slider(page):
     run = moving(30.0)
     page.offer_replay(run)
-    slider = page._slider
+    slider = page.slider
     assert (slider.min, slider.max) == (run[0].time, run[-1].time)
     slider.value = 10.01
-    assert 't = 10.00 s' in page._caption.content
-    assert page._plots[0].data[0][[0, -1]] == pytest.approx([0.0, 10.0])
+    assert 't = 10.00 s' in page.caption.content
+    assert page.plots[0].data[0][[0, -1]] == pytest.approx([0.0, 10.0])
     np.testing.assert_allclose(
         node(page, '/path').points[-1, 1], tip_of(run[300].position), atol=1e-6
     )
     slider.value = 25.0
-    assert page._plots[0].data[0][0] == pytest.approx(5.0, abs=0.1)
+    assert page.plots[0].data[0][0] == pytest.approx(5.0, abs=0.1)
     page.offer_replay([])
-    assert page._slider is None
+    assert page.slider is None
 
 
 def test_payloads_and_other_events_of_a_plant_are_listed():
@@ -262,14 +262,14 @@ EVENT = {'events.begin': [1.0], 'events.duration': [0.5], 'events.payload': [0.2
 
 
 def events_with(view, word):
-    return [event for event in view.page._events if word in f'{event}']
+    return [event for event in view.page.listed if word in f'{event}']
 
 
 def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     view = ros.add(ViewNode, port=18180)
-    ros.until(lambda: view.page._state == ('STALE', WAITING))
+    ros.until(lambda: view.page.shown_state == ('STALE', WAITING))
     arm, law = ros.loop({**EVENT, 'autostart': False})
-    ros.until(lambda: view._plant)
+    ros.until(lambda: view.plant)
     assert configure(ros, arm)
     assert activate(ros, arm)
     ros.until(lambda: view.past and view.past[-1].time > 2.0)
@@ -278,14 +278,14 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     assert now.bound == pytest.approx([0.002, 0.002])
     assert now.truth[:3] == pytest.approx([1.0, 0.32, 0.4])
     assert np.isfinite(now.estimate[:3]).all()
-    assert view.page._state == ('OK', 'tracking')
+    assert view.page.shown_state == ('OK', 'tracking')
     assert [t for t, *_ in events_with(view, '0.25 kg picked up')] == [1.0]
     assert [t for t, *_ in events_with(view, '0.25 kg put down')] == [1.5]
 
     streamed = ros.publisher(topics.JOINT_POSITIONS)
     ros.until(streamed.get_subscription_count)
     ahead = now.position.copy()
-    inputs = law._status.trajectories
+    inputs = law.status.trajectories
     for _ in range(20):
         ahead += 2e-3
         streamed.publish(Float64MultiArray(data=ahead.tolist()))
@@ -294,7 +294,7 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     ros.until(lambda: events_with(view, 'of targets'))
     assert len(events_with(view, 'of targets')) == 1
     assert np.abs(view.past[-1].error).max() < 0.002
-    assert view.page._state == ('OK', 'tracking')
+    assert view.page.shown_state == ('OK', 'tracking')
     chunk = JointTrajectory(joint_names=['joint1', 'joint2'])
     chunk.points.append(JointTrajectoryPoint(positions=ahead.tolist()))
     chunk.points[0].time_from_start.sec = 1
@@ -312,12 +312,16 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     learned, initial, true = now.squares
     assert 0.0 < learned < initial < true  # the estimates began at half the parameters
     ros.kill(law)
-    ros.until(lambda: view.page._state[0] == 'ERROR' and 'gone' in view.page._state[1])
+    ros.until(
+        lambda: (
+            view.page.shown_state[0] == 'ERROR' and 'gone' in view.page.shown_state[1]
+        )
+    )
     # The arm goes on without it: its last error is no longer shown.
     assert np.isfinite(view.past[-1].error).all()
     states = view.create_publisher(JointState, 'joint_states', 1)
     state = JointState(name=['joint1', 'joint2'], position=[0.1, 0.2])
-    state.header.stamp.sec = view._sampled // 10**9 + 2
+    state.header.stamp.sec = view.sampled // 10**9 + 2
     ros.until(lambda: states.publish(state) or view.past[-1].position[0] == 0.1)
     assert np.isnan(view.past[-1].error).all()
     view.close()
@@ -337,7 +341,7 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     arm, law = ros.loop(
         {**push, **force, 'autostart': False}, {'contact.enabled': True}
     )
-    ros.until(lambda: view._config)
+    ros.until(lambda: view.config)
     assert configure(ros, arm)
     assert activate(ros, arm)
     ros.until(lambda: view.past and view.past[-1].time > 7.5)
@@ -366,14 +370,17 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     (event,) = events_with(view, 'external torque on joint1')
     assert event[:2] == (pytest.approx(at, abs=1e-3), 'contact')
     # Once it has ended, all of it can be looked at.
-    assert view.page._slider is None
+    assert view.page.slider is None
     assert deactivate(ros, law)
     assert cleanup(ros, law)
-    ros.until(lambda: view.page._slider)
-    assert view.page._state == ('OK', 'finished: the controller has ended normally')
-    assert view.page._slider.max > 8.0
-    view.page._slider.value = 7.0
-    shown = float(re.search(r't = (.*?) s', view.page._caption.content)[1])
+    ros.until(lambda: view.page.slider)
+    assert view.page.shown_state == (
+        'OK',
+        'finished: the controller has ended normally',
+    )
+    assert view.page.slider.max > 8.0
+    view.page.slider.value = 7.0
+    shown = float(re.search(r't = (.*?) s', view.page.caption.content)[1])
     assert 6.0 < shown <= 7.0
     view.close()
 
@@ -383,7 +390,8 @@ def test_page_replays_a_run_until_the_user_goes_on(tmp_path):
     out = tmp_path / 'run'
     words = ('--view', '--mode', 'lockstep', '--duration', '3', '--out', str(out))
     ours, theirs = pty.openpty()
-    with subprocess.Popen((*COMMAND, *words), stdout=PIPE, stderr=theirs) as process:
+    command, env = (*COMMAND, *words), os.environ | NO_PICTURES
+    with subprocess.Popen(command, stdout=PIPE, stderr=theirs, env=env) as process:
         os.close(theirs)
         said = b''
         expected = rb'(?s)(?=.*the run has ended).*open (http://127.0.0.1:\d+)\s'
@@ -412,7 +420,10 @@ def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
         '--out',
         str(out),
     )
-    with subprocess.Popen(command, stdout=PIPE, stderr=STDOUT, text=True) as process:
+    env = os.environ | NO_PICTURES
+    with subprocess.Popen(
+        command, stdout=PIPE, stderr=STDOUT, text=True, env=env
+    ) as process:
         output = ''
         while not (found := re.search(r'open (http://127.0.0.1:\d+)', output)):
             output += process.stdout.readline()

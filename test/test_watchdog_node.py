@@ -433,9 +433,9 @@ def test_watchdog_whose_torques_nobody_takes_is_not_ready(ros):
     state = JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2))
     states.publish(state)
     ros.until(lambda: node.watchdog.has_state)
-    assert 'nobody subscribes' in node._status().text
+    assert 'nobody subscribes' in node.status().text
     ros.driver()
-    ros.until(lambda: states.publish(state) or node._status().is_ready)
+    ros.until(lambda: states.publish(state) or node.status().is_ready)
 
 
 def test_watchdog_stays_silent_when_states_are_back_after_a_long_silence(ros):
@@ -567,16 +567,16 @@ def test_controller_reports_a_watchdog_that_is_missing(ros, promised):
     law = ros.add(ControllerNode, {'safety.expect_watchdog': promised})
     if not promised:
         for _ in range(20):
-            law._on_second()
+            law.on_second()
         watchdog = ros.add(WatchdogNode)
-        ros.until(lambda: law._on_second() or law._watchdog._seen)
+        ros.until(lambda: law.on_second() or law._watchdog._seen)
         assert not any('torque_watchdog is missing' in line.msg for line in log)
         ros.kill(watchdog)
         watchdog._raw_subscriptions.close()
-    ros.until(lambda: law._on_second() or missing())
+    ros.until(lambda: law.on_second() or missing())
     ros.until(lambda: any('torque_watchdog is missing' in line.msg for line in log))
     ros.add(WatchdogNode)
-    ros.until(lambda: law._on_second() or not missing())
+    ros.until(lambda: law.on_second() or not missing())
 
 
 def test_controller_does_not_take_the_watchdog_for_an_arm(ros):
@@ -597,5 +597,5 @@ def test_controller_does_not_take_the_watchdog_for_an_arm(ros):
     ros.spin(0.2)
     assert watchdog.watchdog.config.torque.limit == (15.0, 9.0)  # as changed before
     assert law.guard.journal.messages == 0
-    law._on_second()
+    law.on_second()
     assert law.others == 0

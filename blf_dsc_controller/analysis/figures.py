@@ -184,7 +184,7 @@ def draw(run: Run, folder: str | Path, metrics: Metrics | None = None) -> list[P
     if changes and run.column('error', 0) is not None:
         paths.append(change)
         title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
-        draw_panels(change, title, list(_close_up(run, changes[0])), 1, _CLOSE_UP)
+        draw_panels(change, title, list(close_up(run, changes[0])), 1, _CLOSE_UP)
     if of('Parameters'):
         title = 'Learning'
         error = metrics.final_parameter_error
@@ -197,7 +197,7 @@ def draw(run: Run, folder: str | Path, metrics: Metrics | None = None) -> list[P
     return paths
 
 
-def _close_up(run: Run, change: float) -> Iterator[Panel]:
+def close_up(run: Run, change: float) -> Iterator[Panel]:
     """Yield errors, torques and the error of the model around a change."""
     begin, end = change - _BEFORE, change + _AFTER
     found = panels([run], begin, end)

@@ -210,7 +210,7 @@ def precompile(options: Namespace) -> None:
     """Compile the kernels of controller, watchdog and plant, in two parallel processes."""
     config = load_loop(options.config)
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
-        list(pool.map(_compile, (config.controller, config.plant)))
+        list(pool.map(compile_kernels, (config.controller, config.plant)))
     if options.package:
         print(
             f'{options.config}: the kernels are in {ship()}, for all who use this copy'
@@ -221,7 +221,8 @@ def precompile(options: Namespace) -> None:
     )
 
 
-def _compile(config: ControllerConfig | PlantConfig) -> None:
+def compile_kernels(config: ControllerConfig | PlantConfig) -> None:
+    """Compile what the nodes call: those of controller and watchdog, or that of the plant."""
     if isinstance(config, ControllerConfig):
         Guard(config)
         JointStateDecoder(config.joints)

@@ -170,6 +170,10 @@ class ExcitationProblem:
     `harmonics` is the highest harmonic of the window in the reference.  The torque is
     computed for the initial estimate, with and without the payload.  The links have
     this radius; the floor is at this height in the base frame [m].
+
+    Attributes:
+        reach: of the positions (n,) [rad] from their middle.
+        limits: usable ones (4, n) of position from the middle, velocity, acceleration, torque.
     """
 
     def __init__(
@@ -193,8 +197,8 @@ class ExcitationProblem:
         lower = np.array(config.limits.position_lower)
         upper = np.array(config.limits.position_upper)
         self._middle = 0.5 * (lower + upper)
-        self._reach = 0.5 * (upper - lower)
-        self._limits = self._usable_limits(config)
+        self.reach = 0.5 * (upper - lower)
+        self.limits = self._usable_limits(config)
         self._base = 2.0 * np.pi / config.learning.window
         self._units = self._largest_amplitudes()
         samples = _SAMPLES_PER_HARMONIC * max(harmonics, 2)
@@ -206,7 +210,7 @@ class ExcitationProblem:
     def _usable_limits(self, config: ControllerConfig) -> np.ndarray:
         """Return limits (4, n) of position from the middle, velocity, acceleration, torque."""
         limits = config.limits
-        position = self._reach - self._settings.barrier.bound
+        position = self.reach - self._settings.barrier.bound
         velocity = _SPEED * np.array(limits.velocity)
         acceleration = _SPEED * np.array(limits.acceleration)
         torque = _TORQUE * self._settings.torque.limit
@@ -215,7 +219,7 @@ class ExcitationProblem:
     def _largest_amplitudes(self) -> np.ndarray:
         """Return for each joint and harmonic (n, h) what alone would reach a limit of motion."""
         rates = self._base * np.arange(1, self.harmonics + 1)
-        motion = self._limits[:3]  # of position, and of its first two derivatives
+        motion = self.limits[:3]  # of position, and of its first two derivatives
         reached = [np.outer(limit, rates**-k) for k, limit in enumerate(motion)]
         return np.asarray(np.min(reached, axis=0))
 
@@ -237,7 +241,7 @@ class ExcitationProblem:
         unit = self._units
         amplitude = np.concatenate(list(x[n:].reshape(2, n, h) * unit), axis=1)
         return {
-            'offset': tuple((self._middle + self._reach * x[:n]).tolist()),
+            'offset': tuple((self._middle + self.reach * x[:n]).tolist()),
             'amplitude': tuple(amplitude.ravel().tolist()),
             'frequency': tuple(np.tile(self._base * np.arange(1, h + 1), 2).tolist()),
             'phase': tuple(np.repeat((0.0, -0.5 * np.pi), h).tolist()),
@@ -250,7 +254,7 @@ class ExcitationProblem:
         rows = self._rows(q, dq, ddq)
         torque = np.abs(rows @ self._guess.T).max(axis=2)
         ratios = (
-            np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self._limits
+            np.abs(np.stack((q - self._middle, dq, ddq, torque), axis=1)) / self.limits
         )
         room = self._clearance.room(q)
         over = (ratios - 1.0 + _MARGIN, _MARGIN - room)

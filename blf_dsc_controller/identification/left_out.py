@@ -134,7 +134,7 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
     theta = (G @ links)[:-1]
     P = theta[: rows.p]
     P_loaded = P + rows.load @ theta[-LOAD:]
-    transmitted = _transmitted(rows, values)
+    transmitted = transmitted_torques(rows, values)
     twist = _TWIST / np.maximum(rows.largest_torque, _TINY)
     g, slope = weighting(rows.every * rows.period)
     regressors = np.zeros((2, n, rows.p))
@@ -164,7 +164,7 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
     return found
 
 
-def _transmitted(rows: Rows, values: Floats) -> OnDisk:
+def transmitted_torques(rows: Rows, values: Floats) -> OnDisk:
     """Return the torque that each joint transmits to its link, and its rate (N, 2 n)."""
     from scipy.signal import savgol_filter
 

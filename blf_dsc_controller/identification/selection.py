@@ -44,7 +44,7 @@ def select(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Selected:
     folds = found.folds.sum(axis=1, keepdims=True)
     prior = full.only(_worthwhile(found._replace(folds=folds), full))
     pairs = folds[::2] + folds[1::2]
-    widths = _widths(found._replace(folds=pairs), prior)
+    widths = prior_widths(found._replace(folds=pairs), prior)
     widened = prior.widened(_factors(prior, widths))
     return Selected(distances, widened, widths, found)
 
@@ -94,7 +94,7 @@ def _worthwhile(found: Regression, prior: Prior) -> list[Entry]:
     return kept
 
 
-def _widths(found: Regression, prior: Prior) -> dict[str, float]:
+def prior_widths(found: Regression, prior: Prior) -> dict[str, float]:
     """Return the factor of each group's width, raised as long as that predicts better.
 
     Every fold must agree: a disturbance that lasts for a part of the recording looks

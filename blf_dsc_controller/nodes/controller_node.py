@@ -54,6 +54,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard: runs the guarded law; None until the node is configured.
         outputs: take the loop's messages beside the topics: joint states, torques,
             telemetry and events.
+        starting: what is looked at before the first state is used.
+        status: diagnostics and events; its `trajectories` are the motions that were asked for.
+        action: offers trajectories as an action; None: nobody can ask for any.
+        load_service: what the drives are told of the load; None: nothing.
+        warned_at: stamp of the start that the last warning was about [ns].
     """
 
     def __init__(self, **options: Any) -> None:
@@ -62,7 +67,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.outputs = Outputs()
         self._loop: GuardedLoop | None = None
         self._load: ReferenceLoad | None = None
-        self._load_service: LoadService | None = None
+        self.load_service: LoadService | None = None
         joints = self.config.joints
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
@@ -71,7 +76,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._polled = 0  # joint states at the last poll
-        self._warned_at = -1  # stamp of the start that the last warning was about
+        self.warned_at = -1  # stamp of the start that the last warning was about
         self._told_gains = False  # that nobody has measured whether the arm bears them
         self._turned_at = -1  # likewise, of the last reference shifted by turns
         # whether the tracking errors had subscribers at the last count
@@ -82,10 +87,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._ends_at = 0.0  # s, at the latest, since a signal
         # joint states processed by then, and when the last was
         self._last_seen = 0, 0.0
-        self._status = ControllerStatus(self, joints, self.outputs)
-        self._action: TrajectoryAction | None = None
+        self.status = ControllerStatus(self, joints, self.outputs)
+        self.action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
-        self._start = ControllerStart(
+        self.starting = ControllerStart(
             self.config,
             self._decoder,
             StartConditions(self, self._watchdog, self._steady),
@@ -116,9 +121,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().info(end)
         load = self.config.load
         if load.service:
-            if self._load_service is None:
-                self._load_service = LoadService(self, self.config)
-            self._load_service.begin()
+            if self.load_service is None:
+                self.load_service = LoadService(self, self.config)
+            self.load_service.begin()
         elif load.tell_drive:
             self.get_logger().warning(
                 'load.tell_drive: without load.service no load is declared to the '
@@ -140,14 +145,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
             joints = self.config.joints
             inputs = motion_input_of(self, len(joints), lambda: self.guard)
-            self._status.trajectories = inputs
-            self._action = offered_action(self, inputs, joints)
-        self._start.look_around(self._outputs[topics.COMMANDS], self.config)
+            self.status.trajectories = inputs
+            self.action = offered_action(self, inputs, joints)
+        self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
         self._report()
 
     def activate(self) -> None:
         """Take command with the next joint state."""
-        self._start.measure()
+        self.starting.measure()
         if self.guard is not None:
             self._begin_again(self.guard)
             self.guard.activate()
@@ -166,7 +171,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def release(self) -> None:
         """Command the torque to leave behind and release the law."""
         self._leave()
-        self._start.close()
+        self.starting.close()
         self.guard = None
         self._loop = None
         self._report()
@@ -174,14 +179,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def close(self) -> None:
         """Command the torque to leave behind; wait until all have received it."""
         self._leave()
-        process.drain([*self._outputs.values(), self._status.journal])
+        process.drain([*self._outputs.values(), self.status.journal])
 
     def destroy_node(self) -> None:
         """Destroy the node, and end the process of its action."""
-        if self._action is not None:
-            self._action.close()
-            self._action = None
-        self._start.close()
+        if self.action is not None:
+            self.action.close()
+            self.action = None
+        self.starting.close()
         super().destroy_node()
 
     def prepare_to_end(self) -> bool:
@@ -204,19 +209,19 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _begin_again(self, guard: Guard) -> None:
         """Look at the conditions of the start, if this node does not command now."""
         if guard.silenced or not guard.commanding:
-            self._start.look_around(self._outputs[topics.COMMANDS], self.config)
+            self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
 
     def _leave(self) -> None:
         """Command the torque that drivers may hold, and release the guard."""
         if self.guard is not None:
             self._command(self.guard.release())
-            self._status.publish_events(self.guard)
+            self.status.publish_events(self.guard)
 
     def reset(self) -> str:
         """Restart with the next joint state and the initial estimates."""
         if self.guard is not None:
             if self.guard.start_error is not None:
-                self._start.measure()
+                self.starting.measure()
             self._begin_again(self.guard)
             self.guard.reset()
         self.failure = None
@@ -246,10 +251,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None:
             return
-        if self._start.hold_early(guard, raw):
-            self._report_if_changed(guard)
+        if self.starting.hold_early(guard, raw):
+            self.report_if_changed(guard)
             return
-        trajectories = self._status.trajectories
+        trajectories = self.status.trajectories
         if trajectories is not None and trajectories.job is not None:
             trajectories.poll(guard)
         try:
@@ -263,14 +268,14 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.has_sample:
             self._look_at_learning(guard)
         self._publish_telemetry(torque)
-        if self._action is not None:
-            self._action.poll(guard)
+        if self.action is not None:
+            self.action.poll(guard)
         if guard.waiting_for:
             self.get_logger().warning(
                 f'not started, waiting for a usable joint state: {guard.waiting_for}',
                 throttle_duration_sec=WAITING_PERIOD,
             )
-        self._report_if_changed(guard)
+        self.report_if_changed(guard)
 
     def _is_simulated(self) -> bool:
         """Whether all joint states are of this package's simulated arm."""
@@ -283,12 +288,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
             return False
         self.get_logger().fatal(''.join(traceback.format_exception(error)))
         self._command(self.guard.fail(f'{type(error).__name__}: {error}'))
-        self._report_if_changed(self.guard)
+        self.report_if_changed(self.guard)
         return True
 
     def _torque_for(self, guard: Guard, raw: bytes) -> np.ndarray | None:
-        if self._load_service is not None:
-            self._load_service.follow(guard, self.config)
+        if self.load_service is not None:
+            self.load_service.follow(guard, self.config)
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
@@ -342,10 +347,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if columns != self._columns:
             self._columns = columns
             names = self._loop.estimates if self._loop is not None else ()
-            self._status.rejected = rejected_columns(guard.controller, names)
-            for reason in self._status.rejected.values():
+            self.status.rejected = rejected_columns(guard.controller, names)
+            for reason in self.status.rejected.values():
                 self.get_logger().warning(reason)
-            has_changed |= bool(self._status.rejected)
+            has_changed |= bool(self.status.rejected)
         if has_changed:
             self._report()
 
@@ -368,18 +373,18 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Check for missing states."""
         self._changes.poll()
         guard = self.guard
-        if self._action is not None:
-            self._action.poll(guard)
+        if self.action is not None:
+            self.action.poll(guard)
         if guard is None:
             return False
-        held = self._start.release(guard)
+        held = self.starting.release(guard)
         if held is not None:
             self._on_joint_state(held)
         self._command(guard.watch())
-        self._report_if_changed(guard)
+        self.report_if_changed(guard)
         is_watched = guard.watchdog.on and guard.commanding
         polled, self._polled = self._polled, guard.journal.messages
-        return is_watched or self._start.held is not None or polled != self._polled
+        return is_watched or self.starting.held is not None or polled != self._polled
 
     # Changes of the configuration, and reports.
 
@@ -407,9 +412,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 telemetry = self._loop.telemetry
                 self._publish(telemetry.bound(guard.journal.stamp, bound, limit))
 
-    def _report_if_changed(self, guard: Guard) -> None:
-        if not self._status.has_news(guard):
-            self._status.publish_events(guard)
+    def report_if_changed(self, guard: Guard) -> None:
+        """Publish new events, and diagnostics if they tell anything new."""
+        if not self.status.has_news(guard):
+            self.status.publish_events(guard)
             return
         supervisor = guard.supervisor
         self._log_phase(guard)
@@ -423,14 +429,15 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.finished = True
         self._report()
 
-    def _on_second(self) -> None:
+    def on_second(self) -> None:
+        """Look for what may appear or vanish beside this node, and report."""
         self._look_for_watchdog()
-        if self._load_service is not None:
-            self._load_service.look()
-        super()._on_second()
+        if self.load_service is not None:
+            self.load_service.look()
+        super().on_second()
         guard = self.guard
-        if guard is not None and guard.start_stamp != self._warned_at:
-            self._warned_at = guard.start_stamp
+        if guard is not None and guard.start_stamp != self.warned_at:
+            self.warned_at = guard.start_stamp
             if not self._is_simulated():
                 self._warn_of_start(guard)
 
@@ -491,7 +498,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.get_logger().info('tracking the reference')
 
     def _report(self) -> None:
-        self._status.report(
+        self.status.report(
             self.state_label, self.guard, self.others, self._watchdog.problem
         )
 

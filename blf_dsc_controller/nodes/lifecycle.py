@@ -169,7 +169,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
     def start(self) -> None:
         """Start timers and services, and the node itself if `autostart` is set."""
         PollingTimer(self, PERIOD, self._on_poll)
-        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self._on_second)
+        create_steady_timer(self, _DIAGNOSTICS_PERIOD, self.on_second)
         self.create_service(Trigger, '~/reset', self._on_reset)
         if self.config.autostart:
             self.autostart()
@@ -201,7 +201,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
     def _report(self) -> None:
         """Publish diagnostics."""
 
-    def _on_second(self) -> None:
+    def on_second(self) -> None:
         """Warn of other publishers of this node's output, and report."""
         if self._outputs:
             publisher = next(iter(self._outputs.values()))

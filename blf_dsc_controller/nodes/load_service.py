@@ -32,6 +32,8 @@ class LoadService:
     Attributes:
         problem: why the drives are told nothing more, or empty.
         told: what they have accepted last; None: nothing.
+        to_frame: points of the tip in the frame that the service wants (4, 4).
+        client: of the service; None until it is found.
     """
 
     def __init__(self, node: Node, config: ControllerConfig) -> None:
@@ -43,8 +45,8 @@ class LoadService:
         self.told: DriveLoad | None = None
         self._node = node
         self._name = node.resolve_service_name(config.load.service)
-        self._to_frame = np.linalg.solve(frame, tip)
-        self._client: Any = None
+        self.to_frame = np.linalg.solve(frame, tip)
+        self.client: Any = None
         self._type = ''
         self._asked: DriveLoad | None = None
         self._answer: Any = None
@@ -52,7 +54,7 @@ class LoadService:
 
     def look(self) -> None:
         """Look for the service, rarely: its type says what it needs."""
-        if self._client is not None or self.problem:
+        if self.client is not None or self.problem:
             return
         types = dict(self._node.get_service_names_and_types()).get(self._name, ())
         if not types:
@@ -73,7 +75,7 @@ class LoadService:
             )
             return
         self._type = types[0]
-        self._client = self._node.create_client(service, self._name)
+        self.client = self._node.create_client(service, self._name)
 
     def begin(self) -> None:
         """Begin with a new law, which knows nothing of loads declared before."""
@@ -86,28 +88,29 @@ class LoadService:
 
     def follow(self, guard: Guard, config: ControllerConfig) -> None:
         """Take over what was accepted since the last state; ask for the next step."""
-        if self._client is None or self.problem:
+        if self.client is None or self.problem:
             return
         self._states += 1
         if self._asked is not None:
             self._await(guard, self._asked)
-        elif self._states >= EVERY and self._client.service_is_ready():
+        elif self._states >= EVERY and self.client.service_is_ready():
             self._states = 0
             if config.load.in_motion or guard.is_at_rest:
-                self._ask(guard.load_to_tell())
+                self.ask(guard.load_to_tell())
 
-    def _ask(self, load: DriveLoad | None) -> None:
+    def ask(self, load: DriveLoad | None) -> None:
+        """Ask the service to accept a load in the tip, if it is one."""
         if load is None:
             return
-        centre = (self._to_frame @ np.append(load.centre, 1.0))[:3]
-        request = self._client.srv_type.Request()
+        centre = (self.to_frame @ np.append(load.centre, 1.0))[:3]
+        request = self.client.srv_type.Request()
         try:
             _FILLS[self._type](request, load.mass, centre * (load.mass > 0.0))
         except AttributeError as error:
             self._give_up(f'{self._name}: its request has other fields ({error})')
             return
         self._asked = load
-        self._answer = self._client.call_async(request)
+        self._answer = self.client.call_async(request)
 
     def _await(self, guard: Guard, asked: DriveLoad) -> None:
         if not self._answer.done():

@@ -66,7 +66,11 @@ _RESET_TIMEOUT = 2.0  # s for the controller to respond
 class PlantNode(LoopNode[PlantConfig]):
     """Node that publishes measured joint states and applies the received torques.
 
-    `latency` measures how long, in real time, the arm waits for its torques.
+    Attributes:
+        latency: measures how long, in real time, the arm waits for its torques.
+        start_stamp: stamp of the plant's begin [ns].
+        is_offered: whether the first state was published, once its peers are there.
+        has_torque: whether a torque has answered the last state.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -85,7 +89,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._reported_rejected = 0
         self._diagnostics = DiagnosticsPublisher(self, joints)
         self._step_timer: Timer | None = None
-        self._start_stamp = FIRST_STAMP
+        self.start_stamp = FIRST_STAMP
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
         self._tell_parameters()
@@ -124,8 +128,8 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def deactivate(self) -> None:
         """Stop time: the arm stays where it is, and torques are not applied."""
-        self._offered = self._running = False
-        self._has_torque = True
+        self.is_offered = self._running = False
+        self.has_torque = True
         self._published = self._began = 0.0
         self._first = 0
         self._torque_waits = self._stale = False
@@ -141,7 +145,7 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def reset(self) -> str:
         """Return the arm to its start, braked, and then reset the controller."""
-        self._start_stamp = self.stamp + _BETWEEN_RUNS
+        self.start_stamp = self.stamp + _BETWEEN_RUNS
         self.deactivate()
         self.plant.reset()
         self._halt = ''
@@ -153,15 +157,15 @@ class PlantNode(LoopNode[PlantConfig]):
     @property
     def stamp(self) -> int:
         """Time of the present sample [ns]."""
-        return self._start_stamp + self.plant.elapsed_ns
+        return self.start_stamp + self.plant.elapsed_ns
 
     # The loop.
 
     def _on_poll(self) -> bool:
         if self.finished or self.state_label != 'active':
             return False
-        waits = (self._lockstep or not self._running) and not self._has_torque
-        if not self._offered:
+        waits = (self._lockstep or not self._running) and not self.has_torque
+        if not self.is_offered:
             if not next(self._peers, False):
                 self._offer()
         elif waits and self._now() - self._published > _REPEAT_PERIOD:
@@ -203,8 +207,8 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def _offer(self) -> None:
         if not self._lockstep:
-            self._start_stamp = self._wall() - self.plant.elapsed_ns
-        self._offered = True
+            self.start_stamp = self._wall() - self.plant.elapsed_ns
+        self.is_offered = True
         measurement = self.plant.measure().copy()
         measurement[len(self.config.joints) :] = nan
         for ahead in range(self.config.sensor.incomplete_states, 0, -1):
@@ -224,16 +228,16 @@ class PlantNode(LoopNode[PlantConfig]):
                 f'command rejected: {error}', throttle_duration_sec=1.0
             )
             return
-        if not self._offered and self.state_label != 'inactive':
+        if not self.is_offered and self.state_label != 'inactive':
             return
         if not self.input.take(size, self._decoder.values, self.plant.sample):
             self.get_logger().error(self.input.problem, throttle_duration_sec=1.0)
             return
-        if not self._offered:
+        if not self.is_offered:
             self._torque_waits = self.plant.sample > 0
             return
         self.latency.torque_received(self._now())
-        self._has_torque = True
+        self.has_torque = True
         if not self._running:
             self.get_logger().info('first torque received: brake off')
             self._release()
@@ -315,7 +319,7 @@ class PlantNode(LoopNode[PlantConfig]):
             process.drain(self._outputs.values())
         stamp = self.stamp
         measurement = self.plant.measure()
-        self._has_torque = False
+        self.has_torque = False
         self._published = self._now()
         self.latency.state_published(self._published)
         if (motors := self.plant.motor_reading) is not None:
@@ -329,9 +333,7 @@ class PlantNode(LoopNode[PlantConfig]):
     def _tell_parameters(self) -> None:
         """Publish all parameters, in force from the start."""
         given = flatten(self.config)
-        self._changes.publish(
-            Change(self._start_stamp, given, configured=True).encode()
-        )
+        self._changes.publish(Change(self.start_stamp, given, configured=True).encode())
 
     def _reconfigure(self, config: PlantConfig) -> None:
         self._changed |= differences(self.config, config)

@@ -61,6 +61,11 @@ class BagRecorderNode(PlainNode):
 
     Raises ConfigurationError if a parameter is invalid, BagError if the bag's folder
     exists.
+
+    Attributes:
+        bag: where messages are written.
+        waiting: messages that wait for the first joint state, with the plant as the clock.
+        plant_time: stamp of the last joint state [ns]; -1 before the first.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -77,35 +82,36 @@ class BagRecorderNode(PlainNode):
         self._twice: dict[int, RecentMessages] = {}
         self._joint_states = self.resolve_topic_name(JOINT_STATES.relative)
         self._handle_of_states = 0
-        self._waiting: list[RawMessage] = []  # for the first joint state
-        self._plant_time = -1  # ns; -1 before the first joint state
-        create_steady_timer(self, _DISCOVERY_PERIOD, self._discover)
+        self.waiting: list[RawMessage] = []  # for the first joint state
+        self.plant_time = -1  # ns; -1 before the first joint state
+        create_steady_timer(self, _DISCOVERY_PERIOD, self.discover)
         PollingTimer(self, _TAKE_PERIOD, self._record)
         # The folder is created last: from here on, any end of the node also completes
         # the bag.
-        self._bag = BagWriter(
+        self.bag = BagWriter(
             self._config.output,
             compression=self._config.compression,
             flush_interval=_FLUSH_INTERVAL,
         )
-        self.get_logger().info(f'recording into {self._bag.path}')
+        self.get_logger().info(f'recording into {self.bag.path}')
 
     def close(self) -> None:
         """Write the waiting messages, complete the bag and log a summary."""
         self._record()
         self._raw_subscriptions.close()
-        if self.failure is not None or self._bag.closed:
+        if self.failure is not None or self.bag.closed:
             return
         try:
-            for message in self._waiting:  # there was no joint state
-                self._bag.write(*message)
-            self._bag.close()
+            for message in self.waiting:  # there was no joint state
+                self.bag.write(*message)
+            self.bag.close()
         except OSError as error:
-            raise self._bag.abandon(error) from error
+            raise self.bag.abandon(error) from error
         for line in self._summary():
             self.get_logger().info(line)
 
-    def _discover(self) -> None:
+    def discover(self) -> None:
+        """Subscribe to topics that have appeared since."""
         try:
             found = self.get_topic_names_and_types()
         # caused by one participant, but rclpy then returns no topics
@@ -165,7 +171,7 @@ class BagRecorderNode(PlainNode):
         if self.failure is not None:
             return
         offered = [quality_of(each.qos_profile) for each in publishers]
-        handle = self._bag.add_topic(topic, types[0], offered)
+        handle = self.bag.add_topic(topic, types[0], offered)
         self._recorded.add(topic)
         quality = compatible(offered, self._config.queue_depth)
         self._raw_subscriptions.subscribe(topic, types[0], quality, handle)
@@ -189,14 +195,14 @@ class BagRecorderNode(PlainNode):
         taken = self._raw_subscriptions.take()
         try:
             for message in self._timed(self._without_repeats(taken)):
-                self._bag.write(*message)
+                self.bag.write(*message)
             if flush:
-                self._bag.flush()
+                self.bag.flush()
             else:
-                self._bag.flush_if_due()
+                self.bag.flush_if_due()
         except OSError as error:
             self.finished = True
-            self.failure = self._bag.abandon(error)
+            self.failure = self.bag.abandon(error)
         return len(taken) > _RARE
 
     def _without_repeats(self, taken: Iterable[RawMessage]) -> list[RawMessage]:
@@ -219,21 +225,21 @@ class BagRecorderNode(PlainNode):
         for message in messages:
             if message.handle == self._handle_of_states:
                 with suppress(MessageError):
-                    self._plant_time = max(
-                        self._plant_time, joint_state_stamp(message.raw)
+                    self.plant_time = max(
+                        self.plant_time, joint_state_stamp(message.raw)
                     )
-            self._waiting.append(message)
-            if self._plant_time >= 0:
+            self.waiting.append(message)
+            if self.plant_time >= 0:
                 timed += [
-                    each._replace(received=self._plant_time) for each in self._waiting
+                    each._replace(received=self.plant_time) for each in self.waiting
                 ]
-                self._waiting = []
+                self.waiting = []
         return timed
 
     def _summary(self) -> Iterator[str]:
         for topic in self._chosen.difference(self._recorded, self._skipped):
             yield f'{topic}: never appeared'
-        for topic, count in self._bag.message_counts.items():
+        for topic, count in self.bag.message_counts.items():
             yield f'{topic}: {count} messages'
 
 

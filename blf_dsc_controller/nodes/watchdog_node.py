@@ -263,7 +263,7 @@ class WatchdogNode(PlainNode):
         listening = sum(is_listener(each.node_name) for each in found)
         return self._output.get_subscription_count() > listening
 
-    def _status(self) -> Status:
+    def status(self) -> Status:
         """Return what this node can do now."""
         watchdog = self.watchdog
         status = self._status_of(watchdog)
@@ -294,7 +294,7 @@ class WatchdogNode(PlainNode):
 
     def _look(self) -> None:
         """Report what this node can do if that has changed."""
-        status = self._status()
+        status = self.status()
         if status == self._reported:
             return
         if status.level == OK:
@@ -302,7 +302,7 @@ class WatchdogNode(PlainNode):
         self._report()
 
     def _report(self) -> None:
-        status = self._status()
+        status = self.status()
         takeovers = 0 if self.watchdog is None else self.watchdog.takeovers
         values = {'takeovers': takeovers, READY: status.is_ready}
         part = ('torque', status.level, status.text, values)

@@ -225,12 +225,12 @@ class Rerun:
         while guard.journal.commands < before and not self._is_over:
             if not self._next():
                 self.end = self.end or 'the bag does not say which states were used'
-        while not (_is_own(event) or guard.commanding or guard.supervisor.uses_states):
+        while not (is_own(event) or guard.commanding or guard.supervisor.uses_states):
             k = self._position + 1
             if k >= self._stamp.size or self._stamp[k] > event.stamp:
                 break
             self._process(k)  # nothing was commanded for it
-        if _is_own(event) and not guard.journal.pending and not self._is_over:
+        if is_own(event) and not guard.journal.pending and not self._is_over:
             self._reach(event)
 
     def _reach(self, event: Event) -> None:
@@ -295,7 +295,7 @@ class Rerun:
         if _reason(event) is Reason.FAILED:  # nothing shows how far the law got
             self.end = f'the law failed, {event.content["text"]}'
             return
-        if pending and not _is_own(event):
+        if pending and not is_own(event):
             self._report_departure(pending[0], event)
             return
         try:
@@ -308,7 +308,7 @@ class Rerun:
             return
         if pending and _key(pending[0]) == _key(event):
             self._compare(event, pending.popleft())
-        elif pending and _is_own(event):
+        elif pending and is_own(event):
             self._report_departure(pending[0], event)
         else:
             is_stop = event.type is EventType.STOP
@@ -450,7 +450,7 @@ def _check(events: Sequence[Event]) -> None:
             )
 
 
-def _is_own(event: Event) -> bool:
+def is_own(event: Event) -> bool:
     """Whether the controller decides on an event itself, because of a message."""
     is_stop = event.type is EventType.STOP
     own = (

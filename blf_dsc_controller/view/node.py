@@ -90,6 +90,9 @@ class ViewNode(PlainNode):
         page: what is served.
         past: the snapshots of the last `PAST` seconds.
         run: snapshots of the whole run, at most `_KEPT`, evenly spaced.
+        config: of the controller that is shown; None: none has been seen.
+        plant: parameters of the simulated plant, if there is one.
+        sampled: stamp of the last tracking error [ns]; -1 before the first.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -100,8 +103,8 @@ class ViewNode(PlainNode):
         self.run: list[Snapshot] = []
         self._stride, self._taken = 1, 0  # of the snapshots that are kept
         self._is_offered = False  # whether the page offers to replay them
-        self._config: ControllerConfig | None = None
-        self._plant: dict[str, Any] = {}  # parameters of the simulated plant
+        self.config: ControllerConfig | None = None
+        self.plant: dict[str, Any] = {}  # parameters of the simulated plant
         self._planned: list[tuple[float, str, str]] = []  # its events
         self._bound: list[bytes] = []  # newest messages
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_LISTED)
@@ -110,7 +113,7 @@ class ViewNode(PlainNode):
             'STALE',
             f'waiting for a controller ({self.resolve_topic_name(topics.JOURNAL.relative)})',
         )
-        self._start = self._sampled = -1  # ns, stamps of start and last tracking error
+        self._start = self.sampled = -1  # ns, stamps of start and last tracking error
         self._pictures = self._silent = 0
         self._last_target = -inf  # s
         self._finished = False  # the controller has released the arm
@@ -140,7 +143,7 @@ class ViewNode(PlainNode):
                 self._note(message.handle, message.raw)
         # latched, it may come before the journal that says what it is of
         self._bound = streams.setdefault(topics.BOUND, self._bound)
-        has_state = self._config is not None and self._take(streams)
+        has_state = self.config is not None and self._take(streams)
         self._silent = 0 if has_state else self._silent + 1
         self.page.state(*self._health())
         self.page.events(list(self._events))
@@ -182,7 +185,7 @@ class ViewNode(PlainNode):
 
     def _health(self) -> tuple[str, str]:
         """Return the state of the controller, or that it or the arm has gone silent."""
-        if self._config is None or self._silent < _SILENCE:
+        if self.config is None or self._silent < _SILENCE:
             return self._state
         if self._finished:
             return 'OK', 'finished: the controller has ended normally'
@@ -222,10 +225,10 @@ class ViewNode(PlainNode):
         """Follow the parameters of the simulated plant."""
         plant = dict(change.parameters)
         if not change.configured:
-            plant = self._plant | plant
-        elif self._config is not None:
-            self.page.draw_arm(self._config, plant)
-        self._plant = plant
+            plant = self.plant | plant
+        elif self.config is not None:
+            self.page.draw_arm(self.config, plant)
+        self.plant = plant
         self._planned = plant_events(plant)
         if change.configured:
             self._noted = -1.0
@@ -269,14 +272,14 @@ class ViewNode(PlainNode):
 
     def _configure(self, config: ControllerConfig) -> None:
         try:
-            self.page.draw_arm(config, self._plant)
+            self.page.draw_arm(config, self.plant)
         except BlfDscError as error:  # anyone may have sent this plant
-            if not self._plant:
+            if not self.plant:
                 raise
             self._pass_over(error)
-            self._plant, self._planned = {}, []
+            self.plant, self._planned = {}, []
             self.page.draw_arm(config, {})
-        self._config = config
+        self.config = config
         estimates = estimate_names(config)
         joints = config.joints
         names = (
@@ -319,11 +322,11 @@ class ViewNode(PlainNode):
                 self._pass_over(error)
             else:
                 stamps[topic], self._values[topic] = at, values
-        self._sampled = max(stamps.get(topics.TRACKING_ERROR, -1), self._sampled)
+        self.sampled = max(stamps.get(topics.TRACKING_ERROR, -1), self.sampled)
         stamp = stamps.get(topics.JOINT_STATES)
         if stamp is None:
             return False
-        if stamp - self._sampled > _OUTDATED:  # the law is not running
+        if stamp - self.sampled > _OUTDATED:  # the law is not running
             for topic in (topics.TRACKING_ERROR, topics.EXTERNAL_TORQUE):
                 self._values[topic] = np.nan * self._values[topic]
         self._keep(self._time(stamp))

@@ -132,6 +132,12 @@ class Page:
     Attributes:
         server: the viser server.
         url: address to open in a browser.
+        shown_state: level and text of the controller's state.
+        listed: time [s], kind and text of the events, as in `event_list`.
+        caption: numbers of the last moment.
+        plots: errors and torques, and what has been learned.
+        ghost: the arm at its reference.
+        slider: replays a finished run; None before.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -146,8 +152,8 @@ class Page:
         with redirect_stdout(io.StringIO()):  # hides its banner
             self.server = PageServer(host, port)
         self.url = f'http://{host}:{self.server.get_port()}'
-        self._events: list[tuple[float, str, str]] = []
-        self._state = 'STALE', ''
+        self.listed: list[tuple[float, str, str]] = []
+        self.shown_state = 'STALE', ''
         self._corners: Floats | None = None  # joints and tip when first drawn
         self.server.on_client_connect(self._welcome)
         self._clear()
@@ -155,8 +161,8 @@ class Page:
     def _clear(self) -> None:
         """Show only the state until `draw_arm` is called."""
         server, gui = self.server, self.server.gui
-        self._list: Any = None
-        self._slider: Any = None
+        self.event_list: Any = None
+        self.slider: Any = None
         server.scene.reset()
         gui.reset()
         gui.configure_theme(
@@ -165,7 +171,7 @@ class Page:
         gui.main_panel.dock_right()
         server.scene.configure_default_lights(cast_shadow=False)  # costly without a GPU
         self._header = gui.add_html('')
-        self.state(*self._state)
+        self.state(*self.shown_state)
 
     def draw_arm(self, config: ControllerConfig, plant: Mapping[str, Any]) -> None:
         """Draw the arm of a controller, with the parameters of its plant."""
@@ -183,7 +189,7 @@ class Page:
         reach = arm.reach
         self._held = dict.fromkeys(model.actuated_joint_names, 0.0)
         self._drawn = ViserUrdf(server, model, root_node_name='/arm')
-        self._ghost = ViserUrdf(
+        self.ghost = ViserUrdf(
             server, shadow, root_node_name='/reference', mesh_color_override=_GHOST
         )
         self._base = np.array(model.get_transform(arm.chain.base))
@@ -192,7 +198,7 @@ class Page:
         tabs = self._tabs = gui.add_tab_group()
         with tabs.add_tab('Plots'):
             log = {'distr': 3, 'range': _AXIS_OF_SHARE}
-            self._plots = [
+            self.plots = [
                 self._plot(
                     f'{prefix}: largest error in 1 s [% of bound]',
                     names,
@@ -215,9 +221,9 @@ class Page:
                     _FROM_ZERO_KG,
                 ),
             ]
-            self._caption = gui.add_html('')
+            self.caption = gui.add_html('')
         with tabs.add_tab('Events'):
-            self._list = gui.add_html(event_list(self._events))
+            self.event_list = gui.add_html(event_list(self.listed))
 
     def _plot(
         self,
@@ -248,14 +254,14 @@ class Page:
 
     def offer_replay(self, run: Sequence[Snapshot]) -> None:
         """Offer a slider over these snapshots of an ended run; none without any."""
-        if self._slider is not None:
-            self._slider.remove()
-            self._slider = None
+        if self.slider is not None:
+            self.slider.remove()
+            self.slider = None
         if len(run) < _FEWEST:
             return
         times = [each.time for each in run]
         first, last = times[0], times[-1]
-        self._slider = self.server.gui.add_slider(
+        self.slider = self.server.gui.add_slider(
             'replay [s]',
             first,
             last,
@@ -265,16 +271,16 @@ class Page:
         )
 
         def show(_: Any) -> None:
-            at = bisect_right(times, self._slider.value)
+            at = bisect_right(times, self.slider.value)
             past = run[bisect_left(times, times[at - 1] - PAST) : at]
             self.move(past)
             self.plot(past)
 
-        self._slider.on_update(show)
+        self.slider.on_update(show)
 
     def state(self, level: str, text: str) -> None:
         """Show the state: level (OK, WARN, ERROR or STALE) and description."""
-        self._state = level, text
+        self.shown_state = level, text
         self._header.content = (
             f'{_SHEET}<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
             f'background:{_LEVELS[level]}"><b>{level}</b> {escape(text)}</div>'
@@ -282,10 +288,10 @@ class Page:
 
     def events(self, events: Sequence[tuple[float, str, str]]) -> None:
         """List these events: time [s], kind and text."""
-        if self._events != list(events):
-            self._events = list(events)
-            if self._list is not None:
-                self._list.content = event_list(self._events)
+        if self.listed != list(events):
+            self.listed = list(events)
+            if self.event_list is not None:
+                self.event_list.content = event_list(self.listed)
 
     def move(self, past: Sequence[Snapshot]) -> None:
         """Move the arm to the last of these snapshots."""
@@ -302,9 +308,9 @@ class Page:
             tip = placements[-1]
             self._mark_contact(now, placements[1:-1])
             reference = now.position - now.error
-            self._ghost.show_visual = bool(np.abs(now.error).max() > _APART)  # NaN: not
+            self.ghost.show_visual = bool(np.abs(now.error).max() > _APART)  # NaN: not
             if np.isfinite(reference).all():
-                self._ghost.update_cfg(self._posture(reference))
+                self.ghost.update_cfg(self._posture(reference))
             scene.add_icosphere(
                 '/payload',
                 0.045 * reach,
@@ -312,7 +318,7 @@ class Page:
                 position=tip,
                 visible=now.loaded,
             )
-            happened = [e for e in self._events if now.time - _SHOWN < e[0] <= now.time]
+            happened = [e for e in self.listed if now.time - _SHOWN < e[0] <= now.time]
             _, kind, text = happened[-1] if happened else (0.0, '', '')
             above = tip + np.array((0.0, 0.0, 0.1 * reach))
             scene.add_label(
@@ -368,11 +374,11 @@ class Page:
                 shares(of.squares, _PEAK),
                 weights(np.array(of.load)),
             )
-        marks = [e[0] for e in self._events if t[0] <= e[0] <= t[-1]]
+        marks = [e[0] for e in self.listed if t[0] <= e[0] <= t[-1]]
         with self.server.atomic():
-            for plot, values in zip(self._plots, curves, strict=True):
+            for plot, values in zip(self.plots, curves, strict=True):
                 plot.data = with_marks(t, values, marks)
-            self._caption.content = caption(now, contact_of(self._joints, now))
+            self.caption.content = caption(now, contact_of(self._joints, now))
 
     def _aim(self, camera: Any, width: float = inf) -> None:
         """Point a camera at the arm, which then fills a picture of this width [px]."""
