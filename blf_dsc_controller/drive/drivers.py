@@ -67,8 +67,8 @@ def _check_kind(address: str, path: Path, settings: DriveConfig) -> None:
     if is_bus and settings.driver == FRANKA:
         raise BlfDscError(
             f'{address} is a CAN bus, but {path} names no driver of motors: drive.driver is '
-            f'{FRANKA}, whose robot has an address in the network. For Damiao motors add '
-            f'drive.driver: {DAMIAO}, as config/yam.yaml does'
+            f'{FRANKA}, whose robot has an address in the network. For Damiao motors '
+            f'write a file with drive.driver: {DAMIAO}, as doc/motor_arms.md says'
         )
     if _HOST.match(address) and settings.driver == DAMIAO:
         raise BlfDscError(

@@ -60,7 +60,7 @@ from blf_dsc_controller.studies.monte_carlo import (
     plant_with,
     torque_error,
 )
-from blf_dsc_controller.writing import whole, writing
+from blf_dsc_controller.writing import whole
 from sim_plant.elastic import run_elastic_plant
 from sim_plant.kernels import run_plant
 from sim_plant.plant import plant_of
@@ -278,10 +278,12 @@ class Store:
         """Write results of consecutive runs atomically."""
         pa = require_pyarrow()
         path = self._path(runs)
-        with writing(path) as part, part.open('wb') as file:
+        unfinished = path.with_name(f'.{path.name}')
+        with unfinished.open('wb') as file:
             pa.parquet.write_table(pa.table(columns), file)
             file.flush()
             os.fsync(file.fileno())
+        unfinished.replace(path)
 
     def missing(self) -> list[range]:
         """Return the chunks of runs without results."""
