@@ -127,7 +127,7 @@ class Server(FrankaSimServer):
             self.cycle = 0
             time.sleep(_SLOW if self.current_motion_id else _IDLE)
         self.cycle += bool(moves)
-        for what in self.events[self.cycle] if self.cycle else ():
+        for what in self.events.pop(self.cycle, ()):  # once, of the first motion
             self.happen(what)
         self.physics_sim.step()
         fields = self.physics_sim.get_robot_state().items()
