@@ -38,7 +38,6 @@ _SIDES = {
 _RATES = {'dot', 'ddot', 'vel', 'velocity', 'speed', 'acc', 'acceleration'}
 _SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
 _NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
-_CALLED = {'q': 'positions', 'tau': 'torques', 'theta': 'positions of motors'}
 _SHOWN = 60  # names of columns in a message
 _RATE = re.compile(r'(\d*\.?\d+|\d+\.)\s*Hz', re.IGNORECASE)
 _RANGE = re.compile(r'(\d+):(\d+)')
@@ -146,16 +145,22 @@ def _of_joints(
     if found and len(found) <= len(joints):
         are_numbers = _RANGE.fullmatch(split_unit(given, kind).stem)
         return found if are_numbers else _by_number(found, kind)
-    if not (given or found) and any(_kind_of(name, joints) for name in names):
-        raise BlfDscError(
-            f'{path} has no columns that are named as {_CALLED[kind]}: {_listed(names)}. Are '
-            f'they in another file? Put both side by side: paste -d, {path} OTHER.csv > both.csv. '
-            f'Or choose columns, as in --map {kind}=1:7 (columns 1 to 6, the first is 0)'
-        )
     raise BlfDscError(
         f'{path}: which columns are {kind} of {", ".join(joints)} is not clear. Its columns are '
         f'{_listed(names)}: choose them, as in --map {kind}={kind}_* or --map {kind}=1:7 '
-        '(columns 1 to 6, the first is 0)'
+        f'(columns 1 to 6, the first is 0){_elsewhere(path, names, joints, given or found)}'
+    )
+
+
+def _elsewhere(
+    path: Path, names: Sequence[str], joints: Sequence[str], found: Sequence[str]
+) -> str:
+    """Return what to do if columns, of which none was found, are in another file."""
+    if found or not any(_kind_of(name, joints) for name in names):
+        return ''
+    return (
+        f'. If they are in another file, put both side by side: paste -d, {path} OTHER.csv > '
+        'both.csv'
     )
 
 
