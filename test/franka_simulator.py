@@ -39,7 +39,7 @@ _HAND = 'robot0_hand'
 _GRASP = np.array([0.0, 0.0, 0.12])  # m, of the load in the frame of the hand
 _PATIENCE = 20.0  # s, for a torque; then the client is gone
 _POLL = 0.02  # s, in which also what needs no message is noticed
-_IDLE = 0.01  # s, for a step while nothing moves
+_IDLE = 0.04  # s, for a step while nothing moves: a client reads but a few states then
 _SLOW = 0.3  # s, for a step of a motion that waits for its first torque
 
 
