@@ -355,7 +355,7 @@ def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):
 
 def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
     """Not once all postures have been measured."""
-    coarsen(arm, '1.0e-3')
+    coarsen(arm, '5.0e-3')
     options = ('--yes', '--torque', '0.01', '--travel', '1e-5')
     assert commission(arm, 'plant', *options, postures=(FAR, NEAR)) == 1
     told = capsys.readouterr().err
