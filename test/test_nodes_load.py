@@ -30,6 +30,7 @@ from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.supervision.supervisor import Reason
 from sim_plant.settings import plant_settings
 
 PACKAGES = ('ur_msgs', 'franka_msgs')
@@ -149,12 +150,16 @@ def test_driver_that_refuses_is_asked_once(services, ros):
     assert arm.law.guard.supervisor.running
 
 
-def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
-    """After a reset it knows of no load: nor may its commands take away what the drives add."""
+def told_two_kilograms(ros, services):
+    """Run an arm whose drives have been told what it picked up."""
     arm = Arm(ros, services['ur'], **{'load.in_motion': True})
     arm.run_until(8.5)
-    told = arm.law.load_service.told
-    assert told.mass == pytest.approx(2.0, abs=0.1)
+    assert arm.law.load_service.told.mass == pytest.approx(2.0, abs=0.1)
+    return arm
+
+
+def begins_again(ros, arm):
+    """Reset the law, and check that neither it nor the drives carry the load twice."""
     ros.reset(arm.law)
     guard = arm.law.guard
     ros.until(lambda: guard.time < 8.0)
@@ -162,6 +167,24 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     assert guard.supervisor.running, guard.supervisor.text
     # if the commands took away what the drives add, it would be 0.2
     assert guard.samples.ratio.max() < 0.1
+
+
+def test_law_that_begins_again_after_a_stop_leaves_the_load_to_the_drives(
+    services, ros
+):
+    """The safe torque carries what the law did, but not what the drives do."""
+    arm = told_two_kilograms(ros, services)
+    guard = arm.law.guard
+    guard.stop(Reason.FAILED, 'a test')
+    ros.until(lambda: guard.is_settled)
+    begins_again(ros, arm)
+
+
+def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
+    """After a reset it knows of no load: nor may its commands take away what the drives add."""
+    arm = told_two_kilograms(ros, services)
+    begins_again(ros, arm)
+    guard = arm.law.guard
     assert deactivate(ros, arm.law)
     ros.until(lambda: guard.is_settled)
     assert cleanup(ros, arm.law)

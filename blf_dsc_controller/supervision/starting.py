@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.checks import is_valid_state
+from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.supervision.findings import Findings
@@ -57,18 +58,28 @@ class Starting:
         """
         command = self._command
         command.note(EventType.RESET)
-        load = self._carried()
+        added = self._added_by_drives()
         command.reference.resumable = False
         command.controller.reset()
         self._loads.forget()
+        load = self._carried(added - self._added_by_drives())
         command.samples.keep()
         self._start_over()
         self._takeover.carried = load
         if load is not None:
             command.safe_stop.begin_anew(command.config.safety, load)
 
-    def _carried(self) -> Vector | None:
-        """Return the load (n,) [N m] besides the initial estimate that is carried now, if any."""
+    def _added_by_drives(self) -> Vector:
+        """Return what the law believes the drives to add (n,) [N m], where the arm was last."""
+        command = self._command
+        settings = command.controller.settings
+        return added_torque(settings.torque, command.safe_torque.last.q)
+
+    def _carried(self, forgotten: Vector) -> Vector | None:
+        """Return the load (n,) [N m] besides the initial estimate that is carried now, if any.
+
+        It is without what the drives hold and the law has just `forgotten` (n,) [N m].
+        """
         command = self._command
         if command.supervisor.running:
             return command.held.load_before_learning()
@@ -76,7 +87,8 @@ class Starting:
             return self._takeover.carried  # of a reset just before
         if not command.commanding or command.silenced:
             return None
-        return command.safe_stop.carried(command.config.safety)
+        load = command.safe_stop.carried(command.config.safety)
+        return None if load is None else load - forgotten
 
     def forget_load_after_gap(self, stamp: int, measurement: Vector) -> None:
         """Carry nothing on in a state that does not follow the last one: others may hold it."""
