@@ -151,7 +151,7 @@ def test_a_reset_begins_without_a_load_if_commands_may_not_have_reached_the_arm(
     arm = Arm('fr3')
     arm.run(3.0)
     carried = np.abs(arm.guard.controller.state.disturbance).max()
-    arm.guard._stop(reason, 'by hand')
+    arm.guard.stop(reason, 'by hand')
     arm.run(arm.config.sample_time)
     arm.guard.reset()
     arm.run(arm.config.sample_time)
