@@ -28,7 +28,7 @@ from blf_dsc_controller.law.innovation import CORRELATION
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
-_WINDOWS = 3.0
+_WINDOWS = 3.0  # of the learning; by choice, not derived
 _NOTHING = 0.1  # of that: rows of zeros before the first
 
 

@@ -117,7 +117,10 @@ def filter_interval(
 def residual(
     settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
 ) -> float:
-    """Return tau_J,L - X_L P_l of joint i [N m] for an `estimate` theta (m,)."""
+    """Return tau_J,L - X_L P_l of joint i [N m].
+
+    The `estimate` is theta (m,), `absorbed` is P_f (p,).
+    """
     filtered = state.filtered[i]
     p = filtered.size - 1
     r = filtered[p]
@@ -130,7 +133,7 @@ def residual(
 def load_torque(
     settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
 ) -> float:
-    """Return r of joint i [N m] for an `estimate` theta (m,)."""
+    """Return r of joint i [N m] for an `estimate` theta (m,), P_f (p,) `absorbed`."""
     if not has_settled(settings, state):
         return 0.0
     r = residual(settings, state, i, estimate, absorbed) - state.bias[i]
@@ -150,7 +153,8 @@ def update(
 ) -> None:
     """Compute r after an interval of `dt` [s], and its bias once the filters have settled.
 
-    The `information` (m, m) is the inverse covariance of the prior of theta.
+    The `information` (m, m) is the inverse covariance of the prior of theta; P_f (p,) is
+    `absorbed` of friction.
     """
     settling = _SETTLING / settings.observer_bandwidth
     before = state.elapsed[0]
