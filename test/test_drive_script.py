@@ -240,10 +240,10 @@ def test_a_pose_that_is_none_is_refused(arm):
 def test_what_no_drive_can_be_made_of_is_refused_in_one_line(
     given, message, monkeypatch
 ):
-    def start(_self):
+    def start(_wanted):
         raise AssertionError('a process was started')
 
-    monkeypatch.setattr(blf.Drive, '_start', start)
+    monkeypatch.setattr('blf_dsc_controller.drive.drive.LoopProcess', start)
     arguments = {'config': 'panda', 'robot': 'simulated', **given}
     with pytest.raises(DriveError, match=message) as raised:
         blf.Drive(**arguments)
@@ -457,7 +457,7 @@ def test_two_threads_that_move_one_arm_both_return(arm):
 
 def test_a_process_that_is_killed_is_an_error_and_another_can_be_started(tmp_path):
     with drive(tmp_path / 'bag') as arm:
-        os.kill(arm._process.pid, signal.SIGKILL)
+        os.kill(arm._loop.pid, signal.SIGKILL)
         with pytest.raises(
             LoopEndedError, match=r'ended by signal 9, without .* recover\(\) starts'
         ):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,7 +101,7 @@ def test_robot_is_connected_again_after_a_stop_and_after_a_disconnect(
 ):
     robot = make_robot_from_config(config_of('panda', record=f'{tmp_path / "bag"}'))
     robot.connect()
-    robot._arm._process.kill()
+    os.kill(robot._arm._loop.pid, signal.SIGKILL)
     wait_for(lambda: not robot.is_connected)
     with pytest.raises(LoopEndedError):
         robot.get_observation()

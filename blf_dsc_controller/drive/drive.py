@@ -9,13 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
-import os
-import signal
-import socket
-import subprocess
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -24,9 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blf_dsc_controller import child
-from blf_dsc_controller.control import goal_messages
-from blf_dsc_controller.control.goal_messages import Answer, Outcome
 from blf_dsc_controller.drive.arguments import (
     checked_config,
     checked_joints,
@@ -39,6 +29,7 @@ from blf_dsc_controller.drive.arguments import (
     checked_timeout,
     hint_at_degrees,
 )
+from blf_dsc_controller.drive.loop_process import LoopProcess
 from blf_dsc_controller.errors import (
     DriveError,
     LoopEndedError,
@@ -46,19 +37,12 @@ from blf_dsc_controller.errors import (
     NotInTimeError,
 )
 from blf_dsc_controller.messages import script_link, topic_link
-from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.script_link import ArmState
 
 if TYPE_CHECKING:
     from blf_dsc_controller.drive.pose import Pose, Poses
 
-_PROCESS = 'blf_dsc_controller.drive.script_process'
-_ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
-_POLL = 0.1  # s
-_SILENCE = 60.0  # s without a word of a loop that runs
 _KEPT = 100  # results of motions
-_END = 5.0  # s, for a process that was told to end at once
-_LOG = logging.getLogger('blf_dsc_controller')
 
 
 class Drive:
@@ -74,9 +58,6 @@ class Drive:
     arm is held where it rests.  At the end of the block, or of the script, the arm is
     brought to rest, and the robot holds it by its own means.  Warnings and remarks of
     the loop go to the logger `blf_dsc_controller`.
-
-    Attributes:
-        joints: names of the n joints, in the order of all arrays.
     """
 
     def __init__(
@@ -100,22 +81,19 @@ class Drive:
         Raises:
             DriveError: file, robot or arm are not as they should be.
         """
-        self.joints: tuple[str, ...] = ()
         self._config = checked_config(config)
         self._overrides = checked_overrides(overrides)
         self._robot = checked_robot(robot)
         self._record = checked_record(record)
         self._starts = 0
-        self._news = threading.Condition()
-        self._owner = os.getpid()
-        self._number = 0
-        self._last = 0  # number of the last motion
+        self._number = 0  # of the last request
+        self._last = 0  # of the last motion
         self._hint = 0, ''  # of which motion, and what its error ends with
-        self._start()
+        self._loop = self._started()
 
     def __setattr__(self, name: str, value: object) -> None:
         """Refuse what other packages have as settings: here it would change nothing."""
-        if not name.startswith('_') and name != 'joints':
+        if not name.startswith('_'):
             raise DriveError(
                 f'{name}: a Drive has no such setting. The speed is given with each motion, as in '
                 'move_to(q, speed=0.1), and limits in the parameter file, or in overrides'
@@ -131,7 +109,7 @@ class Drive:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        ended = self._ended
+        ended = self.ended
         self.close()
         if kind is None and ended:
             raise LoopEndedError(ended)
@@ -246,7 +224,7 @@ class Drive:
             LoopEndedError: the loop has ended.
         """
         values = checked_positions(positions, self.joints)
-        self._put(script_link.POSITIONS, values.tobytes())
+        self._loop.put(script_link.POSITIONS, values.tobytes())
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait for the end of the last `move_to` or `follow` that did not.
@@ -305,15 +283,18 @@ class Drive:
     # State.
 
     @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the n joints, in the order of all arrays."""
+        return self._loop.joints
+
+    @property
     def state(self) -> ArmState:
         """The last state, some milliseconds old.
 
         Raises:
             LoopEndedError: the loop has ended.
         """
-        self._check()
-        assert self._state is not None  # noqa: S101 - since it runs
-        return self._state
+        return self._loop.state
 
     @property
     def pose(self) -> Pose:
@@ -341,13 +322,13 @@ class Drive:
         Raises:
             LoopEndedError: the loop has ended.
         """
-        self._check()
-        return self._last != 0 and self._last not in self._results
+        self._loop.check()
+        return self._last != 0 and not self._loop.has_result(self._last)
 
     @property
     def ended(self) -> str:
         """Why the loop has ended; empty while it runs."""
-        return self._ended
+        return self._loop.ended
 
     def recover(self) -> None:
         """Take command again after an end, such as a stop of the controller or a reflex.
@@ -357,162 +338,33 @@ class Drive:
         Raises:
             DriveError: the cause is still there.
         """
-        if not self._ended:
+        if not self.ended:
             return
-        if self._waits and self._process.poll() is None:
-            self._forget()
-            self._link.put(script_link.RECOVER, b'{}')
-            self._link.flush()
-            self._await_running()
+        self._last = 0
+        if self._loop.can_recover:
+            self._loop.recover()
         else:
-            self._end_process()
-            self._start()
+            self._loop.end()
+            self._loop = self._started()
 
     def close(self) -> None:
         """Bring the arm to rest, and end its loop; a second Ctrl-C ends it at once."""
-        if os.getpid() != self._owner:
-            return  # a fork of the script ends, and not the script
-        self._closed = True
-        if self._process.poll() is None:
-            try:
-                self._close_softly()
-            except KeyboardInterrupt:
-                self._tell_to_close()
-                self._end_process()
-                raise
-        self._end_process()
+        self._loop.close()
 
-    # The process.
-
-    def _start(self) -> None:
+    def _started(self) -> LoopProcess:
+        """Return another process, which records into a folder of its own."""
         self._starts += 1
-        self._closed = False
         record = self._record
         if record is not None and self._starts > 1:
             record = record.with_name(f'{record.name}_{self._starts}')
-        self._forget()
-        if os.name != 'posix':
-            raise DriveError(
-                'the loop of a Drive has a process of its own, which needs Linux or macOS: use '
-                'ArmController in a loop of yours'
-            )
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [*child.running_module(_PROCESS), f'{theirs.fileno()}'],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                env=dict.fromkeys(_ONE_THREAD, '1') | os.environ | child.places(),
-                start_new_session=True,  # Ctrl-C is for the script, which brakes
-            )
-        self._link = Link(ours)
-        wanted = {
-            'config': self._config,
-            'overrides': self._overrides,
-            'robot': self._robot,
-            'record': str(record) if record else None,
-        }
-        self._link.put(script_link.START, topic_link.encode(wanted))
-        self._link.flush()
-        link = self._link
-        self._listener = threading.Thread(
-            target=self._listen, args=(link,), daemon=True
+        return LoopProcess(
+            {
+                'config': self._config,
+                'overrides': self._overrides,
+                'robot': self._robot,
+                'record': str(record) if record else None,
+            }
         )
-        self._listener.start()
-        try:
-            self._await_running()
-        except BaseException:
-            if self._process.poll() is None:
-                self._process.send_signal(signal.SIGTERM)
-            self._end_process()
-            raise
-
-    def _forget(self) -> None:
-        """Forget what an earlier loop told."""
-        self._state: ArmState | None = None
-        self._ended = ''
-        self._waits = self._runs = False
-        self._results: dict[int, tuple[type[DriveError] | None, str]] = {}
-        self._last = 0
-        self._heard = time.monotonic()
-
-    def _await_running(self) -> None:
-        self._until(lambda: self._runs and self._state is not None, None)
-
-    def _close_softly(self) -> None:
-        """Tell the loop to end, and wait as long as it says something."""
-        self._tell_to_close()
-        self._heard = time.monotonic()
-        while self._process.poll() is None:
-            if time.monotonic() - self._heard > _SILENCE:
-                _LOG.error(f'the loop does not end: silent for {_SILENCE:g} s, killed')
-                return
-            with self._news:
-                self._news.wait(_POLL)
-
-    def _tell_to_close(self) -> None:
-        self._link.put(script_link.CLOSE, b'null')
-        self._link.flush()
-
-    def _end_process(self) -> None:
-        """Wait for a process that is about to end, or kill it."""
-        try:
-            self._process.wait(_END)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._listener.join()
-        self._link.close()
-
-    # What the process tells, in a thread.
-
-    def _listen(self, link: Link) -> None:
-        while not link.broken:
-            link.wait(_POLL)
-            for kind, content in link.messages():
-                with self._news:
-                    self._take(kind, content)
-                    self._news.notify_all()
-        code = self._process.wait()
-        with self._news:
-            if link is self._link and not self._ended:
-                self._waits = False
-                self._ended = _death(code)
-            self._news.notify_all()
-
-    def _take(self, kind: int, content: bytes) -> None:
-        self._heard = time.monotonic()
-        if kind == script_link.SAMPLE:
-            self._state = script_link.decode_sample(content, len(self.joints))
-            return
-        if kind == script_link.GOAL:
-            self._take_goal(goal_messages.decode(content))
-            return
-        told = topic_link.decode(content)
-        if kind == script_link.RUNNING:
-            self.joints = tuple(told)
-            self._runs = True
-        elif kind == script_link.DONE:
-            error = MotionFailedError if told['problem'] else None
-            self._results[told['number']] = error, told['problem']
-        elif kind == script_link.ENDED:
-            reason = f': {told["text"]}' if told['text'] else ''
-            self._waits = told['waits']
-            self._ended = f'{told["end"]}{reason}'
-        elif kind == script_link.FAILED:
-            self._waits = False
-            self._ended = told
-        elif kind == topic_link.LOG:
-            _LOG.log(logging.getLevelName(told['level'].upper()), told['text'])
-
-    def _take_goal(self, told: goal_messages.Message) -> None:
-        if isinstance(told, Answer) and not told.accepted:
-            self._results[told.number] = MotionFailedError, told.reason
-        elif isinstance(told, goal_messages.End):
-            done = told.outcome is Outcome.SUCCEEDED
-            self._results[told.number] = None if done else MotionFailedError, told.text
-
-    # What the script wants.
 
     def _begin(
         self,
@@ -525,18 +377,17 @@ class Drive:
     ) -> None:
         """Begin a motion; `hint` is what its error ends with."""
         checked_timeout(timeout)
-        self._check()
+        self._loop.check()
         self._number += 1
         self._last = number = self._number
         self._hint = number, hint
-        with self._news:  # another thread may still ask for that of the last motion
-            for each in [each for each in self._results if each < number - _KEPT]:
-                del self._results[each]
+        # another thread may still ask for that of the last motion
+        self._loop.forget_results(before=number - _KEPT)
         if kind == script_link.FOLLOW:
             content = script_link.HEAD.pack(number) + topic_link.encode(wanted)
         else:
             content = topic_link.encode({**wanted, 'number': number})
-        self._put(kind, content)
+        self._loop.put(kind, content)
         if wait:
             self._await_motion(number, timeout)
 
@@ -549,7 +400,7 @@ class Drive:
         except KeyboardInterrupt:
             # where no block ends with it, as in a notebook, the arm would go on
             with contextlib.suppress(LoopEndedError):
-                self._put(script_link.BRAKE, topic_link.encode(number))
+                self._loop.put(script_link.BRAKE, topic_link.encode(number))
             raise
 
     def _ask(
@@ -558,63 +409,11 @@ class Drive:
         checked_timeout(timeout)
         self._number += 1
         number = self._number
-        self._put(kind, topic_link.encode(wanted(number)))
+        self._loop.put(kind, topic_link.encode(wanted(number)))
         self._await_result(number, timeout)
 
-    def _put(self, kind: int, content: bytes) -> None:
-        self._check()
-        self._link.put(kind, content)
-        self._link.flush()
-
     def _await_result(self, number: int, timeout: float | None) -> None:
-        self._until(lambda: number in self._results, timeout)
-        error, text = self._results[number]
-        if error is not None:
+        problem = self._loop.await_result(number, timeout)
+        if problem is not None:
             of, hint = self._hint
-            raise error(text + hint if number == of else text)
-
-    def _until(self, condition: Callable[[], bool], timeout: float | None) -> None:
-        """Wait until a condition holds; the link is flushed meanwhile."""
-        end = time.monotonic() + checked_timeout(timeout)
-        with self._news:
-            while not condition():
-                self._check()
-                if time.monotonic() > end:
-                    raise NotInTimeError(f'not over after {timeout} s')
-                self._link.flush()
-                self._news.wait(_POLL)
-
-    def _check(self) -> None:
-        """Raise LoopEndedError if the loop has ended, or says nothing any more.
-
-        Raises:
-            DriveError: in a fork of the script, which hears nothing of the loop.
-        """
-        if os.getpid() != self._owner:
-            raise DriveError(
-                f'this Drive is of process {self._owner}, and this is a fork of it: command the '
-                'arm there'
-            )
-        if self._ended and self._closed:
-            raise LoopEndedError(
-                'this Drive was closed, as at the end of its block: make another one, or '
-                'recover() starts it again'
-            )
-        if self._ended:
-            again = 'takes command again' if self._waits else 'starts another loop'
-            remedy = f'; recover() {again}' if self._runs else ''
-            raise LoopEndedError(f'{self._ended}{remedy}')
-        silent = time.monotonic() - self._heard
-        if self._runs and silent > _SILENCE:
-            raise LoopEndedError(
-                f'the loop has said nothing for {silent:.0f} s: look at the arm, then close()'
-            )
-
-
-def _death(code: int) -> str:
-    """Return what is known of a process that ended without a word."""
-    how = f'by signal {-code}' if code < 0 else f'with exit code {code}'
-    return (
-        f'the process of the loop ended {how}, without bringing the arm to rest: look at the '
-        'robot; stderr may say why'
-    )
+            raise MotionFailedError(problem + hint if number == of else problem)
