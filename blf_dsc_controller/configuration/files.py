@@ -246,8 +246,7 @@ class _Limited(yaml.composer.Composer):
             problem = f'nested more than {_DEEPEST} levels deep'
         elif self._nodes > _MOST_NODES:
             problem = (
-                f'more than {_MOST_NODES} entries, which no arm needs: give a parameter '
-                'file with less'
+                f'more than {_MOST_NODES} entries: leave out what does not belong here'
             )
         if problem:
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
