@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the package; one `except` of their common base class catches them all."""
 
+_MOST_LINES = 50  # of one message
+
 
 class BlfDscError(Exception):
     """Base class of all errors that this package raises on purpose; can be pickled."""
@@ -24,7 +26,7 @@ def check_type(
 
 
 class ConfigurationError(BlfDscError):
-    """Invalid configuration; the message lists every problem found."""
+    """Invalid configuration; the message lists the problems found, up to 50 of them."""
 
     def __init__(self, problems: list[str], source: str = '') -> None:
         super().__init__(problems, source)
@@ -35,7 +37,9 @@ class ConfigurationError(BlfDscError):
         """Return a line for each problem, below one with their number and source."""
         where = f' in {self.source}' if self.source else ''
         count = 'problem' if len(self.problems) == 1 else 'problems'
-        lines = ''.join(f'\n  - {problem}' for problem in self.problems)
+        lines = ''.join(f'\n  - {problem}' for problem in self.problems[:_MOST_LINES])
+        if len(self.problems) > _MOST_LINES:
+            lines += f'\n  - and {len(self.problems) - _MOST_LINES} more'
         return f'{len(self.problems)} {count} with the configuration{where}:{lines}'
 
 

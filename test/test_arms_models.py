@@ -474,6 +474,7 @@ WRONG_TEXTS = (  # what is replaced, by what, and the remedy
     (AXIS, '<axis xyz="0 0 0" />', 'is zero'),
     ('upper="2.8973"', 'upper="-3"', 'empty range, -2.8973 to -3'),
     (MASS, '<mass value="heavy" />', '<mass value="heavy">: expected 1 finite number'),
+    (MASS, '<mass value="0,73" />', 'write decimal points, and spaces between numbers'),
     (AXIS, '<axis xyz="0 1" />', 'expected 3 finite number'),
     (
         LINK8,
@@ -497,6 +498,14 @@ WRONG_CHAINS = (
     (
         {'tip': '', 'joints': ()},
         'Set robot.tip to the last link of the arm, such as panda_link7',
+    ),
+    (
+        {'text': re.sub('type="[rp]', 'type="x', PANDA_TEXT), 'tip': '', 'joints': ()},
+        "no joint moves: 'panda_joint1' is xevolute, ",
+    ),
+    (
+        {'text': '<robot><link name="a" /></robot>', 'tip': '', 'joints': ()},
+        'there is none. The joints of an arm are revolute, continuous, prismatic',
     ),
     ({'tip': 'panda_joint7'}, "is a joint, and the tip is a link: give 'panda_link7'"),
     ({'base': 'panda_joint1'}, "and the base is a link: give 'panda_link0'"),

@@ -482,6 +482,12 @@ def test_bag_of_another_format_or_without_metadata(
     assert (code, 'none of the recorded messages was lost' in output) == (0, True)
 
 
+def test_file_of_another_format_is_not_worth_a_recovery(tmp_path, all_say):
+    file = tmp_path / 'notes.mcap'
+    file.write_text('notes')
+    all_say(file, 'it is no MCAP file: give a bag')
+
+
 @pytest.mark.parametrize('declared', [1 << 27 | 1, 1 << 62])
 def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, all_say, declared):
     file = copy / 'bag_0.mcap'
@@ -524,7 +530,7 @@ def test_named_pipe_is_rejected_as_parameter_file_and_urdf(tmp_path, capsys):
     ('text', 'words'),
     [
         ('[' * 100_000, 'nested more than 50 levels'),
-        ('a:\n' + '- 1\n' * 100_000, 'more than 50000 entries'),
+        ('a:\n' + '- 1\n' * 100_000, 'more than 50000 entries: leave out'),
         (BOMB, 'does not support the alias'),
     ],
 )

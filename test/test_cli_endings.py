@@ -60,7 +60,16 @@ COMMANDS = {
 
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _ESCAPED = 99  # exit code after an exception that the command has let through
-ELSEWHERE = {'drive', 'precompile', 'arms', 'monte-carlo'}
+STUDY = """monte_carlo:
+  ros__parameters: {base: arm.yaml, runs: 2}
+"""
+BEFORE_THEIR_LOOP = {
+    'drive': 'drive --robot simulated --config arm.yaml --duration 0.1 --out moved',
+    'monte-carlo': 'monte-carlo --config study.yaml --out study',
+    'run over ROS': 'run --config arm.yaml --mode lockstep --duration 0.1 --out out',
+}
+"""Commands that need processes or real time: they end here before these begin."""
+ELSEWHERE = {'arms', 'precompile'}
 
 
 @pytest.fixture(scope='module')
@@ -69,6 +78,7 @@ def given(tmp_path_factory):
     folder = tmp_path_factory.mktemp('given')
     (folder / 'pendulum.urdf').write_text(PENDULUM)
     (folder / 'arm.yaml').write_text(FILE)
+    (folder / 'study.yaml').write_text(STUDY)
     time = np.arange(0.0, 8.0, 0.01)
     q = 0.8 * np.sin(2.0 * time) + 0.4 * np.sin(5.0 * time)
     ddq = -3.2 * np.sin(2.0 * time) - 10.0 * np.sin(5.0 * time)
@@ -193,7 +203,7 @@ def whole(given, tmp_path_factory):
 
 def test_each_command_is_tried_here_or_elsewhere():
     (commands,) = (each for each in make_parser()._actions if each.dest == 'command')
-    tried = {words.split()[0] for words in COMMANDS.values()}
+    tried = {words.split()[0] for words in (COMMANDS | BEFORE_THEIR_LOOP).values()}
     assert tried | ELSEWHERE == set(commands.choices)
 
 
@@ -210,6 +220,18 @@ def test_ctrl_c_while_files_are_written_is_one_line_and_leaves_none_in_part(
     )
     is_interrupted(ended, name)
     assert ended.files.items() <= whole(name).files.items()
+
+
+@pytest.mark.parametrize('at', [1, 2])
+@pytest.mark.parametrize('name', BEFORE_THEIR_LOOP)
+def test_ctrl_c_before_a_loop_begins_is_one_line_and_leaves_nothing(
+    given, tmp_path, name, at
+):
+    folder = shutil.copytree(given, tmp_path / 'here')
+    before = {*folder.rglob('*')}
+    ended = Ended(BEFORE_THEIR_LOOP[name].split(), folder, at=at)
+    is_interrupted(ended, name)
+    assert {*folder.rglob('*')} == before
 
 
 @pytest.mark.nightly
@@ -233,14 +255,35 @@ def is_interrupted(ended, name):
     assert not any(file.endswith(PART) for file in ended.files)
 
 
+@pytest.mark.parametrize('name', ['monte-carlo', 'run over ROS'])
+def test_full_disk_before_a_loop_begins_is_one_line_and_leaves_no_file(
+    given, tmp_path, name
+):
+    folder = shutil.copytree(given, tmp_path / 'here')
+    is_full(BEFORE_THEIR_LOOP[name], folder, tmp_path)
+
+
+def test_full_disk_ends_the_recording_of_a_drive_and_not_the_drive(given, tmp_path):
+    folder = shutil.copytree(given, tmp_path / 'here')
+    with limited_files(tmp_path / 'disk', 100):  # bytes
+        ended = Ended(BEFORE_THEIR_LOOP['drive'].split(), folder)
+    assert ended.code == 1
+    assert 'controlling simulated: Ctrl-C ends' in ended.lines
+    assert not any('Traceback' in line or 'Errno' in line for line in ended.lines)
+
+
 @pytest.mark.parametrize('name', sorted(COMMANDS.keys() - {'doctor'}))
 def test_full_disk_is_one_line_and_leaves_no_file(given, tmp_path, name):
     folder = shutil.copytree(given, tmp_path / 'here')
+    is_full(COMMANDS[name], folder, tmp_path)
+
+
+def is_full(words, folder, tmp_path):
     before = set(folder.rglob('*'))
     with limited_files(tmp_path / 'disk', 100):  # bytes
-        ended = Ended(COMMANDS[name].split(), folder)
+        ended = Ended(words.split(), folder)
     assert ended.code == 1
-    assert ended.lines[-1].startswith(f'blf_dsc {name.split()[0]}: ')
+    assert ended.lines[-1].startswith(f'blf_dsc {words.split()[0]}: ')
     assert 'File too large' in ended.lines[-1]
     assert not any('Traceback' in line or 'Errno' in line for line in ended.lines)
     assert not any(path.is_file() for path in set(folder.rglob('*')) - before)

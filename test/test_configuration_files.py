@@ -713,6 +713,22 @@ def test_missing_urdf_is_reported_with_the_places_where_it_was_looked_for(
     assert f'there is no {tmp_path / "no.urdf"}, nor {own}' in str(error.value)
 
 
+def test_missing_urdf_of_an_absolute_path_is_looked_for_once(file, tmp_path):
+    missing = tmp_path / 'no.urdf'
+    (problem,) = problems_of(file(section('/**', f'robot.urdf: {missing}')))
+    assert problem.count(str(missing)) == 2  # what was given, and where it is not
+
+
+def test_long_lists_of_problems_are_cut(file):
+    names = ', '.join(f'x{k}: 1' for k in range(1000))
+    with pytest.raises(ConfigurationError) as caught:
+        load_plant(file(section('sim_plant', names)))
+    lines = str(caught.value).splitlines()
+    assert lines[0].startswith('1000 problems')
+    assert lines[-1] == '  - and 950 more'
+    assert len(lines) == 1 + 50 + 1
+
+
 def test_arm_may_be_named_by_the_url_of_a_file(file, tmp_path):
     (tmp_path / 'mine.urdf').write_text(
         (share_folder() / 'config/ur5e.urdf').read_text(encoding='utf-8')

@@ -170,7 +170,7 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         (
             CONTROLLER,
             {'reference.phase': [0.0, 1.0]},
-            'got 2, but 1 entries are needed (1 of refe',
+            'got 2, but 1 entry is needed (1 of refe',
         ),
         # What parameters have to do with each other.
         (BOTH, {'joints': ['elbow', 'elbow']}, "the name 'elbow' is repeated"),

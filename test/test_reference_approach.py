@@ -407,7 +407,7 @@ def test_arm_far_beyond_its_limits_is_not_held(at):
     config = replace(CONFIG, reference=Reference(type='hold'))
     with pytest.raises(
         StartError,
-        match=r"joint 'joint2' would be held at .* rad, and its limits are -6.2",
+        match=r"joint 'joint2' would be held at .* rad, and its limits are -6.2.*degrees, give",
     ):
         plan_start(config, np.full(2, BOUND), np.array([0.0, at]), STILL)
     at_rest = np.array([0.0, 2.0 * np.pi + 0.09])

@@ -130,6 +130,9 @@ def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
         assert np.isfinite(plot.data).all()
     assert node(page, '/event').text == 'plant: 2 kg picked up'
     assert '2 kg picked up' in page.event_list.content
+    page.events([(1.5, 'release', '')])
+    page.move(past)
+    assert node(page, '/event').text == 'release'
 
 
 def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):

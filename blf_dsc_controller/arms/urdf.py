@@ -18,6 +18,7 @@ Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed 
 from __future__ import annotations
 
 import difflib
+import re
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,6 +41,7 @@ INERTIA_NAMES = ('m', 'm*cx', 'm*cy', 'm*cz', 'Ixx', 'Ixy', 'Iyy', 'Ixz', 'Iyz',
 INERTIA_UNITS = ('kg', *('kg m',) * 3, *('kg m^2',) * 6)
 
 _MOVING = ('revolute', 'continuous', 'prismatic')
+_MOST_KINDS = 5  # that a message names
 _ACCELERATIONS = ('acceleration', 'deceleration')  # of URDF 1.2
 _MAX_ELEMENTS = 500  # of links, and of joints
 _LIMITS = ('lower', 'upper', 'velocity', 'effort', *_ACCELERATIONS)
@@ -297,8 +299,13 @@ class Tree(NamedTuple):
     def only_chain(self) -> tuple[str, ...]:
         """Return the moving joints, which must be one chain."""
         moving = _moving([*self.joints.values()])
-        trunk = self.trunk() if moving else ()
-        if not moving or len(trunk) < len(moving):
+        if not moving:
+            raise BlfDscError(
+                f'no joint moves: {self._kinds()}. The joints of an arm are '
+                f'{", ".join(_MOVING)}'
+            )
+        trunk = self.trunk()
+        if len(trunk) < len(moving):
             such = (
                 f', such as {_link(self.joints[trunk[-1]], "child")}' if trunk else ''
             )
@@ -307,6 +314,13 @@ class Tree(NamedTuple):
                 f'{_listed(moving)}. Set robot.tip to the last link of the arm{such}'
             )
         return trunk
+
+    def _kinds(self) -> str:
+        kinds = [
+            f'{name!r} is {joint.get("type") or "of no type"}'
+            for name, joint in self.joints.items()
+        ]
+        return ', '.join(kinds[:_MOST_KINDS]) or 'there is none'
 
     def body(self, link: str, joints: Sequence[str]) -> _Body:
         """Return a link with all that it carries, where no other joint than `joints` moves."""
@@ -571,9 +585,15 @@ def _numbers(
     if len(numbers) != count or not all(abs(number) <= largest for number in numbers):
         raise BlfDscError(
             f'<{element.tag} {key}="{text}">: expected {count} finite number(s) of at most '
-            f'{largest:g} in magnitude'
+            f'{largest:g} in magnitude{_of_comma(text)}'
         )
     return np.array(numbers)
+
+
+def _of_comma(text: str) -> str:
+    """Return what to write instead of numbers with a comma; or empty."""
+    is_between = re.search(r'\d,\d', text)
+    return ': write decimal points, and spaces between numbers' if is_between else ''
 
 
 def _listed(names: Iterable[object]) -> str:

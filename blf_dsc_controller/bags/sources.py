@@ -36,7 +36,8 @@ FILES = {'.mcap', '.db3', '.bag'}
 """Suffixes of the files of a bag."""
 _TABLES = {'.csv', '.txt', '.npz', '.mat', '.parquet'}
 CDR = 'cdr'
-MAGIC_SIZE = 8
+_MAGIC = b'\x89MCAP0\r\n'
+MAGIC_SIZE = len(_MAGIC)
 HEAD = Struct('<BQ')  # opcode and content length, at the start of each record
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _MESSAGE = Struct('<HIQQ')
@@ -268,7 +269,17 @@ def _reason(path: Path, error: Exception) -> str:
         encoding = other_encoding(file)
         if encoding:
             return f'its messages are {encoding}, not CDR of ROS 2: {_remedy(encoding)}'
-    return f'{text}; to save the undamaged part: blf_dsc recover {path}'
+    remedy = f'{text}; to save the undamaged part: blf_dsc recover {path}'
+    is_other = not any(map(_has_magic, files))
+    return 'it is no MCAP file: give a bag' if is_other else remedy
+
+
+def _has_magic(file: Path) -> bool:
+    """Whether a file begins or ends as one in MCAP does, also if it was damaged."""
+    with file.open('rb') as stream:
+        begin = stream.read(MAGIC_SIZE)
+        stream.seek(-min(MAGIC_SIZE, file.stat().st_size), SEEK_END)
+        return _MAGIC in (begin, stream.read())
 
 
 def _near(path: Path) -> str:

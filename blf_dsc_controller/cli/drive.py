@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from blf_dsc_controller.cli.main import INTERRUPTED
+from blf_dsc_controller.cli.result_folder import only_if_begun
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.run import STOPPED, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
@@ -52,9 +53,10 @@ def drive(options: Namespace) -> int:
         print(f'errors to expect: {expectation(judged)}')
     if end := end_of_waypoints(config):
         print(end)
-    with announced_compilation(print_notice):
-        controller = ArmController(config, record=options.out, stamps='wall')
     with ExitStack() as ending:
+        begin = ending.enter_context(only_if_begun(options.out))
+        with announced_compilation(print_notice):
+            controller = ArmController(config, record=options.out, stamps='wall')
         ros = None
         if options.ros:
             ros = RosTopics(controller, options.namespace)
@@ -74,6 +76,7 @@ def drive(options: Namespace) -> int:
         )
         with signals_to(loop.request_end):
             print_notice(f'controlling {options.robot}: Ctrl-C ends')
+            begin()
             outcome = loop.run()
         _print(outcome, loop, controller)
     if ros is not None and ros.problem:

@@ -21,6 +21,8 @@ _OF_URDF = 'parameter file of an arm from a URDF, or a preset, such as ur5e'
 _WIDTH = 88
 _MOVED = {'paper': 'paper', 'tool': 'tool-bound', 'contacts': 'contacts'}
 """Commands of earlier versions, by their tables of `benchmark`."""
+_OTHERS = {'view': 'blf_dsc run --view shows a run, arm_view a running loop'}
+"""What is meant by words that are no command."""
 _Command: TypeAlias = Callable[..., Callable[..., Any]]
 
 
@@ -36,6 +38,10 @@ class _Parser(argparse.ArgumentParser):
         else:
             help_line = f'see {help_line}'
         self.exit(2, f'{self.prog}: {message}; {help_line}\n')
+
+    def takes(self, word: str) -> bool:
+        """Whether a word is an option of this command, other than that for help."""
+        return word in {*self._option_string_actions} - {'-h', '--help'}
 
     def refuse(self, unknown: str) -> NoReturn:
         """Exit with code 2 because of a word that this command does not take."""
@@ -450,7 +456,7 @@ def _add_studies(command: _Command) -> None:
     option(
         '--config', default='monte_carlo', help='study file, or a preset (monte_carlo)'
     )
-    option('--runs', type=int, help='number of runs (as configured)')
+    option('--runs', type=_positive, help='number of runs (as configured)')
     option(
         '--workers',
         type=_positive,
@@ -521,10 +527,17 @@ def check_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> None
             f'{words[0]} makes a table of the project: in a checkout, call '
             f'python -m benchmark {_MOVED[words[0]]}'
         )
+    if words and words[0] in _OTHERS:
+        parser.error(f'no command {words[0]}: {_OTHERS[words[0]]}')
     if words and not words[0].startswith('-') and words[0] not in known:
         close = difflib.get_close_matches(words[0], known, n=1)
         guess = f', did you mean {close[0]}?' if close else ''
         parser.error(f'no command {words[0]}{guess}; there are {", ".join(known)}')
+    behind = next((word for word in words if word in known), None)
+    if behind is not None and known[behind].takes(words[0]):
+        parser.error(
+            f'{words[0]} belongs behind the command: blf_dsc {behind} {words[0]} ...'
+        )
 
 
 def check_text(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
@@ -39,6 +41,26 @@ def refuse_existing(path: Path) -> None:
         raise BlfDscError(
             f'{path} exists already and is not overwritten: choose another --out'
         )
+
+
+@contextmanager
+def only_if_begun(path: Path | None) -> Iterator[Callable[[], None]]:
+    """Remove the folder that is made there meanwhile, unless what this yields was called.
+
+    Whatever ended it, an error or an interrupt, the same command can be given again.
+    """
+    existed = path is None or path.exists()
+    begun = False
+
+    def begin() -> None:
+        nonlocal begun
+        begun = True
+
+    try:
+        yield begin
+    finally:
+        if path is not None and not (begun or existed):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def discard_unrecorded() -> list[Path]:

@@ -278,7 +278,7 @@ def _check_posture(config: ControllerConfig, posture: Floats) -> None:
     n = len(config.joints)
     if posture.shape != (n,):
         raise BlfDscError(
-            f'posture: got {posture.size} angles, but the arm has {n} joints'
+            f'posture: got {posture.size} angles, but the arm has {n} joint{"s" * (n > 1)}'
         )
     limits = zip(
         config.joints,
@@ -289,10 +289,9 @@ def _check_posture(config: ControllerConfig, posture: Floats) -> None:
     )
     for joint, at, lower, upper in limits:
         if not lower + _ROOM <= at <= upper - _ROOM:
-            problem = _beyond(float(at), lower, upper)
             raise BlfDscError(
-                f'posture: {joint} would be at {at:.4g} rad, {problem} its limits, {lower:g} to '
-                f'{upper:g} rad'
+                f'posture: {joint} would be at {at:.4g} rad, '
+                f'{_beyond(float(at), lower, upper)}'
             )
 
 
@@ -300,12 +299,13 @@ _ROOM = 0.05  # rad
 
 
 def _beyond(at: float, lower: float, upper: float) -> str:
-    """Return how an angle [rad] is to the limits of its joint."""
+    """Return how an angle [rad] is to the limits of its joint, and what may be meant."""
+    limits = f'its limits, {lower:g} to {upper:g} rad'
     if lower <= at <= upper:
-        return f'less than {_ROOM:g} rad from'
-    degrees = abs(at) > 2.0 * math.pi and lower <= math.radians(at) <= upper
-    hint = f' ({at:g} degrees are {math.radians(at):.4g} rad)' if degrees else ''
-    return f'beyond{hint}'
+        return f'less than {_ROOM:g} rad from {limits}'
+    is_degrees = abs(at) > 2.0 * math.pi and lower <= math.radians(at) <= upper
+    hint = f': if this is in degrees, give {math.radians(at):.4g}' if is_degrees else ''
+    return f'beyond {limits}{hint}'
 
 
 def _rounded(values: Floats) -> tuple[float, ...]:

@@ -245,7 +245,9 @@ class _Limited(yaml.composer.Composer):
         elif self._depth > _DEEPEST:
             problem = f'nested more than {_DEEPEST} levels deep'
         elif self._nodes > _MOST_NODES:
-            problem = f'more than {_MOST_NODES} entries'
+            problem = (
+                f'more than {_MOST_NODES} entries: leave out what does not belong here'
+            )
         if problem:
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
         node = super().compose_node(parent, index)
@@ -334,8 +336,10 @@ def places_of(url: str) -> str:
     """Return where `resolve` has looked for a file that does not exist, in words."""
     if url.startswith('package://'):
         return str(resolve(url))
-    own = share_folder() / 'config' / url
-    return f'{Path(url).expanduser().absolute()}, nor {own}'
+    path = Path(url).expanduser()
+    if path.is_absolute():
+        return str(path)
+    return f'{path.absolute()}, nor {share_folder() / "config" / url}'
 
 
 def read_text(path: Path) -> str:

@@ -370,7 +370,8 @@ def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[st
             name if name.isdigit() else f'{count} of {name}'
             for count, name in zip(counts, param.length, strict=True)
         )
-        yield f'{param.name}: got {length}, but {needed} entries are needed ({factors})'
+        entries = 'entry is' if needed == 1 else 'entries are'
+        yield f'{param.name}: got {length}, but {needed} {entries} needed ({factors})'
 
 
 def _is(value: object, type_: Any) -> bool:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf
+from math import inf, pi, radians
 from typing import NamedTuple
 
 import numpy as np
@@ -298,15 +298,23 @@ def _via_centre(
 def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
     """Check that an arm at rest at q (n,) [rad] is at most `PAST_LIMITS` past its limits."""
     limits = zip(
-        config.limits.position_lower, config.limits.position_upper, strict=True
+        config.joints,
+        config.robot.kinds(config.joints),
+        config.limits.position_lower,
+        config.limits.position_upper,
+        strict=True,
     )
-    for joint, at, (lower, upper) in zip(config.joints, q, limits, strict=True):
-        if not lower - PAST_LIMITS <= at <= upper + PAST_LIMITS:
-            raise StartError(
-                f'joint {joint!r} would be held at {at:.6g} rad, and its limits are {lower:g} to '
-                f'{upper:g} rad: if the arm really is there, change limits.position_lower or '
-                'limits.position_upper'
-            )
+    for at, (joint, kind, lower, upper) in zip(q, limits, strict=True):
+        if lower - PAST_LIMITS <= at <= upper + PAST_LIMITS:
+            continue
+        unit = 'm' if kind == 'prismatic' else 'rad'
+        is_degrees = unit == 'rad' and abs(at) > 2.0 * pi
+        hint = f'; if this is in degrees, give {radians(at):.3g}'
+        raise StartError(
+            f'joint {joint!r} would be held at {at:.6g} {unit}, and its limits are {lower:g} to '
+            f'{upper:g} {unit}: if the arm really is there, change limits.position_lower or '
+            f'limits.position_upper{hint if is_degrees else ""}'
+        )
 
 
 def plan_start(

@@ -60,7 +60,7 @@ _FROM_ZERO = {
 _FROM_ZERO_KG = {  # at least 1 kg: an unknown load has no scale of its own
     'range': {
         'min': {'hard': 0.0, 'soft': 0.0, 'mode': 1},
-        'max': {'pad': 0.1, 'soft': 1.05, 'mode': 1},
+        'max': {'pad': 0.1, 'soft': 1.15, 'mode': 1},  # room for half of its number
     }
 }
 _NO_TICKS: Mapping[str, Any] = {'ticks': {'show': False, 'size': 0}}
@@ -322,7 +322,10 @@ class Page:
             _, kind, text = happened[-1] if happened else (0.0, '', '')
             above = tip + np.array((0.0, 0.0, 0.1 * reach))
             scene.add_label(
-                '/event', f'{kind}: {text}', position=above, visible=bool(kind)
+                '/event',
+                f'{kind}: {text}' if text else kind,
+                position=above,
+                visible=bool(kind),
             )
             recent = np.array(
                 [each.position for each in past if each.time > now.time - _TRAIL]
