@@ -29,12 +29,12 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.foresight import foresee, foresight_lines
 from blf_dsc_controller.identification.identify import identify_arm
+from blf_dsc_controller.identification.problems import problems_of
 from blf_dsc_controller.identification.recording import joined
 from blf_dsc_controller.identification.summary import (
     interval,
     load_table,
     notes_of,
-    problems_of,
 )
 from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
