@@ -51,9 +51,9 @@ def test_zeros_that_are_quarter_turns_off_are_named_and_not_applied(states, offs
     assert problem.startswith('OTHER ZEROS')
     for joint, offset in offsets.items():
         assert f'{-offset:+.5g} rad to panda_joint{joint}' in problem
-    # 1 % of noise, which windows smooth; as recorded, most of gravity is not explained
+    # 1 % of noise, which windows smooth; bodies that no arm has explain much as it is
     assert found.other_zeros.error < 1.0
-    assert found.score.total[2] > 10.0
+    assert found.score.total[2] > 5.0
 
 
 def test_right_zeros_are_not_doubted(states):

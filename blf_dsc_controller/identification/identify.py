@@ -3,8 +3,8 @@
 
 In four steps: the efforts are checked; the model is selected by cross-validation within
 the first four fifths of the motion; its values are fitted to these, and scored on the
-rest; then they are fitted to all of the motion.  If they do not explain the torques held
-back, other zeros of the joints are tried.
+rest; then they are fitted to all of the motion.  If gravity is explained far better by
+other zeros of the joints, these are tried.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alon
 from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.plausibility import shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
-from blf_dsc_controller.identification.problems import is_explained, is_usable
+from blf_dsc_controller.identification.problems import is_usable
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted
@@ -39,6 +39,7 @@ from blf_dsc_controller.run import Floats
 STAGES = ('reading', 'checking efforts', 'selecting terms', 'fitting', 'intervals')
 """What takes time, in this order."""
 
+_GOOD = 2.0  # % of the torque, error with which other zeros are not looked for
 _BETTER = 0.5  # times the error, at most, with zeros that are not the given ones
 _AS_GOOD = 1.1  # times that error, at most, without an offset that is not needed
 
@@ -157,7 +158,7 @@ def identify_arm(
         BlfDscError: the recording is too short or has no motion.
     """
     found = _identified(recording, robot, effort, picked_up, find_signs, begin)
-    if is_explained(found) or effort == 'without-gravity':
+    if found.score.total[2] < _GOOD or effort == 'without-gravity':
         return found
 
     def identified_at(offsets: Floats) -> Identified:

@@ -29,6 +29,7 @@ _FRICTION = ('viscous', 'Coulomb')
 _POSTURES = 200  # at most, that are compared
 _ROUNDS = 3  # over all pairs of joints
 _CLEAR = 0.98  # times the cost, at most, for which a zero is moved
+_BETTER = 0.5  # times the cost, at most, of zeros that are likelier than the given ones
 _CANDIDATES = 3  # that are fitted
 
 
@@ -50,7 +51,8 @@ def likely_zeros(recording: Recording, robot: Robot) -> list[Floats]:
     gravity = _Gravity(chain, np.array(robot.gravity), q, rows.u(0.0)[fit], columns)
     turning = [i for i, joint in enumerate(chain.joints) if joint.kind != 'prismatic']
     _search(gravity, turning, q.shape[1])
-    likely = (each for each in gravity.best() if any(each))
+    most = _BETTER * gravity.cost((0,) * q.shape[1])
+    likely = (each for each in gravity.best() if gravity.cost(each) < most)
     return [0.25 * TURN * np.array(each) for each in islice(likely, _CANDIDATES)]
 
 
