@@ -30,7 +30,7 @@ _POSTURES = 200  # at most, that are compared
 _ROUNDS = 3  # over all pairs of joints
 _CLEAR = 0.98  # times the cost, at most, for which a zero is moved
 _BETTER = 0.5  # times the cost, at most, of zeros that are likelier than the given ones
-_CANDIDATES = 3  # that are fitted
+_CANDIDATES = 2  # that are fitted
 
 
 def shifted(recording: Recording, offsets: Floats) -> Recording:
