@@ -57,6 +57,7 @@ from blf_dsc_controller.identification.identify import (
 from blf_dsc_controller.identification.physical import Cone, solve
 from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.problem import problem_of
+from blf_dsc_controller.identification.problems import problems_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import (
     Recording,
@@ -67,7 +68,6 @@ from blf_dsc_controller.identification.recording import (
 from blf_dsc_controller.identification.regression import regression
 from blf_dsc_controller.identification.scoring import nearest_friction
 from blf_dsc_controller.identification.sliding import COULOMB_SPEED, sliding_direction
-from blf_dsc_controller.identification.summary import problems_of
 from blf_dsc_controller.identification.values import COULOMB, base_matrix, parts
 from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.simulation.loop import simulate, write_bag

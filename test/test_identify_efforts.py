@@ -30,11 +30,8 @@ from blf_dsc_controller.identification.joint_alone import _Fit, _sign
 from blf_dsc_controller.identification.left_out import transmitted_torques
 from blf_dsc_controller.identification.mounting import gravity_columns
 from blf_dsc_controller.identification.problem import problem_of
-from blf_dsc_controller.identification.summary import (
-    is_usable,
-    notes_of,
-    problems_of,
-)
+from blf_dsc_controller.identification.problems import is_usable, problems_of
+from blf_dsc_controller.identification.summary import notes_of
 from blf_dsc_controller.identification.values import (
     COULOMB,
     OFFSET,

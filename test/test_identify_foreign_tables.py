@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import tracemalloc
 import warnings
 from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZipFile
@@ -609,6 +610,24 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, suffix, kind, capsys):
     assert 'is not a regular file' in error
     assert error.count('\n') == 1
     assert len(PANDA) == 7
+
+
+def test_memory_for_a_long_table_is_a_few_times_its_numbers(tmp_path):
+    """An honest CSV with an empty cell: all rows as lists would be three times as much."""
+    names = ['t', *numbered('q'), *numbered('dq'), *numbered('tau')]
+    repeats = 100  # 30,000 rows, 6 MB
+    time = np.arange(repeats * TIME.size) * PERIOD
+    q, tau = (np.tile(values, (repeats, 1)) for values in (Q, TAU))
+    path = written(tmp_path / 'a.csv', names, (time, q, q, tau))
+    head, last = path.read_text().rsplit(',', 1)
+    path.write_text(f'{head},\n{head.rsplit(chr(10), 1)[1]},{last}')  # an empty cell
+    numbers = 8 * time.size * (1 + q.shape[1] + tau.shape[1])  # bytes
+    tracemalloc.start()
+    read_table(path, UR5E_TEXT)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # as they stand in the file, in rad and N m, and masks; and a block of lines
+    assert peak < 3.5 * numbers + 5_000_000
 
 
 def test_arrays_that_unpack_to_gigabytes_are_refused(tmp_path):

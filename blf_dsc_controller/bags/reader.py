@@ -90,6 +90,7 @@ def recorded_run(
         values = loaded(found.field(JOINT_STATE_FIELDS.index(kind)))
         return Series(found.names, found.stamp, values)
 
+    arm, unusable = _arm(content)
     return Run(
         **arrays,
         joints=joints,
@@ -106,10 +107,10 @@ def recorded_run(
             for event in events
             if event.type is EventType.OSCILLATION
         ),
-        arm=_arm(content),
+        arm=arm,
         tool=_tool(content),
         learns=_learns([event.content.get('parameters', {}) for event in events]),
-        notes=(*run.notes, *_unknown_parameters(content)),
+        notes=(*run.notes, *_unknown_parameters(content), *unusable),
         sliding=_sliding(content),
     )
 
@@ -297,14 +298,18 @@ def _joints(content: Content) -> tuple[str, ...]:
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
-def _arm(content: Content) -> LearnedArm | None:
-    """Return the arm of the recorded configuration, None if it cannot be built."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
-        from blf_dsc_controller.factory.estimate import learned_arm  # slow: compiles
+def _arm(content: Content) -> tuple[LearnedArm | None, list[str]]:
+    """Return the arm of the recorded configuration, and what to say if it cannot be built."""
+    if not content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
+        return None, []
+    from blf_dsc_controller.factory.estimate import learned_arm  # slow: compiles
 
-        with suppress(BlfDscError):
-            return learned_arm(content.controller_config())
-    return None
+    try:
+        return learned_arm(content.controller_config()), []
+    except BlfDscError as error:
+        return None, [
+            f'what the recorded arm would tell is left out, as it cannot be built: {error}'
+        ]
 
 
 def _sliding(content: Content) -> tuple[str, ...]:

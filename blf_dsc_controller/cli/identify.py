@@ -36,16 +36,15 @@ from blf_dsc_controller.identification.identify import (
 )
 from blf_dsc_controller.identification.mjcf import mjcf
 from blf_dsc_controller.identification.parameters import robot_parameters
+from blf_dsc_controller.identification.problems import is_usable, problems_of
 from blf_dsc_controller.identification.summary import (
     base_table,
     bodies_table,
     errors_table,
     header_of,
-    is_usable,
     joints_table,
     load_table,
     notes_of,
-    problems_of,
     stiffness_table,
 )
 from blf_dsc_controller.writing import write_text

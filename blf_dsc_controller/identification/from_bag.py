@@ -71,8 +71,6 @@ def read_bag(
     if not _has_stamps(messages, groups[0]):
         messages.is_stamped = False
         source += ' (without stamps: by the times of reception)'
-    file = _File(path, Tree.of(text), dict(zip(theirs, joints, strict=True)), units)
-
     other = _motor_states(content, theirs)
     if motors:
         topics = {**names.topics, JOINT_STATES.leaf: '/' + motors.lstrip('/')}
@@ -80,47 +78,78 @@ def read_bag(
     if other is not None:
         source += f', positions of motors of {other.topics[JOINT_STATES].name}'
 
-    parts = [single_run(content, group).states for group in groups]
-    q: Rows
-    torque: Rows
-    if len(parts) > 1:
-        if commanded:
-            raise BagError(
-                f'{path}: the joints come in {len(parts)} messages, to which commands cannot be '
-                'assigned: leave out --effort command'
-            )
-        found = [file.sound(part, part, _OF_EFFORTS) for part in parts]
-        said = [each for _, remarks in found for each in remarks]
-        sound = [
-            part.select(rows) for part, (rows, _) in zip(parts, found, strict=True)
-        ]
-        stamp, q, torque = _together(sound, theirs)
+    file = _File(path, Tree.of(text), dict(zip(theirs, joints, strict=True)), units)
+    if len(groups) > 1:
+        _refuse_commands(path, len(groups), commanded=commanded)
+        motion = _of_several(file, content, groups, source)
     else:
-        (states,) = parts
-        efforts, remedy = states, _OF_EFFORTS
-        if commanded or not _any(states.field(2), states.size):
-            source, efforts = applied_torque(content, states)
-            remedy = _OF_COMMANDS
-            if not _any(efforts.field(2), states.size):
-                raise BagError(
-                    f'{path}: all torques in the {source} are zero: record measured efforts'
-                )
-        rows, said = file.sound(states, efforts, remedy)
-        states, efforts = states.select(rows), efforts.select(rows)
-        stamp, q, torque = states.stamp, states.field(0), efforts.field(2)
+        motion = _of_one(file, content, theirs, source, commanded=commanded)
     theta = None
     if other is not None:
-        theta = units['q'].factor * _motors_at(stamp, other, theirs)
+        theta = units['q'].factor * _motors_at(motion.stamp, other, theirs)
     recording = resampled(
         joints,
-        stamp,
-        _Scaled(q, units['q'].factor),
-        _Scaled(torque, units['tau'].factor),
-        '; '.join([source, *said]),
+        motion.stamp,
+        _Scaled(motion.q, units['q'].factor),
+        _Scaled(motion.torque, units['tau'].factor),
+        '; '.join([motion.source, *motion.said]),
         file.tree.turning(joints),
         theta,
     )
     return recording._replace(currents=is_of_drive(units['tau'].name))
+
+
+class _Motion(NamedTuple):
+    """Sound states (N,) of n joints, in the units of the bag."""
+
+    stamp: Stamps
+    q: Rows
+    torque: Rows
+    source: str  # of the torques
+    said: list[str]  # of what was left out
+
+
+def _refuse_commands(path: Path, messages: int, *, commanded: bool) -> None:
+    """Raise BagError if commands are wanted of joints that come in several messages."""
+    if commanded:
+        raise BagError(
+            f'{path}: the joints come in {messages} messages, to which commands cannot be '
+            'assigned: leave out --effort command'
+        )
+
+
+def _of_several(
+    file: _File, content: Content, groups: Sequence[Sequence[str]], source: str
+) -> _Motion:
+    """Return the motion of joints that come in several messages."""
+    parts = [single_run(content, group).states for group in groups]
+    found = [file.sound(part, part, _OF_EFFORTS) for part in parts]
+    said = [each for _, remarks in found for each in remarks]
+    sound = [part.select(rows) for part, (rows, _) in zip(parts, found, strict=True)]
+    return _Motion(*_together(sound, tuple(file.joints)), source, said)
+
+
+def _of_one(
+    file: _File,
+    content: Content,
+    joints: Sequence[str],
+    source: str,
+    *,
+    commanded: bool,
+) -> _Motion:
+    """Return the motion of joints that come in one message, with efforts, or else commands."""
+    states = single_run(content, joints).states
+    efforts, remedy = states, _OF_EFFORTS
+    if commanded or not _any(states.field(2), states.size):
+        source, efforts = applied_torque(content, states)
+        remedy = _OF_COMMANDS
+        if not _any(efforts.field(2), states.size):
+            raise BagError(
+                f'{file.path}: all torques in the {source} are zero: record measured efforts'
+            )
+    rows, said = file.sound(states, efforts, remedy)
+    states, efforts = states.select(rows), efforts.select(rows)
+    return _Motion(states.stamp, states.field(0), efforts.field(2), source, said)
 
 
 class _Unit(NamedTuple):

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
@@ -64,50 +66,68 @@ def read_table(
     """
     table = open_table(path)
     tree = Tree.of(text)
-    arm = tuple(joints) or tree.trunk()
     others = dict(names.joints)
     given = {kind: others.pop(kind, '') for kind in KINDS}
-    theirs = NameMap(joints=others).joints_of(arm)
+    trunk = tuple(joints) or tree.trunk()
+    theirs = NameMap(joints=others).joints_of(trunk)
     columns = choose_columns(path, table.names, given, theirs, planned=planned)
-    n = len(columns.q)
-    if joints and n != len(arm):
-        listed = ', '.join(column.name for column in columns.q)
-        raise BlfDscError(
-            f'{path} has the positions of {n} joints ({listed}), but from base to '
-            f'tip there are {len(arm)}: {", ".join(arm)}'
-        )
+    if joints:
+        _check_count(path, columns, trunk)
+    arm = trunk[: len(columns.q)]
     groups = _groups(path, table, columns)
-    time, said = _seconds(path, columns, groups['time'])
-    q, tau, theta = (groups[kind] for kind in ('q', 'tau', 'theta'))
-    _check_rows(path, time, np.asarray(q.values))
-    stamp, runs = _one_clock(path, time)
-    if runs > 1:
-        said.append(f'the time starts again {runs - 1} times: read as {runs} runs')
+    clock = _clock(path, columns, groups)
     has_unit = bool(split_unit(given['q'], 'q').unit)
     motion = Motion(
         path=path,
-        joints=arm[:n],
-        stamp=stamp,
-        q=q,
-        tau=None if planned else tau,
-        theta=theta if columns.theta else None,
+        joints=arm,
+        stamp=clock.stamp,
+        q=groups['q'],
+        tau=None if planned else groups['tau'],
+        theta=groups['theta'] if columns.theta else None,
         unit='' if has_unit else f'q={_pattern(table, columns)}',
         others='choose the columns that have it, as in --map tau=effort_*',
     )
     sound = checked(motion, tree)
-    source = '; '.join([f'{path.name}: {columns.text}', *said, *sound.said])
-    rows = sound.rows & np.isfinite(time)
-    torque = np.zeros_like(q.values) if planned else _scaled(tau)
+    rows = sound.rows & clock.known
+    q = _scaled(motion.q)[rows]
     recording = resampled(
-        arm[:n],
-        stamp[rows],
-        _scaled(q)[rows],
-        torque[rows],
-        source,
-        tree.turning(arm[:n]),
-        _scaled(theta)[rows] if columns.theta else None,
+        arm,
+        clock.stamp[rows],
+        q,
+        np.zeros_like(q) if motion.tau is None else _scaled(motion.tau)[rows],
+        '; '.join([f'{path.name}: {columns.text}', *clock.said, *sound.said]),
+        tree.turning(arm),
+        None if motion.theta is None else _scaled(motion.theta)[rows],
     )
     return recording._replace(currents=columns.has_currents)
+
+
+def _check_count(path: Path, columns: Columns, arm: Sequence[str]) -> None:
+    """Raise BlfDscError if there are not as many positions as joints of the arm."""
+    if len(columns.q) != len(arm):
+        listed = ', '.join(column.name for column in columns.q)
+        raise BlfDscError(
+            f'{path} has the positions of {len(columns.q)} joints ({listed}), but from base to '
+            f'tip there are {len(arm)}: {", ".join(arm)}'
+        )
+
+
+class _Clock(NamedTuple):
+    """When the rows (N,) of a table were recorded."""
+
+    stamp: Stamps  # (N,) ns
+    known: NDArray[np.bool_]  # (N,)
+    said: list[str]  # of what is odd
+
+
+def _clock(path: Path, columns: Columns, groups: dict[str, Group]) -> _Clock:
+    """Return the times of all rows; raise BlfDscError if they are none."""
+    time, said = _seconds(path, columns, groups['time'])
+    _check_rows(path, time, np.asarray(groups['q'].values))
+    stamp, runs = _one_clock(path, time)
+    if runs > 1:
+        said.append(f'the time starts again {runs - 1} times: read as {runs} runs')
+    return _Clock(stamp, np.isfinite(time), said)
 
 
 def _pattern(table: Table, columns: Columns) -> str:

@@ -34,6 +34,13 @@ class Score(NamedTuple):
         return np.asarray(100.0 * np.sqrt(squares))
 
 
+class OtherZeros(NamedTuple):
+    """Zeros of n joints with which the torques are explained far better."""
+
+    offsets: Floats  # (n,) to be added to the positions, rad
+    error: float  # of the torques held back with them, % of their rms
+
+
 class Identified(NamedTuple):
     """An identified arm of n bodies; values are ordered as in `Parts`."""
 
@@ -62,6 +69,7 @@ class Identified(NamedTuple):
     inertia: float  # share of its other inertial torque, likewise
     # (3,) gravity that explains the torques far better than the given one, m/s^2
     other_gravity: Floats | None
+    other_zeros: OtherZeros | None  # that explain the torques, if the given ones do not
     picked_up: float | None  # s, when the load was picked up
     compliance: (
         Compliance | None

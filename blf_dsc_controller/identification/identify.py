@@ -3,7 +3,8 @@
 
 In four steps: the efforts are checked; the model is selected by cross-validation within
 the first four fifths of the motion; its values are fitted to these, and scored on the
-rest; then they are fitted to all of the motion.
+rest; then they are fitted to all of the motion.  If gravity is explained far better by
+other zeros of the joints, these are tried.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.foresight import Foresight, foresee
-from blf_dsc_controller.identification.identified import Identified
+from blf_dsc_controller.identification.identified import Identified, OtherZeros
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.plausibility import shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
+from blf_dsc_controller.identification.problems import is_usable
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted
@@ -31,10 +33,15 @@ from blf_dsc_controller.identification.stiffness import Compliance, compliance_o
 from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
 from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
+from blf_dsc_controller.identification.zeros import likely_zeros, shifted
 from blf_dsc_controller.run import Floats
 
 STAGES = ('reading', 'checking efforts', 'selecting terms', 'fitting', 'intervals')
 """What takes time, in this order."""
+
+_GOOD = 2.0  # % of the torque, error with which other zeros are not looked for
+_BETTER = 0.5  # times the error, at most, with zeros that are not the given ones
+_AS_GOOD = 1.1  # times that error, at most, without an offset that is not needed
 
 
 def _tell_nobody(_stage: str) -> None:
@@ -150,6 +157,54 @@ def identify_arm(
     Raises:
         BlfDscError: the recording is too short or has no motion.
     """
+    found = _identified(recording, robot, effort, picked_up, find_signs, begin)
+    if found.score.total[2] < _GOOD or effort == 'without-gravity':
+        return found
+
+    def identified_at(offsets: Floats) -> Identified:
+        there = shifted(recording, offsets)
+        return _identified(there, robot, effort, picked_up, find_signs, _tell_nobody)
+
+    zeros = _better_zeros(found, likely_zeros(recording, robot), identified_at)
+    return found._replace(other_zeros=zeros)
+
+
+def _better_zeros(
+    found: Identified,
+    likely: Sequence[Floats],
+    identified_at: Callable[[Floats], Identified],
+) -> OtherZeros | None:
+    """Return the first of likely zeros that explain the torques far better, or None."""
+    for offsets in likely:
+        other = identified_at(offsets)
+        error = float(other.score.total[2])
+        if error < _BETTER * found.score.total[2] and is_usable(other):
+            return _simplest(OtherZeros(offsets, error), identified_at)
+    return None
+
+
+def _simplest(
+    zeros: OtherZeros, identified_at: Callable[[Floats], Identified]
+) -> OtherZeros:
+    """Return the zeros without offsets that are not needed to explain the torques."""
+    for joint in np.flatnonzero(zeros.offsets):
+        fewer = zeros.offsets.copy()
+        fewer[joint] = 0.0
+        error = float(identified_at(fewer).score.total[2])
+        if fewer.any() and error < _AS_GOOD * zeros.error:
+            zeros = OtherZeros(fewer, error)
+    return zeros
+
+
+def _identified(
+    recording: Recording,
+    robot: Robot,
+    effort: Effort,
+    picked_up: float | None,
+    find_signs: bool,  # noqa: FBT001
+    begin: Callable[[str], None],
+) -> Identified:
+    """Return what `identify_arm` finds for the positions as they are recorded."""
     begin(STAGES[1])
     problem = problem_of(recording, robot, effort, picked_up, find_signs=find_signs)
     rows = problem.rows
@@ -189,6 +244,7 @@ def identify_arm(
         gravity=size.gravity,
         inertia=size.inertia,
         other_gravity=problem.other_gravity,
+        other_zeros=None,
         picked_up=problem.picked_up,
         compliance=compliance,
     )

@@ -14,6 +14,7 @@ matter:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -81,6 +82,25 @@ def left_out(
     rows: Rows, model: SerialChain, G: Floats, values: Floats, distances: Floats
 ) -> LeftOut:
     """Return the columns for the values of a fit, with contacts that slide at `distances` (n,)."""
+    columns = [*_of_friction(rows, values, distances)]
+    rows.set_load((G @ values)[: rows.p])
+    columns += _of_torque(rows, (G @ values)[:-1])
+    kinds = [KINDS.index(kind) for kind, _ in columns]
+    return LeftOut(
+        np.stack([column for _, column in columns], axis=1),
+        _elastic(rows, model, G, values),
+        np.repeat([*kinds, KINDS.index('elasticity')], rows.speed.size),
+    )
+
+
+def _of_friction(
+    rows: Rows, values: Floats, distances: Floats
+) -> Iterator[tuple[str, Floats]]:
+    """Yield kinds and columns (R, n) of other laws of friction.
+
+    The rows are left with contacts that slide at `distances`, and Stribeck friction as
+    the model has it.
+    """
     terms = parts(values).terms
     least = _SMALL * rows.largest_torque
     coulomb = np.maximum(terms[COULOMB], least)
@@ -88,26 +108,26 @@ def left_out(
     viscous = np.maximum(terms[VISCOUS], least / speed)
     sliding = [_contact(rows, distance) for distance in DISTANCES]
     rows.set_sliding(distances)
-    columns = [('fading', coulomb * _fading(rows, *each)) for each in _FADINGS]
+    for fading in _FADINGS:
+        yield 'fading', coulomb * _fading(rows, *fading)
     rows.set_stribeck(STRIBECK_SPEED, 2.0)
-    rows.set_load((G @ values)[: rows.p])
-    columns += [('contact', coulomb * (b - a)) for a, b in pairwise(sliding)]
+    for a, b in pairwise(sliding):
+        yield 'contact', coulomb * (b - a)
     speeds = rows.over_windows(lambda at: np.abs(rows.dq[at]), rows.g)
-    columns.append(('direction', viscous * speeds))
-    # measured torques would explain themselves
-    theta = (G @ values)[:-1]
-    moved = theta.copy()
-    moved[rows.p : rows.unknowns - LOAD] = 0.0
+    yield 'direction', viscous * speeds
+
+
+def _of_torque(rows: Rows, theta: Floats) -> Iterator[tuple[str, Floats]]:
+    """Yield kinds and columns (R, n) in proportion to the torques of the unknowns `theta`.
+
+    Measured torques would explain themselves.
+    """
+    of_bodies = theta.copy()
+    of_bodies[rows.p : rows.unknowns - LOAD] = 0.0
     everything = np.arange(rows.time.size)
-    loads = np.abs(rows.torques(everything, moved))
-    columns.append(('load', loads * rows.friction[:, COLUMNS.index('Coulomb')]))
-    columns.append(('gain', rows.torques(everything, theta)))
-    kinds = [KINDS.index(kind) for kind, _ in columns]
-    return LeftOut(
-        np.stack([column for _, column in columns], axis=1),
-        _elastic(rows, model, G, values),
-        np.repeat([*kinds, KINDS.index('elasticity')], speed.size),
-    )
+    loads = np.abs(rows.torques(everything, of_bodies))
+    yield 'load', loads * rows.friction[:, COLUMNS.index('Coulomb')]
+    yield 'gain', rows.torques(everything, theta)
 
 
 def _contact(rows: Rows, distance: float) -> Floats:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -74,6 +74,23 @@ def resampled(
         BlfDscError: there are too few states, or their stamps cannot be of one clock.
     """
     groups = (q, torque) if motors is None else (q, torque, motors)
+    order = _order(stamp, groups)
+    grid = _grid_of(stamp[order])
+    turns = Turns((q[order[rows]] for rows in blocks_of(order.size)), turning)
+    if turns.wrapped.any():
+        names = ', '.join(np.array(joints)[turns.wrapped])
+        source = f'{source} (positions of {names} are wrapped: full turns added)'
+    positions = grid.evenly(lambda rows: turns.added(rows, q[order[rows]]))
+    torques = grid.evenly(lambda rows: torque[order[rows]])
+    recording = Recording(joints, grid.period, positions, torques, grid.gap, source)
+    if motors is None:
+        return recording
+    twist = _twist(q[order], motors[order], turning)
+    return recording._replace(twist=grid.evenly(lambda rows: twist[rows]))
+
+
+def _order(stamp: Stamps, groups: Sequence[Rows]) -> NDArray[np.intp]:
+    """Return the rows in which all values are known, each stamp once, in their order."""
     known = [
         np.isfinite(np.column_stack([each[rows] for each in groups])).all(axis=1)
         for rows in blocks_of(stamp.size)
@@ -81,7 +98,34 @@ def resampled(
     order = np.flatnonzero(np.concatenate([np.zeros(0, dtype=bool), *known]))
     if not (np.diff(stamp[order]) > 0).all():
         order = order[np.unique(stamp[order], return_index=True)[1]]
-    stamp = stamp[order]
+    return order
+
+
+class _Grid(NamedTuple):
+    """Even times, at which states at uneven ones are interpolated."""
+
+    time: Floats  # (N,) of the states, s
+    even: Floats  # (M,) s
+    period: float  # s
+    gap: NDArray[np.bool_]  # (M,) whether nothing was recorded here
+
+    def evenly(self, values: Callable[[slice], Floats]) -> Samples:
+        """Return at the even times what `values` returns of the states."""
+
+        def block(rows: slice) -> Floats:
+            at = self.even[rows]
+            near = _around(at, self.time)
+            return interpolated(at, self.time[near], values(near))
+
+        return mapped(self.even.size, block)
+
+
+def _grid_of(stamp: Stamps) -> _Grid:
+    """Return the even times for states at these stamps, which increase.
+
+    Raises:
+        BlfDscError: there are too few, or they cannot be of one clock.
+    """
     if stamp.size < 2:
         raise BlfDscError(
             f'there are {stamp.size} joint state(s) with a position, a torque and a unique '
@@ -101,30 +145,17 @@ def resampled(
             f'{time[-1]:.3g} s after the first: are their stamps of one clock? Cut the recording '
             'where they jump'
         )
-    grid = np.arange(0.0, time[-1], period)
-    gap = (intervals > GAP * period)[np.searchsorted(time, grid, side='right') - 1]
-    turns = Turns((q[order[rows]] for rows in blocks_of(order.size)), turning)
-    if turns.wrapped.any():
-        names = ', '.join(np.array(joints)[turns.wrapped])
-        source = f'{source} (positions of {names} are wrapped: full turns added)'
+    even = np.arange(0.0, time[-1], period)
+    gap = (intervals > GAP * period)[np.searchsorted(time, even, side='right') - 1]
+    return _Grid(time, even, period, gap)
 
-    def evenly(values: Callable[[slice], Floats]) -> Samples:
-        def block(rows: slice) -> Floats:
-            at = grid[rows]
-            near = _around(at, time)
-            return interpolated(at, time[near], values(near))
 
-        return mapped(grid.size, block)
-
-    positions = evenly(lambda rows: turns.added(rows, q[order[rows]]))
-    torques = evenly(lambda rows: torque[order[rows]])
-    recording = Recording(joints, period, positions, torques, gap, source)
-    if motors is None:
-        return recording
-    twist = motors[order] - q[order]
+def _twist(links: Floats, motors: Floats, turning: NDArray[np.bool_]) -> Floats:
+    """Return motors minus links (N, n), without what their zeros differ by, and full turns."""
+    twist = motors - links
     twist -= np.median(twist, axis=0)
     twist -= TURN * np.round(twist / TURN) * turning
-    return recording._replace(twist=evenly(lambda rows: twist[rows]))
+    return twist
 
 
 def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats:

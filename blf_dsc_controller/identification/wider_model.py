@@ -14,6 +14,13 @@ with the rows A_i of each joint, of which one in a correlation length l_i counts
 
 A gain of a joint's torque multiplies all its values, so that the model is not linear in
 both.  It is linearised about the last solution, again and again.
+
+Torques show how gains differ, but not a factor that all have in common: whatever the
+prior prefers there, such as bodies that are nearer to those of the fit, is no knowledge.
+So gains are those relative to their mean.  With a spread s of n gains, their mean is
+unknown by s / sqrt(n), and so is a common factor of all values x:  t^2 s^2 / n  x x^T  is
+added to the covariance, where t is how much wider a 95 % interval is if the spread is
+that of n gains only (Student, The probable error of a mean, 1908).
 """
 
 from __future__ import annotations
@@ -32,7 +39,9 @@ from blf_dsc_controller.identification.regression import (
     correlation_length,
     to_z,
 )
+from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.windows import HOP, Indices
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
 
 _FIRST = 0.3  # size of each kind, at first
@@ -41,6 +50,7 @@ _ROUNDS = 5  # of residuals ...
 _MOST_ROUNDS = 10  # ... if gains still change ...
 _AGREE = 0.01  # ... by more than this
 _STEPS = 3  # in each, of sizes
+_QUANTILE = 0.975  # that half of a 95 % interval reaches
 _FLOOR = 1e-4  # of a joint's torque, least residual
 
 
@@ -57,11 +67,25 @@ def doubt(problem: Problem, prior: Prior, fit: Fit, distances: Floats) -> Doubt:
     model = problem.parameters.model
     columns = left_out(problem.rows, model, problem.G, fit.values, distances)
     wider = _WiderModel(problem, prior, fit, columns)
-    z, H = wider.fit()
+    z, H, spread = wider.fit()
     k = wider.k
     d = prior.D @ z[:k]
     covariance = prior.D @ H[:k, :k] @ prior.D.T + np.outer(d, d)
+    scaled = fit.values.copy()
+    parts(scaled).delay[:] = 0.0
+    factor = _deviation_of_mean(spread, problem.rows.speed.size)
+    covariance += factor**2 * np.outer(scaled, scaled)
     return Doubt(covariance, _torques(problem, columns, z[k:]))
+
+
+def _deviation_of_mean(spread: float, n: int) -> float:
+    """Return the deviation of the mean of n values for a 95 % interval; 0 of a single one."""
+    from scipy.special import stdtrit
+
+    if n == 1:
+        return 0.0
+    t = float(stdtrit(n - 1, _QUANTILE)) / TWO_SIDED
+    return t * spread / float(np.sqrt(n))
 
 
 class _WiderModel:
@@ -88,8 +112,8 @@ class _WiderModel:
         values, _ = _solved(self._products, is_of_model * 1.0, deviation**2)
         return values
 
-    def fit(self) -> tuple[Floats, Floats]:
-        """Return z and its covariance.
+    def fit(self) -> tuple[Floats, Floats, float]:
+        """Return z and its covariance, and the spread of the gains.
 
         Sizes of the kinds, residuals and the linearisation follow from one another, in turns.
         """
@@ -99,8 +123,9 @@ class _WiderModel:
         # the size of what the model has is that of its prior
         sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
         z = np.zeros(self._kinds.size)
+        relative = _relative(self._kinds.size, self._gains)
         for turn in range(_MOST_ROUNDS):
-            about = _linearised(self._narrow, z, self.k, self._gains)
+            about = _linearised(self._narrow, z, self.k, self._gains) @ relative
             linear = np.swapaxes(about, 1, 2) @ self._products @ about
             before = z[self._gains]
             z, sizes = self._sized(linear, sizes, deviation**2 * lengths)
@@ -109,7 +134,8 @@ class _WiderModel:
             change = np.abs(z[self._gains] - before).max()
             if turn >= _ROUNDS - 1 and change < _AGREE:
                 break
-        return _solved(linear, sizes[self._kinds], deviation**2 * lengths)
+        z, H = _solved(linear, sizes[self._kinds], deviation**2 * lengths)
+        return z, H, float(sizes[KINDS.index('gain')])
 
     def _sized(
         self, linear: Floats, sizes: Floats, variance: Floats
@@ -123,6 +149,13 @@ class _WiderModel:
             z, H = _solved(linear, sizes[self._kinds], variance)
             sizes[:-1] = _sizes(self._kinds, z, H, sizes)
         return z, sizes
+
+
+def _relative(size: int, of_gains: Indices) -> Floats:
+    """Return E (c, c): columns, times E, are of gains relative to their mean; c = size + 1."""
+    E = np.eye(size + 1)
+    E[np.ix_(of_gains, of_gains)] -= 1.0 / of_gains.size
+    return E
 
 
 def _linearised(narrow: Floats, z: Floats, k: int, of_gains: Indices) -> Floats:

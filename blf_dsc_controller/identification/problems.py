@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why an identified arm is not to be used: its efforts, its mounting, its zeros, its errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from blf_dsc_controller.identification.identified import Identified, OtherZeros
+from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
+
+_POOR = 0.2  # of the torque, largest accepted error on the part held back
+_GOOD = 0.02  # likewise, error that is accepted whatever else is possible
+_FAR = 3.0  # times the error of a model of a joint alone: this one is wrong
+_LARGE = 0.1  # of the torque of a joint, error that is a fault ...
+_RELEVANT = 0.02  # ... if it is so much of the largest torque
+
+
+def problems_of(found: Identified, effort: str) -> Iterator[str]:
+    """Yield why the efforts or the result are doubtful."""
+    if found.other_zeros is not None:
+        yield _zeros_problem(found, found.other_zeros)
+        return
+    if found.other_gravity is not None:
+        words = ' '.join(f'{value:.3g}' for value in found.other_gravity)
+        yield (
+            f'ANOTHER MOUNTING: the torques show gravity along ({words}) in the base frame: give '
+            f'--gravity {words}, or correct the mounting in the URDF'
+        )
+        return
+    yield from _size_problems(found, effort)
+    if not is_explained(found):
+        yield (
+            'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
+            'N m (currents need --gains), is --gravity given in the base frame, are the zeros and '
+            'directions of the joints those of the URDF, and was the load the same throughout?'
+        )
+    yield from _joint_problems(found)
+
+
+def _zeros_problem(found: Identified, zeros: OtherZeros) -> str:
+    """Return which zeros of joints would explain the torques."""
+    moved = ', '.join(
+        f'{offset:+.5g} rad to {name}'
+        for name, offset in zip(found.joints, zeros.offsets, strict=True)
+        if offset
+    )
+    return (
+        f'OTHER ZEROS: the torque error is {zeros.error:.3g} instead of '
+        f'{found.score.total[2]:.3g} % if there is added to the positions: {moved}. So the joints '
+        'seem to have other zeros than in the URDF, as in a DH convention: check this, and convert '
+        'the positions'
+    )
+
+
+def _size_problems(found: Identified, effort: str) -> Iterator[str]:
+    """Yield a problem if the arm is not of the size of the URDF's."""
+    least, most = GRAVITY
+    share = f"the efforts contain {found.gravity:.2g} of the URDF's"
+    if found.gravity < least:
+        yield (
+            f'GRAVITY IS MISSING: {share}, so that masses in kg cannot be told from them. If they '
+            'are currents, give --gains; if the drives compensate it, --effort without-gravity; '
+            'if the arm is not mounted upright, --gravity; if joints have other zeros or '
+            'directions than in the URDF, as in a DH convention, convert their positions'
+        )
+    elif found.gravity > most:
+        cause = (
+            'If they are not in N m, give --gains. Are the masses of the URDF far too small, or is '
+            'it without its tool?'
+        )
+        if effort == 'without-gravity':
+            cause = 'The efforts are the whole torque: give --effort torque'
+        yield f'GRAVITY IS DOUBLE: {share}. {cause}'
+    elif np.isnan(found.gravity) and not INERTIA[0] < found.inertia < INERTIA[1]:
+        yield (
+            f"INERTIA IS NOT OF THIS SIZE: the efforts contain {found.inertia:.2g} of the URDF's. "
+            'If they are not in N m (or N), give --gains'
+        )
+
+
+def _joint_problems(found: Identified) -> Iterator[str]:
+    """Yield joints whose torque can be explained, but not by this arm."""
+    score = found.score
+    errors = score.errors[2]
+    large = np.maximum(_LARGE * score.torque, _RELEVANT * score.torque.max())
+    for i in np.flatnonzero((errors > _FAR * found.alone) & (errors > large)):
+        left, alone = 100.0 * errors[i] / score.torque[i], found.alone[i]
+        yield (
+            f'{found.joints[i]} DOES NOT FIT: {left:.0f} % of its torque is left, though a model '
+            f'of this joint alone leaves {100.0 * alone / score.torque[i]:.1f} %. Do the sign and '
+            'the unit of its effort, and its axis in the URDF, agree with those of other joints?'
+        )
+
+
+def is_usable(found: Identified) -> bool:
+    """Whether the model explains the torques held back, and is of the size of the URDF's."""
+    return not any(problems_of(found, ''))
+
+
+def is_explained(found: Identified) -> bool:
+    """Whether the model explains the torques held back.
+
+    It must be better than the URDF, and not much worse than models of joints alone.
+    """
+    urdf, _, total = found.score.total
+    alone = 100.0 * np.sqrt(np.sum(found.alone**2) / np.sum(found.score.torque**2))
+    most = max(100.0 * _GOOD, _FAR * float(alone))
+    return bool(total <= min(100.0 * _POOR, most, urdf))
