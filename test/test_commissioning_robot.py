@@ -187,7 +187,7 @@ def test_nothing_moves_unless_somebody_agrees(arm, capsys, monkeypatch):
     [
         (['--write', 'm.yaml'], (NEAR,), '--write measures nothing'),
         ([], ((0.3, 2.99),), 'joint2 would be at 2.99 rad, less than 0.05 rad from'),
-        ([], ((0.3, 90.0),), 'rad: if this is in degrees, give 1.571'),
+        ([], ((0.3, 90.0),), 'rad; if this is in degrees, give 1.571'),
         ([], ((0.3, 4.0),), 'joint2 would be at 4 rad, beyond its limits'),
         ([], (NEAR, (0.3, 1.1, 0.0)), 'got 3 angles, but the arm has 2 joints'),
     ],

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from datetime import datetime
 from typing import NamedTuple
@@ -31,6 +30,7 @@ from blf_dsc_controller.commissioning.chosen import (
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.response import Response, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.configuration.plausibility import hint_at_degrees
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run
@@ -303,9 +303,7 @@ def _beyond(at: float, lower: float, upper: float) -> str:
     limits = f'its limits, {lower:g} to {upper:g} rad'
     if lower <= at <= upper:
         return f'less than {_ROOM:g} rad from {limits}'
-    is_degrees = abs(at) > 2.0 * math.pi and lower <= math.radians(at) <= upper
-    hint = f': if this is in degrees, give {math.radians(at):.4g}' if is_degrees else ''
-    return f'beyond {limits}{hint}'
+    return f'beyond {limits}{hint_at_degrees(at, lower, upper)}'
 
 
 def _rounded(values: Floats) -> tuple[float, ...]:

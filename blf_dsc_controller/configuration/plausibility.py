@@ -309,5 +309,12 @@ def _unit_of(kind: str, value: float) -> str:
     return _of_degrees(value)
 
 
+def hint_at_degrees(at: float, lower: float, upper: float) -> str:
+    """Return what to give if an angle [rad] past its limits may be in degrees; or empty."""
+    if abs(at) > 2.0 * math.pi and lower <= math.radians(at) <= upper:
+        return f'; if this is in degrees, give {math.radians(at):.4g}'
+    return ''
+
+
 def _of_degrees(value: float) -> str:
     return f'is it in degrees? Give {math.radians(value):.3g}'

@@ -36,7 +36,14 @@ from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
 from blf_dsc_controller.identification.zeros import likely_zeros, shifted
 from blf_dsc_controller.run import Floats
 
-STAGES = ('reading', 'checking efforts', 'selecting terms', 'fitting', 'intervals')
+STAGES = (
+    'reading',
+    'checking efforts',
+    'selecting terms',
+    'fitting',
+    'intervals',
+    'trying other zeros',
+)
 """What takes time, in this order."""
 
 _GOOD = 2.0  # % of the torque, error with which other zeros are not looked for
@@ -158,6 +165,7 @@ def identify_arm(
         BlfDscError: the recording is too short or has no motion.
     """
     found = _identified(recording, robot, effort, picked_up, find_signs, begin)
+    begin(STAGES[5])
     if found.score.total[2] < _GOOD or effort == 'without-gravity':
         return found
 

@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import inf, pi, radians
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
+from blf_dsc_controller.configuration.plausibility import hint_at_degrees
 from blf_dsc_controller.errors import (
     BlfDscError,
     StartError,
@@ -307,13 +308,13 @@ def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
     for at, (joint, kind, lower, upper) in zip(q, limits, strict=True):
         if lower - PAST_LIMITS <= at <= upper + PAST_LIMITS:
             continue
-        unit = 'm' if kind == 'prismatic' else 'rad'
-        is_degrees = unit == 'rad' and abs(at) > 2.0 * pi
-        hint = f'; if this is in degrees, give {radians(at):.3g}'
+        slides = kind == 'prismatic'
+        unit = 'm' if slides else 'rad'
+        hint = '' if slides else hint_at_degrees(at, lower, upper)
         raise StartError(
             f'joint {joint!r} would be held at {at:.6g} {unit}, and its limits are {lower:g} to '
             f'{upper:g} {unit}: if the arm really is there, change limits.position_lower or '
-            f'limits.position_upper{hint if is_degrees else ""}'
+            f'limits.position_upper{hint}'
         )
 
 
