@@ -39,7 +39,10 @@ def identified(states, offsets=()):
     return identify_arm(recording_of(moved[::EVERY], period=1e-3 * EVERY), ROBOT)
 
 
-@pytest.mark.parametrize('offsets', [{4: QUARTER}, {2: -QUARTER, 6: QUARTER}])
+@pytest.mark.parametrize(
+    'offsets',
+    [{4: QUARTER}, {2: -QUARTER, 6: QUARTER}, {2: QUARTER, 4: QUARTER}],
+)
 def test_zeros_that_are_quarter_turns_off_are_named_and_not_applied(states, offsets):
     found = identified(states, offsets)
     right = np.zeros(7)

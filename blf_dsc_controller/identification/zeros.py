@@ -29,7 +29,7 @@ _FRICTION = ('viscous', 'Coulomb')
 _POSTURES = 200  # at most, that are compared
 _ROUNDS = 3  # over all pairs of joints
 _CLEAR = 0.98  # times the cost, at most, for which a zero is moved
-_BETTER = 0.5  # times the cost, at most, of zeros that are likelier than the given ones
+_BETTER = 0.9  # times the cost, at most, of zeros that are fitted: masses may be rough
 _CANDIDATES = 2  # that are fitted
 
 
