@@ -132,7 +132,7 @@ class ArmController:
         self._motors = JointStateEncoder(config.joints, ('position', 'velocity'))
         self._shift: int | None = None  # ns, of the stamps
         self._told_turns: set[str] = set()
-        self._loop.guard.activate()
+        self._loop.guard.starting.activate()
         if text := not_commissioned(config):
             logging.getLogger(__name__).info(text)
 
@@ -199,7 +199,7 @@ class ArmController:
                 if of_motors is not None:
                     raw = self._motors.encode(nanoseconds, *of_motors)
                     self._outputs.write(nanoseconds, topics.MOTOR_STATES, raw)
-            self._tell_turns('the reference', self._loop.guard.turned)
+            self._tell_turns('the reference', self._loop.guard.reference.turned)
         return answer
 
     def prepare(self, q: ArrayLike) -> None:
@@ -213,7 +213,7 @@ class ArmController:
             StartError: the law cannot take over there.
             MotionError: no approach from there keeps the limits.
         """
-        self._loop.guard.prepare(self._checked('q', q))
+        self._loop.guard.starting.prepare(self._checked('q', q))
 
     def _nanoseconds(self, stamp: float) -> int:
         """Return the stamp [ns].
@@ -267,8 +267,8 @@ class ArmController:
                 )
         trajectory = Trajectory(names, tuple(points), begin)
         guard = self._loop.guard
-        plan = guard.plan(trajectory)
-        guard.adopt(plan)
+        plan = guard.motions.plan(trajectory)
+        guard.motions.adopt(plan)
         self._tell_turns('a motion', plan.motion.turned)
 
     def _tell_turns(self, what: str, turned: str) -> None:
@@ -303,7 +303,7 @@ class ArmController:
             TareError: the arm moves or has just come to rest, something touches it, the law
                 is not in command, or `contact.enabled` is false.
         """
-        self._loop.guard.tare()
+        self._loop.guard.findings.tare()
 
     @property
     def is_tared(self) -> bool:
@@ -321,11 +321,11 @@ class ArmController:
 
     def start(self) -> None:
         """Take command with the next state, with what was learned."""
-        self._loop.guard.activate()
+        self._loop.guard.starting.activate()
 
     def reset(self) -> None:
         """Forget what was learned, and any fault; take command with the next state."""
-        self._loop.guard.reset()
+        self._loop.guard.starting.reset()
 
     def fail(self, text: str) -> Vector | None:
         """Stop for a reason `text` of your own.
@@ -369,7 +369,7 @@ class ArmController:
     def reason(self) -> str:
         """Why the controller stopped or does not start; empty while all is well."""
         guard = self._loop.guard
-        return guard.supervisor.text or guard.waiting_for
+        return guard.supervisor.text or guard.starting.waiting_for
 
     @property
     def reference(self) -> Reference:

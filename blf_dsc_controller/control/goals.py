@@ -110,7 +110,7 @@ class Goals:
             self._end(Outcome.ABORTED, *_why_out_of_command(guard))
         elif guard.controller.reference_vector is not followed.vector:
             by = self._inputs.source or 'a reset'
-            if guard.contacts.hold:
+            if guard.findings.contacts.hold:
                 by = 'a contact'
             self._end(Outcome.ABORTED, INVALID, f'pre-empted by {by}')
         elif guard.has_sample:
@@ -146,7 +146,7 @@ class Goals:
             plan.motion.note,
             guard.controller.reference_vector,
         )
-        self._next_feedback = guard.time
+        self._next_feedback = guard.reference.time
 
     def _tolerances(self, goal: Goal) -> tuple[Tolerances, Tolerances]:
         """Return those of the path and at the end; the defaults if any is wrong."""
@@ -160,7 +160,7 @@ class Goals:
 
     def _watch_sample(self, guard: Guard, followed: _Followed) -> None:
         signals = guard.controller.signals
-        t = guard.time
+        t = guard.reference.time
         error = np.stack((signals.xi1, signals.dq - signals.dqr))
         if t >= self._next_feedback:
             self._next_feedback = t + _FEEDBACK_PERIOD
@@ -170,7 +170,9 @@ class Goals:
             actual = [signals.q.tolist(), signals.dq.tolist()]
             number = followed.goal.number
             since = t - followed.begin
-            self._send(Feedback(number, guard.last_stamp, since, desired, actual))
+            self._send(
+                Feedback(number, guard.reference.last_stamp, since, desired, actual)
+            )
         tolerated = followed.arrival if t >= followed.end else followed.path
         violation = ''
         if t >= followed.begin:
@@ -196,7 +198,7 @@ class Goals:
             and guard.supervisor.running
             and guard.controller.reference_vector is followed.vector
         ):
-            left = self._inputs.stop(guard, 'a cancel') - guard.time
+            left = self._inputs.stop(guard, 'a cancel') - guard.reference.time
             text = f'cancelled: braking for {left:.3g} s'
         self._end(Outcome.CANCELLED, SUCCESSFUL, text)
 

@@ -56,7 +56,7 @@ class GuardedLoop:
             if controller.samples == 1:
                 self.telemetry.restart()
             yield from self.telemetry.sample(
-                guard.last_stamp,
+                guard.reference.last_stamp,
                 controller.sample,
                 controller.settings.torque.limit,
                 guard.samples.ratio,

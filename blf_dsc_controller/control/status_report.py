@@ -110,7 +110,7 @@ class StatusReport:
             'last oscillation': guard.calming.last.text
             if guard.calming.last
             else 'none',
-            'torque sensors': guard.untrusted or 'none or as configured',
+            'torque sensors': guard.findings.untrusted or 'none or as configured',
             **(self.trajectories.values if self.trajectories else {}),
         }
         level = WARN
@@ -122,10 +122,10 @@ class StatusReport:
             message = missing
         elif samples.outside:
             message = 'the error has left its bound'
-        elif guard.calming.is_due(guard.time):
+        elif guard.calming.is_due(guard.reference.time):
             message = guard.calming.text
-        elif guard.untrusted:
-            message = guard.untrusted
+        elif guard.findings.untrusted:
+            message = guard.findings.untrusted
         elif samples.saturated_time > 0.0:
             message = message.format('')
         elif guard.has_sample and guard.controller.sample.cuts.any():
@@ -180,16 +180,16 @@ def _load(guard: Guard) -> Part:
 
 def _contact(guard: Guard) -> Part:
     """Return whether something touches the arm, and what did last."""
-    last = guard.contacts.last
+    last = guard.findings.contacts.last
     values: dict[str, Any] = {
-        'contacts': guard.contacts.count,
+        'contacts': guard.findings.contacts.count,
         'distance': f'{guard.controller.sample.contact[DISTANCE]:.3g}',
         'threshold': f'{guard.config.contact.threshold:g}',
         'tared': str(guard.controller.is_tared).lower(),
     }
     if last is not None:
         values |= {
-            'last contact': f'at {(last.stamp - guard.start_stamp) * 1e-9:.3f} s',
+            'last contact': f'at {(last.stamp - guard.reference.start_stamp) * 1e-9:.3f} s',
             'joint': last.joint,
             'external torque': f'{last.torque:+.3g} N m',
             'model error and noise': f'{last.interval:.3g} N m',

@@ -155,7 +155,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.starting.measure()
         if self.guard is not None:
             self._begin_again(self.guard)
-            self.guard.activate()
+            self.guard.starting.activate()
         self.get_logger().info(
             f'ready for joint states of {", ".join(self.config.joints)}'
         )
@@ -220,10 +220,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def reset(self) -> str:
         """Restart with the next joint state and the initial estimates."""
         if self.guard is not None:
-            if self.guard.start_error is not None:
+            if self.guard.starting.error is not None:
                 self.starting.measure()
             self._begin_again(self.guard)
-            self.guard.reset()
+            self.guard.starting.reset()
         self.failure = None
         self._report()
         return 'estimates cleared: starting with the next state'
@@ -240,7 +240,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self.guard is None:
             return False, f'{self.get_name()} is {self.state_label}: activate it first'
         try:
-            self.guard.tare()
+            self.guard.findings.tare()
         except TareError as error:
             return False, str(error)
         return True, 'the external torque is zero here'
@@ -270,9 +270,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._publish_telemetry(torque)
         if self.action is not None:
             self.action.poll(guard)
-        if guard.waiting_for:
+        if guard.starting.waiting_for:
             self.get_logger().warning(
-                f'not started, waiting for a usable joint state: {guard.waiting_for}',
+                f'not started, waiting for a usable joint state: {guard.starting.waiting_for}',
                 throttle_duration_sec=WAITING_PERIOD,
             )
         self.report_if_changed(guard)
@@ -327,7 +327,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 self._publish(message)
 
     def _warn_of_rate(self, guard: Guard) -> None:
-        period = guard.time / (_RATE_SAMPLES - 1)
+        period = guard.reference.time / (_RATE_SAMPLES - 1)
         expected = self.config.sample_time
         if period < _FAST * expected:
             self.get_logger().warning(rate_mismatch(period, expected))
@@ -404,10 +404,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
             guard.retune(config)
             if (
                 self._loop is not None
-                and guard.last_stamp >= 0
+                and guard.reference.last_stamp >= 0
                 and config.telemetry.enabled
             ):
-                bound = guard.controller.bound_at(guard.time)
+                bound = guard.controller.bound_at(guard.reference.time)
                 limit = guard.controller.settings.torque.limit
                 telemetry = self._loop.telemetry
                 self._publish(telemetry.bound(guard.journal.stamp, bound, limit))
@@ -421,11 +421,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._log_phase(guard)
         self._started = self._started or supervisor.running
         if (
-            guard.start_error is not None
+            guard.starting.error is not None
             and self.config.autostart
             and not self._started
         ):
-            self.failure = guard.start_error
+            self.failure = guard.starting.error
             self.finished = True
         self._report()
 
@@ -436,8 +436,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.load_service.look()
         super().on_second()
         guard = self.guard
-        if guard is not None and guard.start_stamp != self.warned_at:
-            self.warned_at = guard.start_stamp
+        if guard is not None and guard.reference.start_stamp != self.warned_at:
+            self.warned_at = guard.reference.start_stamp
             if not self._is_simulated():
                 self._warn_of_start(guard)
 
@@ -460,17 +460,17 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _warn(self, guard: Guard) -> None:
         """Warn of what has been found since the last call."""
-        contacts = guard.contacts
+        contacts = guard.findings.contacts
         if contacts.last is not None and contacts.count != self._contacts:
             self._contacts = contacts.count
             self.get_logger().warning(contacts.last.text)
         if guard.calming.count != self._oscillations:
             self._oscillations = guard.calming.count
             self.get_logger().warning(guard.calming.text)
-        if guard.untrusted != self._untrusted:
-            self._untrusted = guard.untrusted
-            if guard.untrusted:
-                self.get_logger().warning(guard.untrusted)
+        if guard.findings.untrusted != self._untrusted:
+            self._untrusted = guard.findings.untrusted
+            if guard.findings.untrusted:
+                self.get_logger().warning(guard.findings.untrusted)
 
     def _log_phase(self, guard: Guard) -> None:
         supervisor = guard.supervisor
@@ -481,9 +481,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if now == self._logged:
             return
         self._logged = now
-        if guard.turned and guard.start_stamp != self._turned_at:
-            self._turned_at = guard.start_stamp
-            self.get_logger().info(f'the reference {guard.turned}')
+        if guard.reference.turned and guard.reference.start_stamp != self._turned_at:
+            self._turned_at = guard.reference.start_stamp
+            self.get_logger().info(f'the reference {guard.reference.turned}')
         if guard.silenced:
             self.get_logger().warning(supervisor.text)
         elif is_stopped:
@@ -492,7 +492,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 f'{stop}; {self.get_fully_qualified_name()}/reset starts again'
             )
         elif supervisor.phase is Phase.APPROACHING:
-            left = guard.settled - guard.time
+            left = guard.reference.settled - guard.reference.time
             self.get_logger().info(f'approaching the reference, for {left:.3g} s')
         elif supervisor.phase is Phase.TRACKING:
             self.get_logger().info('tracking the reference')

@@ -69,9 +69,9 @@ class RunByRunNode(ControllerNode):
     def position(self) -> np.ndarray | None:
         """Return the positions (n,) [rad] of the last joint state; None: there was none."""
         guard = self.guard
-        if guard is None or not np.isfinite(guard.last_state.age):
+        if guard is None or not np.isfinite(guard.safe_torque.last.age):
             return None
-        return np.array(guard.last_state.q)
+        return np.array(guard.safe_torque.last.q)
 
     def warn(self, text: str) -> None:
         """Log what somebody has to know."""
@@ -94,8 +94,8 @@ class RunByRunNode(ControllerNode):
         if acting is None:
             self._try_each('activate')
         else:
-            self.guard.activate()
-            self.guard.take_over_from(acting)
+            self.guard.starting.activate()
+            self.guard.starting.take_over_from(acting)
         self._report()
         return self.guard
 
