@@ -110,15 +110,32 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._loop = GuardedLoop(self.config, self._steady, self._wall)
         self.guard = self._loop.guard
         self._contacts = self._oscillations = 0
-        self.guard.journal.pending[-1].content['topics'] = {
-            topic.leaf: self.resolve_topic_name(topic.relative)
-            for topic in (topics.JOINT_STATES, topics.COMMANDS)
-        }
+        self._record_topics(self.guard)
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
         if end := end_of_waypoints(self.config):
             self.get_logger().info(end)
+        self._begin_declaring_loads()
+        if self.connect(
+            self._output_topics(), topics.JOINT_STATES, self._on_joint_state
+        ):
+            joints = self.config.joints
+            inputs = motion_input_of(self, len(joints), lambda: self.guard)
+            self.status.trajectories = inputs
+            self.action = offered_action(self, inputs, joints)
+        self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
+        self._report()
+
+    def _record_topics(self, guard: Guard) -> None:
+        """Add the names of the topics to the first event of the journal."""
+        guard.journal.pending[-1].content['topics'] = {
+            topic.leaf: self.resolve_topic_name(topic.relative)
+            for topic in (topics.JOINT_STATES, topics.COMMANDS)
+        }
+
+    def _begin_declaring_loads(self) -> None:
+        """Declare loads to the driver's service, if there is one; warn if one is missing."""
         load = self.config.load
         if load.service:
             if self.load_service is None:
@@ -130,25 +147,23 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 "drives: give the driver's service, or set robot.drive_payload and the load of "
                 'the driver'
             )
+
+    def _output_topics(self) -> list[topics.Topic]:
+        """Return the topics that this node publishes in the loop."""
         outputs = [topics.COMMANDS]
-        if self.config.telemetry.enabled:
-            outputs += [
-                topics.REFERENCE,
-                topics.TRACKING_ERROR,
-                topics.BOUND,
-                topics.MONITOR,
-            ]
-            if self.config.contact.enabled:
-                outputs += [topics.EXTERNAL_TORQUE]
-                if self.config.robot.tip:
-                    outputs += [topics.EXTERNAL_WRENCH]
-        if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
-            joints = self.config.joints
-            inputs = motion_input_of(self, len(joints), lambda: self.guard)
-            self.status.trajectories = inputs
-            self.action = offered_action(self, inputs, joints)
-        self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
-        self._report()
+        if not self.config.telemetry.enabled:
+            return outputs
+        outputs += [
+            topics.REFERENCE,
+            topics.TRACKING_ERROR,
+            topics.BOUND,
+            topics.MONITOR,
+        ]
+        if self.config.contact.enabled:
+            outputs.append(topics.EXTERNAL_TORQUE)
+            if self.config.robot.tip:
+                outputs.append(topics.EXTERNAL_WRENCH)
+        return outputs
 
     def activate(self) -> None:
         """Take command with the next joint state."""

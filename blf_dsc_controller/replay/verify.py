@@ -169,8 +169,6 @@ def verify(
     events, until, other = _events(content)
     _check_format(path, events[0])
     config = content.exact_config(law)
-    recorded = content.configurations[topics.CONTROLLER]
-    newer = sorted(flatten(config).keys() - recorded.keys() - {'insist'})
     errors: dict[int, MessageError] = {}
     states = content.topics[topics.JOINT_STATES].joint_states(
         names.joints_of(config.joints), ('position',), errors
@@ -183,27 +181,51 @@ def verify(
     motions = (event for received, event in content.motions if received < until)
     run.run(events[1:], motions)
     comparisons = tuple(_compared(content, run, answers, config.joints))
+    is_compared = any(found.values for found in comparisons)
+    if run.departure is None and not is_compared:
+        raise _nothing_to_compare(content)
+    end = run.end or other
+    newer = _newer_parameters(content, config)
+    changed_law = _changed_law(config, events[0])
+    return Verification(
+        samples=run.samples,
+        duration=(run.last - run.first) * 1e-9,
+        skipped=run.skipped,
+        comparisons=comparisons,
+        not_compared=_names_of_others(content),
+        events=tuple(run.events),
+        motions=run.motions,
+        remarks=tuple(_remarks(content, end, newer, changed_law)),
+        incomplete=tuple(
+            _incomplete(content, events, comparisons, end, run.alteration)
+        ),
+        difference=_first_difference(content, run, comparisons),
+    )
+
+
+def _newer_parameters(content: Content, config: ControllerConfig) -> list[str]:
+    """Return the parameters that the recorded configuration does not have, by name."""
+    recorded = content.configurations[topics.CONTROLLER]
+    return sorted(flatten(config).keys() - recorded.keys() - {'insist'})
+
+
+def _names_of_others(content: Content) -> tuple[str, ...]:
+    """Return the names of the topics in the bag that are not compared."""
+    return tuple(
+        content.topics[topic].name for topic in _OTHERS if topic in content.topics
+    )
+
+
+def _first_difference(
+    content: Content, run: Rerun, comparisons: Sequence[Comparison]
+) -> Difference | None:
+    """Return the earliest difference; of those with the same stamp, the departure."""
     differences = [found.difference for found in comparisons if found.difference]
     if run.departure is not None:
         differences.insert(0, _departed(run, *run.departure))
-    elif not any(found.values for found in comparisons):
-        raise _nothing_to_compare(content)
     if run.alteration is not None and content.version == __version__:
         differences.append(_altered(content, run, run.alteration))
-    texts = [content.topics[topic] for topic in _OTHERS if topic in content.topics]
-    end = run.end or other
-    return Verification(
-        run.samples,
-        (run.last - run.first) * 1e-9,
-        run.skipped,
-        comparisons,
-        tuple(each.name for each in texts),
-        tuple(run.events),
-        run.motions,
-        tuple(_remarks(content, end, newer, _changed_law(config, events[0]))),
-        tuple(_incomplete(content, events, comparisons, end, run.alteration)),
-        min(differences, key=lambda found: found.stamp, default=None),
-    )
+    return min(differences, key=lambda found: found.stamp, default=None)
 
 
 def _check_format(path: Path, configure: Event) -> None:
