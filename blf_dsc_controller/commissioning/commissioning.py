@@ -164,11 +164,11 @@ def plan(
 ) -> list[Planned]:
     """Return the motions around postures (k, n) [rad] by which an arm is measured.
 
-    With swings that keep its joints sliding, if these stick without (`sliding`).
+    `sliding` adds swings that keep joints sliding which would stick without.
 
-    Raises BlfDscError if the arm is not from a URDF, has feedback through its inertia
-    matrix, with which no arm with elastic joints is safe to be measured, or damping that
-    lags, of which the choice does not know.
+    Raises BlfDscError if the arm is not from a URDF; if its feedback acts through the
+    inertia matrix, which may make an arm with elastic joints unstable; or if its damping
+    lags, which the choice of gains does not model.
     """
     if config.model != 'urdf':
         raise BlfDscError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm is, by its responses: inertias, damping, lags, resonances and readings.
+"""Properties of an arm by its responses: inertias, damping, lags, resonances and readings.
 
 Below its resonances an arm is rigid.  The inverse of its response, D = G_y^-1, has on its
 diagonal what each joint asks for while the others are held, with a lag on the way,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A commissioning for people: a table, sentences and a picture."""
+"""The result of a commissioning: a table, sentences and a picture."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def _of_hidden(found: Commissioned) -> Iterator[str]:
 
 
 def _of_friction(found: Commissioned) -> Iterator[str]:
-    """Yield in which joints friction adds damping that motion lacks, or is not in the file."""
+    """Yield where friction adds damping that is gone in steady motion, or is not in the file."""
     names = np.array(found.joints)
     hidden = np.isnan(found.findings.inertia)
     rubbing = ~hidden & (found.findings.damping > found.choice.gains.damping)
@@ -284,7 +284,7 @@ def draw(found: Commissioned, names: Sequence[str], path: Path) -> None:
     """
     n = len(found.joints)
     rows = 1 + -(-n // 2)  # two joints in each, below the margins
-    title = 'Commissioning: what the arm bears'
+    title = 'Commissioning: margins and responses'
     picture = Picture(rows, 2, title, _SIZE, share_time=False)
     before, after = picture.axes[0]
     _draw_margin(before, found, found.start, 'as measured', names)

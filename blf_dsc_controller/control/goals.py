@@ -75,7 +75,7 @@ class Goals:
         self._next_feedback = 0.0
 
     def take(self, guard: Guard | None, message: Goal | Cancel) -> None:
-        """Begin or end a goal, as a client wants."""
+        """Begin or cancel the goal of a client."""
         if isinstance(message, Cancel):
             self._cancel(guard, message.number)
         elif guard is None:

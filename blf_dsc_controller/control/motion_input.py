@@ -57,12 +57,12 @@ Report = Callable[[Plan | None, str], None]
 
 
 class _Request(NamedTuple):
-    """A motion that is wanted."""
+    """A motion that somebody asked for."""
 
     make: Callable[[], Command]  # may take a while: called where it is planned
     report: Report
     lead: float  # s
-    source: str  # who wants it
+    source: str  # who asked for it
     check: Callable[[Plan], None] | None = None  # raises TrajectoryError: not like this
 
 
@@ -113,7 +113,7 @@ class MotionInput:
         self._points = TargetStream()
         self._target_lead = _TARGET_LEAD
         self._is_stopped = False
-        self._has_told_turns = False
+        self._has_logged_turns = False
         self._last_message = -np.inf  # s since the start
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
@@ -161,7 +161,7 @@ class MotionInput:
     ) -> None:
         """Follow a trajectory that came by another way, serialised or still to be made."""
 
-        def tell(plan: Plan | None, reason: str) -> None:
+        def report_to_both(plan: Plan | None, reason: str) -> None:
             self._report(plan, reason)
             report(plan, reason)
 
@@ -170,7 +170,7 @@ class MotionInput:
         def make() -> Trajectory:
             return _trajectory(given, start) if isinstance(given, bytes) else given()
 
-        self._request(guard, _Request(make, tell, _LEAD, source, check))
+        self._request(guard, _Request(make, report_to_both, _LEAD, source, check))
 
     # Requests.
 
@@ -271,13 +271,13 @@ class MotionInput:
         if near is None:
             near = guard.controller.reference_at(guard.reference.time)[0]
         (shifted,), turned = short_way(positions[np.newaxis], near, config)
-        self._tell_turns(turned)
+        self._log_turns(turned)
         return np.asarray(shifted)
 
-    def _tell_turns(self, turned: str) -> None:
+    def _log_turns(self, turned: str) -> None:
         """Say once that motions are shifted by whole turns."""
-        if turned and not self._has_told_turns:
-            self._has_told_turns = True
+        if turned and not self._has_logged_turns:
+            self._has_logged_turns = True
             self._log.info(f'a motion {turned}; others are shifted likewise')
 
     def _read_positions(self, raw: bytes) -> np.ndarray:
@@ -402,7 +402,7 @@ class MotionInput:
             points = len(plan.command.points)
             note = f' {plan.motion.note}' if plan.motion.note else ''
             self._log.info(f'following a trajectory of {points} points{note}')
-            self._tell_turns(plan.motion.turned)
+            self._log_turns(plan.motion.turned)
 
     def _report_target(self, plan: Plan | None, reason: str) -> None:
         """Count a target; in a stream the latest wins, which is no rejection."""

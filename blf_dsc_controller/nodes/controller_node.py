@@ -57,7 +57,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         starting: what is looked at before the first state is used.
         status: diagnostics and events; its `trajectories` are the motions that were asked for.
         action: offers trajectories as an action; None: nobody can ask for any.
-        load_service: what the drives are told of the load; None: nothing.
+        load_service: declares loads to the drives; None: nothing does.
         warned_at: stamp of the start that the last warning was about [ns].
     """
 
@@ -77,7 +77,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._polled = 0  # joint states at the last poll
         self.warned_at = -1  # stamp of the start that the last warning was about
-        self._told_gains = False  # that nobody has measured whether the arm bears them
+        self._warned_of_gains = (
+            False  # that nobody has measured whether the arm bears them
+        )
         self._turned_at = -1  # likewise, of the last reference shifted by turns
         # whether the tracking errors had subscribers at the last count
         self._errors_subscribed = False
@@ -274,7 +276,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             trajectories.poll(guard)
         try:
             torque = self._torque_for(guard, raw)
-            self._tell(topics.JOINT_STATES, raw)
+            self._write(topics.JOINT_STATES, raw)
             self._command(torque)
             guard.perceive()
         except Exception as error:  # noqa: BLE001 - the arm needs a torque after any error
@@ -373,13 +375,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if torque is not None:
             raw = self._encoder.encode(torque)
             self._senders[topics.COMMANDS](raw)
-            self._tell(topics.COMMANDS, raw)
+            self._write(topics.COMMANDS, raw)
 
     def _publish(self, message: topics.Message) -> None:
         super()._publish(message)
-        self._tell(*message)
+        self._write(*message)
 
-    def _tell(self, topic: topics.Topic, raw: bytes) -> None:
+    def _write(self, topic: topics.Topic, raw: bytes) -> None:
         """Give a message to the outputs beside the topics."""
         if self.outputs and self.guard is not None:
             self.outputs.write(max(self.guard.journal.stamp, 0), topic, raw)
@@ -428,7 +430,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 self._publish(telemetry.bound(guard.journal.stamp, bound, limit))
 
     def report_if_changed(self, guard: Guard) -> None:
-        """Publish new events, and diagnostics if they tell anything new."""
+        """Publish new events, and diagnostics if they have changed."""
         if not self.status.has_news(guard):
             self.status.publish_events(guard)
             return
@@ -461,8 +463,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.watchdog.why_off:
             self.get_logger().warning(guard.watchdog.why_off)
         text = not_commissioned(self.config)
-        if text and not self._told_gains:
-            self._told_gains = True
+        if text and not self._warned_of_gains:
+            self._warned_of_gains = True
             self.get_logger().warning(text)
 
     def _look_for_watchdog(self) -> None:

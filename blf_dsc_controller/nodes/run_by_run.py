@@ -36,7 +36,7 @@ class RunByRunNode(ControllerNode):
         self._acting: np.ndarray | None = None  # N m, the last torque
         self.heard = time.monotonic()
         super().__init__(**options)
-        self._told_gains = True  # they are about to be measured
+        self._warned_of_gains = True  # they are about to be measured
 
     def autostart(self) -> None:
         """Configure the node only: it commands nothing before the first run.
@@ -74,7 +74,7 @@ class RunByRunNode(ControllerNode):
         return np.array(guard.safe_torque.last.q)
 
     def warn(self, text: str) -> None:
-        """Log what somebody has to know."""
+        """Log a warning."""
         self.get_logger().warning(text)
 
     def begin(self, config: ControllerConfig, outputs: tuple[Output, ...]) -> Guard:

@@ -118,7 +118,7 @@ class Verification(NamedTuple):
     events: tuple[Event, ...]  #: replayed events but motions
     motions: int  #: number of replayed trajectories and targets of streams
     remarks: tuple[str, ...]  #: limitations of the result
-    incomplete: tuple[str, ...]  #: what the recording lacks
+    incomplete: tuple[str, ...]  #: what is missing in the recording
     difference: Difference | None  #: the earliest, in a topic or in an event
 
     @property
@@ -489,7 +489,7 @@ def _incomplete(
     end: str,
     alteration: Alteration | None,
 ) -> Iterator[str]:
-    """Yield what the recording lacks: messages, its end, texts of this version."""
+    """Yield what is missing in the recording: messages, its end, texts of this version."""
     for found in comparisons:
         if found.missing:
             yield f'{found.missing} messages of {found.topic}'

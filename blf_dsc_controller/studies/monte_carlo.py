@@ -71,7 +71,7 @@ STILL = 'still.'
 """Prefix of the columns of a run in which nothing moves the parameters."""
 
 UNSEEN = 1000
-"""Seed of the motion on which the torque of a learned model is judged."""
+"""Seed of the motion on which the torque of a learned model is evaluated."""
 
 _ROWS = 200  # postures of that motion
 _ROWS_FOR = 15.0  # s
