@@ -166,7 +166,7 @@ class Script(Beside):
     def _declare(self, wanted: dict[str, Any]) -> None:
         load = DriveLoad(wanted['mass'], tuple(wanted['centre']))
         try:
-            self._guard.loads.want(self._guard.config, load)
+            self._guard.loads.declare(self._guard.config, load)
         except BlfDscError as error:
             self._tell_done(wanted['number'], str(error))
         else:
@@ -175,7 +175,7 @@ class Script(Beside):
     def _follow_load(self) -> None:
         """Say when the drives have a load, or why they have not."""
         problem = self._loop.remark if self._loop is not None else ''
-        if self._loading is not None and (problem or self._guard.loads.is_told):
+        if self._loading is not None and (problem or self._guard.loads.is_declared):
             self._tell_done(self._loading, problem)
             self._loading = None
 

@@ -8,7 +8,7 @@ joint state -> StateCheck -> law -> SampleCheck -> torque
 `Guard` answers each message, silence and error with a torque.  It leaves the rest to its
 parts: `Starting` brings the law into command, `InCommand` takes it out of command and
 computes the safe torque, `Findings` reacts to contacts and oscillations that the law has
-detected, `Motions` changes the reference, and `ToldLoads` counts the load that was
+detected, `Motions` changes the reference, and `DeclaredLoads` counts the load that was
 declared to the drives.
 """
 
@@ -34,6 +34,7 @@ from blf_dsc_controller.messages.errors import (
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision import retuning
+from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
@@ -42,7 +43,6 @@ from blf_dsc_controller.supervision.starting import Starting
 from blf_dsc_controller.supervision.state_check import LONG_GAP, SKIP
 from blf_dsc_controller.supervision.state_watchdog import PERIOD
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason
-from blf_dsc_controller.supervision.told_loads import ToldLoads
 
 Vector = NDArray[np.float64]
 _CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
@@ -78,7 +78,7 @@ class Guard(InCommand):
         """Compile the law; `steady` and `wall` are the clocks [ns]."""
         super().__init__(config, steady, wall)
         self.findings = Findings(self)
-        self.loads = ToldLoads(config, self.controller)
+        self.loads = DeclaredLoads(config, self.controller)
         self.starting = Starting(self, self.findings, self.loads)
         self.motions = Motions(self, self.findings.contacts)
         self.foreign = 0
@@ -301,7 +301,7 @@ class Guard(InCommand):
             retuning.apply_bumpless(self.controller, config, self.reference.time, last)
         else:
             retuning.apply(self.controller, config)
-        self.loads.take_again()
+        self.loads.subtract_again()
         self.config = config
         self.calming.configure(config)
         self.samples.set_limits(config.safety)

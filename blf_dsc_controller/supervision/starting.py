@@ -11,12 +11,12 @@ from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import MotionError
+from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.support import check_support
 from blf_dsc_controller.supervision.takeover import Takeover
-from blf_dsc_controller.supervision.told_loads import ToldLoads
 
 Vector = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Starting:
     """
 
     def __init__(
-        self, command: InCommand, findings: Findings, loads: ToldLoads
+        self, command: InCommand, findings: Findings, loads: DeclaredLoads
     ) -> None:
         """Bring the law of `command` into command, without earlier findings."""
         self.error: BlfDscError | None = None
