@@ -213,32 +213,41 @@ def _stops(run: Run) -> Iterator[Mark]:
 
 def _motion(run: Run) -> Iterator[Panel]:
     t = run.time
-    for i, joint in enumerate(run.joints):
-        position = run.column('position', i)
-        reference = run.column('reference', i)
-        lines = [Line('measured', t, np.asarray(position))]
-        if reference is not None:
-            lines.append(Line('reference', t, reference, INK, dashed=True))
-        unit = run.units(joint).position
-        yield Panel('Motion', f'position of {joint}', unit, lines)
+    for i in range(len(run.joints)):
+        yield _position(run, t, i)
         error = run.column('error', i)
         if error is not None:
             yield _error(run, t, i, 1e3 * error)
-        torque = run.column('torque', i)
-        limit = run.column('torque_limit', i)
-        if torque is None or np.isnan(torque).all():
-            continue
-        lines = [Line('torque', t, torque)]
-        if limit is not None and not np.isnan(limit).all():
-            lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
-        note = f'peak {np.nanmax(np.abs(torque)):.3g}'
-        unit = run.units(joint).torque
-        yield Panel('Torque', f'torque of {joint}', unit, lines, note)
-    for i in range(len(run.joints)) if t.size > _PIECES else ():
-        error = run.column('error', i)
-        if error is not None:
-            yield _error_size(run, t, i, 1e3 * error)
+        yield from _torque(run, t, i)
+    if t.size > _PIECES:
+        for i in range(len(run.joints)):
+            error = run.column('error', i)
+            if error is not None:
+                yield _error_size(run, t, i, 1e3 * error)
     yield from _tool(run, t)
+
+
+def _position(run: Run, t: Floats, i: int) -> Panel:
+    joint = run.joints[i]
+    lines = [Line('measured', t, np.asarray(run.column('position', i)))]
+    reference = run.column('reference', i)
+    if reference is not None:
+        lines.append(Line('reference', t, reference, INK, dashed=True))
+    return Panel('Motion', f'position of {joint}', run.units(joint).position, lines)
+
+
+def _torque(run: Run, t: Floats, i: int) -> Iterator[Panel]:
+    """Yield the panel of the torque with its limit, if there is a torque."""
+    joint = run.joints[i]
+    torque = run.column('torque', i)
+    if torque is None or np.isnan(torque).all():
+        return
+    lines = [Line('torque', t, torque)]
+    limit = run.column('torque_limit', i)
+    if limit is not None and not np.isnan(limit).all():
+        lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
+    note = f'peak {np.nanmax(np.abs(torque)):.3g}'
+    yield Panel('Torque', f'torque of {joint}', run.units(joint).torque, lines, note)
 
 
 def _tool(run: Run, t: Floats) -> Iterator[Panel]:

@@ -360,34 +360,42 @@ def _compare(
     Those that have other stamps differ.
     """
     fields = _COMPARED[topic]
-    theirs = messages.joint_names()
-    ours = own.joint_names()
-    shared = [name for name in ours if name in theirs and name != topics.COMPUTE_TIME]
-    result.left_out = ', '.join(
-        n for n in dict.fromkeys((*ours, *theirs)) if n not in shared
-    )
+    shared = _shared_names(messages, own, result)
     result.recorded = messages.size * len(shared) * len(fields)
-    recorded, replayed = (each.joint_states(shared, ()) for each in (messages, own))
-    if topic is topics.TRACKING_ERROR:
-        recorded = answers
+    recorded = answers
+    if topic is not topics.TRACKING_ERROR:
+        recorded = messages.joint_states(shared, ())
     recorded, replayed, result.missing = _matched(
-        topic, recorded, replayed, answers.size, run.answers
+        topic, recorded, own.joint_states(shared, ()), answers.size, run.answers
     )
-    stamp = replayed.received
     has_moved = recorded.stamp != replayed.stamp
     names = _labels(topic, shared, joints)
     for begin in range(0, replayed.size, _BLOCK):
         rows = slice(begin, begin + _BLOCK)
-        pair = [
-            np.hstack([states.field(k)[rows] for k in fields])
-            for states in (recorded, replayed)
-        ]
-        pair[1][has_moved[rows]] = np.inf
-        result.add(stamp[rows], run.first, names, *pair)
+        theirs = _table(recorded, rows, fields)
+        ours = _table(replayed, rows, fields)
+        ours[has_moved[rows]] = np.inf
+        result.add(replayed.received[rows], run.first, names, theirs, ours)
     if topic is topics.COMMANDS:
         unreached = (result.recorded - result.values) // len(joints)
         if unreached:
             result.left_out = f'{unreached} torques that the replay does not reach'
+
+
+def _shared_names(
+    messages: TopicMessages, own: TopicMessages, result: Comparison
+) -> list[str]:
+    """Return the names in both, but for the computation time; note the others as left out."""
+    theirs, ours = messages.joint_names(), own.joint_names()
+    shared = [name for name in ours if name in theirs and name != topics.COMPUTE_TIME]
+    others = [name for name in dict.fromkeys((*ours, *theirs)) if name not in shared]
+    result.left_out = ', '.join(others)
+    return shared
+
+
+def _table(states: JointStates, rows: slice, fields: Sequence[int]) -> Floats:
+    """Return some rows of fields of messages, beside each other (rows, fields * names)."""
+    return np.hstack([states.field(k)[rows] for k in fields])
 
 
 def _labels(topic: topics.Topic, shared: list[str], joints: Sequence[str]) -> list[str]:
