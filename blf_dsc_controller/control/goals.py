@@ -159,20 +159,13 @@ class Goals:
             return tolerances(self._joints, ()), tolerances(self._joints, ())
 
     def _watch_sample(self, guard: Guard, followed: _Followed) -> None:
+        """End the goal if the arm has arrived, or has left its path or tolerances."""
         signals = guard.controller.signals
         t = guard.reference.time
-        error = np.stack((signals.xi1, signals.dq - signals.dqr))
         if t >= self._next_feedback:
             self._next_feedback = t + _FEEDBACK_PERIOD
-            desired = [
-                each.tolist() for each in (signals.qr, signals.dqr, signals.ddqr)
-            ]
-            actual = [signals.q.tolist(), signals.dq.tolist()]
-            number = followed.goal.number
-            since = t - followed.begin
-            self._send(
-                Feedback(number, guard.reference.last_stamp, since, desired, actual)
-            )
+            self._send_feedback(guard, followed)
+        error = np.stack((signals.xi1, signals.dq - signals.dqr))
         tolerated = followed.arrival if t >= followed.end else followed.path
         violation = ''
         if t >= followed.begin:
@@ -187,6 +180,16 @@ class Goals:
             late = t - followed.latest
             text = f'not there {followed.goal.time:.3g} s after the end: {violation}'
             self._abort(guard, GOAL_VIOLATED, f'{text} ({late:.3g} s late)')
+
+    def _send_feedback(self, guard: Guard, followed: _Followed) -> None:
+        """Send the client where the arm is, and where it should be."""
+        signals = guard.controller.signals
+        desired = [each.tolist() for each in (signals.qr, signals.dqr, signals.ddqr)]
+        actual = [signals.q.tolist(), signals.dq.tolist()]
+        reference = guard.reference
+        since = reference.time - followed.begin
+        number = followed.goal.number
+        self._send(Feedback(number, reference.last_stamp, since, desired, actual))
 
     def _cancel(self, guard: Guard | None, number: int) -> None:
         followed = self._followed

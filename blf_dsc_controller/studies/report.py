@@ -205,15 +205,9 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
     kept = pairs['kept']
     factor = pairs['factor']
     noise = pairs['noise']
-    broken, noisy = (
-        [len(each[f'broken_only_{law}']) for law in _LAWS.values()]
-        for each in (pairs, noise)
-    )
+    broken = _broken_only(pairs)
+    noisy = _broken_only(noise)
     interval = _interval(broken[0], max(1, kept['without']), 'exact')
-    rms, model = (
-        ' / '.join(f'{unit * value:.3g}' for value in pairs['median'][name].values())
-        for name, unit in (('rms_error_rad', 1e3), ('torque_error.end', 1e2))
-    )
     return {
         'bound kept with learning / without': f'{kept["with"]} / {kept["without"]}',
         'broken only with / only without': f'{broken[0]} / {broken[1]}',
@@ -230,9 +224,22 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
         'factor: median, 99.9 %, largest': ', '.join(
             f'{factor[name]:.2f}' for name in ('median', 'p99.9', 'max')
         ),
-        'rms error with / without [mrad]': rms,
-        'torque error on the next motion with / without [%]': model,
+        'rms error with / without [mrad]': _medians(pairs, 'rms_error_rad', 1e3),
+        'torque error on the next motion with / without [%]': _medians(
+            pairs, 'torque_error.end', 1e2
+        ),
     }
+
+
+def _broken_only(pairs: Summary) -> list[int]:
+    """Return how many runs break the bound only with learning, and only without."""
+    return [len(pairs[f'broken_only_{law}']) for law in _LAWS.values()]
+
+
+def _medians(pairs: Summary, name: str, factor: float) -> str:
+    """Return the medians of a figure with and without learning, times a factor."""
+    values = pairs['median'][name].values()
+    return ' / '.join(f'{factor * value:.3g}' for value in values)
 
 
 def format_report(summary: Summary, folder: Path) -> str:
@@ -267,7 +274,7 @@ def _against_none(still: Summary) -> str:
     with_, without = (
         '-' if each is None else f'{1e3 * each:.3g}' for each in rms.values()
     )
-    broken = [len(still[f'broken_only_{law}']) for law in _LAWS.values()]
+    broken = _broken_only(still)
     return (
         'with learning / with neither learning nor adaptation: bound kept '
         f'{kept["with"]} / {kept["without"]}, broken only {broken[0]} / {broken[1]}, '
