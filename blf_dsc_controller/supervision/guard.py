@@ -58,9 +58,9 @@ class Guard(InCommand):
     """The law with its checks and safe torque; it records all events in its journal.
 
     `update`, `reject`, `watch` and `fail` return the torque (n,) [N m] to command, or
-    None.
+    None.  `InCommand` describes the other attributes.
 
-    Attributes (beside those of `InCommand`):
+    Attributes:
         findings: contacts, oscillations and wrong sensors that the law has found.
         loads: the load that is declared to the drives.
         starting: activation, reset, and the start from a state.
