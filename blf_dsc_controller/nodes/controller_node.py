@@ -63,32 +63,31 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.CONTROLLER, ControllerConfig, **options)
+        joints = self.config.joints
         self.guard: Guard | None = None
         self.outputs = Outputs()
         self._loop: GuardedLoop | None = None
         self._load: ReferenceLoad | None = None
         self.load_service: LoadService | None = None
-        joints = self.config.joints
+        self._decoder = JointStateDecoder(joints, required=('position',))
+        self._encoder = Float64MultiArrayEncoder(len(joints))
+        self._started = False
+        self._polled = 0  # joint states at the last poll
+        # whether the tracking errors had subscribers at the last count
+        self._errors_subscribed = False
+        # What has been reported, so that it is not reported again:
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
         self._contacts = self._oscillations = 0
-        self._untrusted = ''  # what was said of the torque sensors
-        self._decoder = JointStateDecoder(joints, required=('position',))
-        self._encoder = Float64MultiArrayEncoder(len(joints))
-        self._polled = 0  # joint states at the last poll
-        self.warned_at = -1  # stamp of the start that the last warning was about
-        self._warned_of_gains = (
-            False  # that nobody has measured whether the arm bears them
-        )
-        self._turned_at = -1  # likewise, of the last reference shifted by turns
-        # whether the tracking errors had subscribers at the last count
-        self._errors_subscribed = False
-        self._started = False
+        self._untrusted = ''  # sentence about the torque sensors
         # phase, stops, silenced, text of a stop
         self._logged = Phase.INACTIVE, 0, False, ''
-        self._ends_at = 0.0  # s, at the latest, since a signal
-        # joint states processed by then, and when the last was
-        self._last_seen = 0, 0.0
+        self._warned_of_gains = False  # whose margin nobody has measured
+        self.warned_at = -1  # stamp of the start that the last warning was about
+        self._turned_at = -1  # likewise, of the last reference shifted by turns
+        # After a signal:
+        self._ends_at = 0.0  # s, at the latest
+        self._last_seen = 0, 0.0  # joint states processed by then, and s, the last
         self.status = ControllerStatus(self, joints, self.outputs)
         self.action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
