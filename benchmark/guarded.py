@@ -52,7 +52,7 @@ class Contestant:
         stamps = (FIRST_STAMP + record.stamps).tolist()
         self._states = zip(stamps, record.measurements, strict=True)
         self._loop = GuardedLoop(loop.controller, lambda: 0, lambda: 0)
-        self._loop.guard.activate()
+        self._loop.guard.starting.activate()
         self.answer(len(stamps) - states)
         if not self._loop.guard.controller.sample.latched[0]:
             raise RuntimeError(f'nothing is learned in {_FULL:g} s')

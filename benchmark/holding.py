@@ -120,7 +120,7 @@ def with_position_loop(case: Case) -> list[Reached]:
 def with_this_law(case: Case) -> list[Reached]:
     """Return what this law reaches with the defaults of the preset."""
     guard, arm = arm_of(case)
-    guard.activate()
+    guard.starting.activate()
     last = np.array(case.rest)
 
     def torque(k: int, measurement: np.ndarray, qr: np.ndarray) -> np.ndarray:
@@ -128,10 +128,12 @@ def with_this_law(case: Case) -> list[Reached]:
         if (qr != last).any():
             last = qr
             point = TrajectoryPoint(_MOVING, tuple(qr.tolist()))
-            guard.adopt(guard.plan(Trajectory(guard.config.joints, (point,))))
+            guard.motions.adopt(
+                guard.motions.plan(Trajectory(guard.config.joints, (point,)))
+            )
         found = guard.update(FIRST_STAMP + k * guard.config.sample_time_ns, measurement)
         if found is None or guard.supervisor.text:
-            raise RuntimeError(guard.supervisor.text or guard.waiting_for)
+            raise RuntimeError(guard.supervisor.text or guard.starting.waiting_for)
         return found
 
     return _visit(case, arm, torque)

@@ -517,7 +517,7 @@ def failed(preset: str, failure: str) -> list[str]:
     """Return what happens to an arm whose sensors fail."""
     loop = load_loop(preset, {PLANT: {'duration': FAILS + AFTER_FAILURE}})
     arm, guard = plant_of(loop.plant), Guard(loop.controller)
-    guard.activate()
+    guard.starting.activate()
     n, period = len(loop.controller.joints), loop.plant.sample_time_ns
     largest, before = 0.0, np.zeros(n)
     for k in range(round((FAILS + AFTER_FAILURE) / (1e-9 * period))):

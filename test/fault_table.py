@@ -82,7 +82,7 @@ class Rig:
         """Start a controller process: activated, with nothing learned."""
         self._decoder = JointStateDecoder(JOINTS, required=('position',))
         guard = Guard(self.config, lambda: self.steady, lambda: self.wall)
-        guard.activate()
+        guard.starting.activate()
         return guard
 
     @property
@@ -144,7 +144,7 @@ class Rig:
         self.wall = max(self.wall, self.base) if self.live else self.wall
         self.plant.reset()
         self.input.torque[:] = 0.0
-        self.guard.reset()
+        self.guard.starting.reset()
 
 
 LEAD = 40  # fault-free samples before the fault
@@ -414,7 +414,9 @@ def replaced(*, possible: bool) -> Callable[[Rig], None]:
                 goal = tuple(state.q + (size if rig.plant.sample % 60 else -size))
                 point = TrajectoryPoint(time=1.5, positions=goal)
                 try:
-                    rig.guard.adopt(rig.guard.plan(Trajectory(JOINTS, (point,))))
+                    rig.guard.motions.adopt(
+                        rig.guard.motions.plan(Trajectory(JOINTS, (point,)))
+                    )
                 except TrajectoryError:
                     assert not possible
                 else:

@@ -24,20 +24,20 @@ STOPPED = 2.0  # s, in which an arm comes to rest
 
 
 def reset(loop, _):
-    loop.guard.reset()
+    loop.guard.starting.reset()
 
 
 def pause(loop, _):
     loop.guard.deactivate()
     loop.run(PAUSED)
-    loop.guard.activate()
+    loop.guard.starting.activate()
 
 
 def stop(loop, _):
     """Stop, and reset the arm at rest."""
     loop.guard.fail('by hand')
     loop.run(STOPPED)
-    loop.guard.reset()
+    loop.guard.starting.reset()
 
 
 def hang(loop, seconds):

@@ -842,6 +842,16 @@ def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():
     assert not any('times the gains it was measured' in each for each in told)
 
 
+def test_frequencies_above_100_hz_are_told_without_an_exponent():
+    least = found()
+    limit = least.choice.margin._replace(frequency=123.4)
+    measured = least.choice.measured._replace(frequency=234.5)
+    choice = least.choice._replace(margin=limit, measured=measured)
+    told = '\n'.join(sentences(least._replace(choice=choice)))
+    assert 'limited near 120 Hz by' in told
+    assert 'at 230 Hz' in told
+
+
 def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
     tmp_path, capsys, monkeypatch
 ):

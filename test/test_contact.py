@@ -250,7 +250,7 @@ def test_arm_that_yields_gives_way_and_one_that_stops_resists():
 def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away(monkeypatch):
     config = loop_of(pushed(PUSH), **{'contact.reaction': 'hold'})
     guard = Guard(config.controller, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     guard.update(FIRST_STAMP, plant_of(config.plant).measure())
     guard.controller.sample.external_interval[:] = 1.0
     monkeypatch.setattr(guard.controller, 'perceive', lambda _: True)
@@ -258,10 +258,10 @@ def test_arm_that_holds_takes_no_targets_until_a_trajectory_leads_away(monkeypat
     q = guard.controller.signals.q
     target = Target(tuple(q), (0.0,) * 7, 0.1, 0.3, held=True)
     with pytest.raises(TrajectoryError, match='the arm holds: send a trajectory'):
-        guard.adopt(guard.plan(target))
+        guard.motions.adopt(guard.motions.plan(target))
     assert guard.supervisor.phase is not Phase.SAFE_STOP
-    guard.reset()
-    assert not guard.contacts.hold
+    guard.starting.reset()
+    assert not guard.findings.contacts.hold
 
 
 def test_run_and_its_bag_say_what_touched_the_arm(tmp_path, held, held_bag, free):
@@ -384,7 +384,7 @@ def test_tare_at_rest_is_zero_there_replays_and_is_forgotten(tmp_path):
         ):
             controller.tare()
         assert not controller.is_tared
-        guard.brake()
+        guard.motions.brake()
         run(1.0)
         before = law.sample.external_interval.copy()
         controller.tare()
@@ -392,9 +392,9 @@ def test_tare_at_rest_is_zero_there_replays_and_is_forgotten(tmp_path):
         assert controller.is_tared
         assert (law.sample.external_interval < 0.7 * before).all()
         assert (np.abs(law.sample.external) < law.sample.external_interval).all()
-        assert not guard.contacts.count
+        assert not guard.findings.contacts.count
         run(0.3)
-        assert guard.contacts.count == 1
+        assert guard.findings.contacts.count == 1
         with pytest.raises(
             TareError, match=r'something touches the arm: .* clear it first'
         ):

@@ -228,14 +228,14 @@ def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(
         config = change(loop.controller, given | steps)
         measurement = np.concatenate((loop.plant.initial.position, np.zeros(2 * n)))
         guard = Guard(config)
-        guard.activate()
-        guard.check_support(measurement)
+        guard.starting.activate()
+        guard.starting.check_support(measurement)
         is_shown = effort in ('whole', 'current')
-        assert (guard.start_error is None) == (
+        assert (guard.starting.error is None) == (
             is_shown or is_limited or parameter == 'gravity'
         )
-        if guard.start_error is not None:
-            assert 'what holds the arm?' in str(guard.start_error)
+        if guard.starting.error is not None:
+            assert 'what holds the arm?' in str(guard.starting.error)
             assert guard.supervisor.reason == 'start rejected'
         moving = measurement + 0.1
         assert check_support(guard.controller, config, moving) is None
@@ -251,15 +251,15 @@ def test_restart_on_a_drive_that_holds_a_torque():
     steps = {'torque.first_step': [5.0] * 7}
     for given in (config, change(config, steps)):
         guard = Guard(given)
-        guard.activate()
-        guard.check_support(held)
+        guard.starting.activate()
+        guard.starting.check_support(held)
         np.testing.assert_allclose(guard.update(10**9, held), gravity, atol=3.0)
     guard = Guard(change(config, {'robot.effort': 'whole'}))
-    guard.activate()
+    guard.starting.activate()
     assert guard.update(10**9, held) is None
     assert 'of another or an earlier controller holds the arm' in guard.supervisor.text
     guard = Guard(change(config, steps))
-    guard.activate()
+    guard.starting.activate()
     assert guard.update(10**9, held * np.repeat([1.0, 0.0], [14, 7])) is None
 
 
@@ -282,7 +282,7 @@ def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort
     added = added_torque(controller_of(config).settings.torque, q)
     for follows in (True, False):
         guard = Guard(config)
-        guard.activate()
+        guard.starting.activate()
         torque = braked = np.zeros(7)
         for k in range(3200):
             applied = (torque if follows else braked) + (

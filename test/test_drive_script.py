@@ -404,7 +404,8 @@ def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
 def test_a_script_is_told_that_the_arm_runs_once_the_law_has_its_first_sample():
     """A start may be refused, or wait for states, for long."""
     beside, told = Script.__new__(Script), []
-    guard = SimpleNamespace(has_sample=False, time=0.0)
+    reference = SimpleNamespace(time=0.0)
+    guard = SimpleNamespace(has_sample=False, reference=reference)
     link = SimpleNamespace(flush=lambda: False, put=lambda kind, _: told.append(kind))
     beside._guard, beside._link, beside._told = guard, link, 0.0
     beside._controller = SimpleNamespace(joints=('joint1',))

@@ -185,7 +185,7 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
     events = {'events.begin': [4.0], 'events.duration': [3.0]}
     guard = Guard(loop.controller)
     plant = plant_of(change(loop.plant, events))
-    guard.activate()
+    guard.starting.activate()
     ratio = 0.0
     random = np.random.default_rng(0)
     left = 0

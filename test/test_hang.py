@@ -44,7 +44,7 @@ class Loop:
         holding = {'safety.torque': 'hold_gravity'}
         self.config = change(loop.controller, holding | (given or {}))
         self.guard = Guard(self.config)
-        self.guard.activate()
+        self.guard.starting.activate()
         self.plant = plant_of(change(loop.plant, LOAD if load else {}))
         self.line = TorqueWatchdog(self.config, TIMEOUT) if watched else None
         self.torque = None
@@ -146,7 +146,7 @@ def test_arm_that_nobody_commands_goes_on_as_its_reference_until_the_watchdog_br
         before, _ = loop.run(draw.uniform(1.5, 4.0))
         law, T = loop.guard.controller, loop.config.sample_time
         _, v, a = motion = np.zeros((3, loop.n))
-        evaluate(law.reference_vector, loop.guard.time, *motion)
+        evaluate(law.reference_vector, loop.guard.reference.time, *motion)
         silence = 0
         while not loop.line.active:
             loop.run(T, hangs=True)
@@ -190,7 +190,7 @@ def test_plan_that_takes_longer_than_a_gap_is_not_made_again(monkeypatch, late):
     loop = Loop('fr3', PATIENT)
     before, _ = loop.run(4.4)
     assert len(plans) == 1
-    loop.guard.reset()
+    loop.guard.starting.reset()
     T = loop.config.sample_time
     for _ in range(round(1.0 / T)):
         state, made = loop.state(), len(plans)
@@ -292,7 +292,7 @@ def test_torque_that_is_left_behind_is_that_of_a_run_sample_by_sample():
     config_of_plant = change(loop.plant, {'duration': 1.05 * 2.0})
     record = simulate(config, config_of_plant)
     guard = Guard(config, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     plant = plant_of(config_of_plant)
     for k, elapsed in enumerate(record.stamps.tolist()):
         torque = guard.update(START + elapsed, plant.measure().copy())
@@ -325,7 +325,7 @@ def test_arm_that_no_error_stops_goes_on_after_a_gap_outside_its_bound():
     config = load_loop('recommended', {'blf_dsc_controller': law}).controller
     rest = np.array([2.293, 1.696])  # rad
     guard = Guard(config, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     for k in range(100):
         guard.update(START + k * 1_000_000, np.array([*rest, *np.zeros(4)]))
     # slower than `safety.velocity_limit`, so it is believed

@@ -363,7 +363,7 @@ def test_evidence_changes_no_torque_until_the_joint_reverses():
     state.drift_extremes[0] = -1.0
     state.breakaway[:] = 0.3
     work.stribeck[:] = 0.5
-    friction.hand_over(settings, state, work, estimate, disturbance)
+    friction.transfer_learned(settings, state, work, estimate, disturbance)
     assert np.abs(work.torque - before).max() > 0.5
     np.testing.assert_allclose(work.torque + disturbance, total, atol=1e-12)
 

@@ -165,7 +165,7 @@ def test_change_of_the_friction_is_taken_from_the_disturbance_estimate():
     work.torque[:] = compensation(state, work, 4.0)
     state.reversal_estimate[:] = 5.0
     disturbance = np.array([0.7])
-    friction.hand_over(SETTINGS, state, work, np.array([0.0, 5.0]), disturbance)
+    friction.transfer_learned(SETTINGS, state, work, np.array([0.0, 5.0]), disturbance)
     assert work.torque[0] == pytest.approx(5.0)
     assert disturbance[0] + work.torque[0] == pytest.approx(0.7 + 4.0)
 

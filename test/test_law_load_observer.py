@@ -149,8 +149,8 @@ def test_what_is_learned_fades_from_r_and_changes_no_torque():
     np.testing.assert_allclose(r, load, rtol=1e-9)
     d3 = np.array([1.0, 2.0])
     before, after = THETA.copy(), THETA + learned
-    disturbance.hand_over(d3, X, after, before)
-    load_observer.hand_over(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
+    disturbance.transfer_learned(d3, X, after, before)
+    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
     r = run(state, work, sensed, DT, theta=after)
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
@@ -247,7 +247,7 @@ def test_torque_is_the_same_while_it_becomes_known_what_is_absorbed():
     sensed = X[:, :P] @ LINKS + [1.0, 0.5]
     before = run(state, work, sensed, 1.0)
     share, d3 = np.array([0.05, 0.1, 0.0]), np.zeros(N)
-    load_observer.hand_over(SETTINGS, state, d3, THETA, THETA, share, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, THETA, THETA, share, NOTHING)
     after = run(state, work, sensed, DT, absorbed=share)
     assert np.abs(after - before).max() > 0.1
     np.testing.assert_allclose(after + d3, before, atol=1e-9)

@@ -217,5 +217,5 @@ def test_disturbance_estimate_follows_the_error_with_leakage_and_gives_up_what_i
     H, before = np.random.default_rng(1).normal(size=(2, 2, M))
     theta = before[0] + 0.1
     torque = H @ before[0] + d3
-    disturbance.hand_over(d3, H, theta, before[0])
+    disturbance.transfer_learned(d3, H, theta, before[0])
     np.testing.assert_allclose(H @ theta + d3, torque)

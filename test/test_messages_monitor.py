@@ -44,7 +44,7 @@ def settings(law):
 def test_tracking_errors_come_if_they_are_wanted_with_each_torque(wanted):
     """Of the law and of a safe torque; where nobody listens they cost time for nothing."""
     loop = GuardedLoop(ControllerConfig())
-    loop.guard.activate()
+    loop.guard.starting.activate()
     errors = []
     for k in range(3):
         if k == 2:

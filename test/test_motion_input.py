@@ -56,7 +56,7 @@ def test_stream_begins_at_rest_after_a_stop(rig):
     rig.inputs.stop(rig.guard, 'a test')
     rig.inputs.take_positions(Float64MultiArrayEncoder(2).encode(last))
     rig.step(1000)
-    q, dq, _ = rig.guard.controller.reference_at(rig.guard.time)
+    q, dq, _ = rig.guard.controller.reference_at(rig.guard.reference.time)
     np.testing.assert_allclose(q, last, atol=1e-9)
     assert not dq.any()
 
@@ -70,9 +70,9 @@ def test_sender_is_followed_again_once_it_has_paused_or_after_a_reset(rig):
     stream(rig, 5)
     assert rig.inputs.targets == 10
     rig.inputs.take_stop()
-    rig.guard.reset()
+    rig.guard.starting.reset()
     rig.step()
-    assert rig.guard.time == 0.0  # before the stop, by the clock of the law
+    assert rig.guard.reference.time == 0.0  # before the stop, by the clock of the law
     stream(rig, 5)
     assert rig.inputs.targets == 15
 
@@ -94,7 +94,7 @@ def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig
     made = []
 
     def make():
-        made.append(rig.guard.time)
+        made.append(rig.guard.reference.time)
         return Trajectory(('joint1', 'joint2'), (TrajectoryPoint(2.0, tuple(AT_REST)),))
 
     inputs.follow(
@@ -110,7 +110,7 @@ def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig
     ((plan, reason),) = reports
     assert not reason
     assert len(made) == 2
-    assert plan.at == pytest.approx(rig.guard.time + 0.01)
+    assert plan.at == pytest.approx(rig.guard.reference.time + 0.01)
 
 
 def moved(rig, seconds):
@@ -118,7 +118,7 @@ def moved(rig, seconds):
     seen = []
     for _ in range(round(1000 * seconds)):
         rig.step()
-        seen.append(rig.guard.controller.reference_at(rig.guard.time))
+        seen.append(rig.guard.controller.reference_at(rig.guard.reference.time))
     return np.array(seen)
 
 
@@ -143,7 +143,7 @@ def test_motions_that_are_sent_use_their_share_of_the_limits(rig, scale):
     rig.guard.retune(change(rig.config, {'limits.scale': scale}))
     rig.inputs.take_stop()
     moved(rig, 1.0)
-    q = rig.guard.controller.reference_at(rig.guard.time)[0]
+    q = rig.guard.controller.reference_at(rig.guard.reference.time)[0]
     limits = rig.config.limits
     largest = scale * np.array((limits.velocity, limits.acceleration))
     for target in (q + np.array([0.9, -0.9]), q):
@@ -159,7 +159,7 @@ def test_stream_that_is_faster_than_its_share_is_followed_at_that(rig):
     rig.guard.retune(change(rig.config, {'limits.scale': 0.1}))
     rig.inputs.take_stop()
     moved(rig, 1.0)
-    q = rig.guard.controller.reference_at(rig.guard.time)[0]
+    q = rig.guard.controller.reference_at(rig.guard.reference.time)[0]
     fastest = 0.1 * np.array(rig.config.limits.velocity)
     for k in range(1, 40):  # 0.6 rad/s
         target = q + 0.012 * k
@@ -179,7 +179,7 @@ def test_motion_sent_while_the_reference_is_faster_is_not_rejected(
     """It keeps at most the speed that it begins with; the next one has its share."""
     rig.inputs.take_stop()
     moved(rig, 1.0)
-    q = rig.guard.controller.reference_at(rig.guard.time)[0]
+    q = rig.guard.controller.reference_at(rig.guard.reference.time)[0]
     go_to(rig, q + np.array([1.5, -1.5]))
     _, dq, ddq = moved(rig, time)[-1]
     rig.guard.retune(change(rig.config, {'limits.scale': scale}))

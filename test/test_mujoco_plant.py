@@ -249,7 +249,7 @@ def test_errors_with_dry_friction_are_as_documented(name, settled, peak):
 def close_loop(config, arm, samples):
     """Guard, and measured angles and errors (samples, n), of either arm under the controller."""
     guard = Guard(config, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     n = len(config.joints)
     angles, errors = np.zeros((2, samples, n))
     for k in range(samples):
@@ -382,7 +382,7 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
     farthest = frames(controller.robot.chain(controller.joints), qr)[-1][:, 0, 3].max()
     arm = beside_a_wall(monkeypatch, plant, farthest - DEPTH)
     guard = Guard(controller, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     state = guard.controller.state
     touched = 0
     for k in range(round(1e3 * ENDED)):

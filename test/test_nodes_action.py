@@ -193,12 +193,12 @@ def own_loop(ros, control_msgs):
 
 
 def reference(law):
-    return law.guard.controller.reference_at(law.guard.time)
+    return law.guard.controller.reference_at(law.guard.reference.time)
 
 
 def rests_at(law):
     """Return where the reference stays, which must rest."""
-    q, dq, _ = law.guard.controller.reference_at(law.guard.time + 10.0)
+    q, dq, _ = law.guard.controller.reference_at(law.guard.reference.time + 10.0)
     np.testing.assert_array_equal(dq, 0.0)
     return q
 
@@ -341,7 +341,7 @@ def test_cancel_of_a_goal_does_not_brake_the_motion_that_has_replaced_it(loop):
     goals.take(law.guard, Goal(7, serialize_message(far), (), (), 0.0))
     client.ros.until(lambda: sent)
     newer = Trajectory(JOINTS, (TrajectoryPoint(1.0, tuple(NEAR)),))
-    law.guard.adopt(law.guard.plan(newer))
+    law.guard.motions.adopt(law.guard.motions.plan(newer))
     goals.take(law.guard, Cancel(7))
     np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
     assert [type(each) for each in sent] == [Answer, End]
@@ -405,11 +405,11 @@ def test_pre_empted_goal_is_aborted(loop, preempt):
 
 def test_goal_with_a_later_stamp_lets_the_motion_before_it_go_on(loop):
     _, law, client = loop
-    stamp = law.guard.last_stamp + 2_000_000_000
+    stamp = law.guard.reference.last_stamp + 2_000_000_000
     handle = client.follow(point(NEAR, 0.5), stamp=stamp)
     np.testing.assert_allclose(reference(law)[0], START, atol=1e-3)
     assert client.result(handle)[0] == SUCCEEDED
-    assert law.guard.last_stamp >= stamp + 500_000_000
+    assert law.guard.reference.last_stamp >= stamp + 500_000_000
     np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
 
 
@@ -439,7 +439,7 @@ def test_stop_past_the_bound_violates_the_path(loop):
 
 
 def in_the_past(client, law):
-    return client.goal(point(NEAR, 0.01), stamp=law.guard.start_stamp + 1)
+    return client.goal(point(NEAR, 0.01), stamp=law.guard.reference.start_stamp + 1)
 
 
 def with_two_degrees_of_freedom(client, _law):
@@ -488,12 +488,12 @@ def test_goal_that_cannot_be_followed_is_rejected_and_the_one_before_goes_on(
 
 def test_goal_too_fast_for_the_limits_takes_longer_and_says_so(loop):
     _, law, client = loop
-    begin = law.guard.time
+    begin = law.guard.reference.time
     status, result = client.result(client.follow(point(FAR, 0.1)))
     assert status == SUCCEEDED
     assert 'as fast as the limits allow: its end is ' in result.error_string
     # 0.6 rad at 1.5 rad/s and 6 rad/s^2
-    assert law.guard.time - begin > 0.6 / 1.5 + 1.5 / 6.0
+    assert law.guard.reference.time - begin > 0.6 / 1.5 + 1.5 / 6.0
     np.testing.assert_allclose(rests_at(law), FAR, atol=1e-9)
 
 

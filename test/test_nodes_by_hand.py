@@ -393,7 +393,7 @@ def test_reset_measures_the_rate_again_and_a_later_refusal_ends_nothing(ros):
     arm = Arm(ros)
     stamp = start_live(ros, node, arm)
     # rejected once, of an arm that has been in command
-    node.guard.refuse(StartError('of the test'))
+    node.guard.starting.refuse(StartError('of the test'))
     node.report_if_changed(node.guard)
     assert not node.finished
     assert ros.reset(node).success
@@ -402,8 +402,8 @@ def test_reset_measures_the_rate_again_and_a_later_refusal_ends_nothing(ros):
         stamp += 10**7
         arm.send(stamp, START)
         ros.spin(0.01)
-    ros.until(lambda: node.guard.start_error is not None)
-    assert 'joint states come every 0.01 s' in str(node.guard.start_error)
+    ros.until(lambda: node.guard.starting.error is not None)
+    assert 'joint states come every 0.01 s' in str(node.guard.starting.error)
     assert not node.finished
     assert not node.guard.supervisor.running
     assert len(arm.commands) >= count

@@ -104,7 +104,7 @@ class Arm:
         return response
 
     def run_until(self, time):
-        self.ros.until(lambda: self.law.guard.time > time)
+        self.ros.until(lambda: self.law.guard.reference.time > time)
 
 
 def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tmp_path):
@@ -162,8 +162,8 @@ def begins_again(ros, arm):
     """Reset the law, and check that neither it nor the drives carry the load twice."""
     ros.reset(arm.law)
     guard = arm.law.guard
-    ros.until(lambda: guard.time < 8.0)
-    ros.until(lambda: guard.time > 0.5 or guard.supervisor.text)
+    ros.until(lambda: guard.reference.time < 8.0)
+    ros.until(lambda: guard.reference.time > 0.5 or guard.supervisor.text)
     assert guard.supervisor.running, guard.supervisor.text
     # if the commands took away what the drives add, it would be 0.2
     assert guard.samples.ratio.max() < 0.1
@@ -194,8 +194,14 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     assert 'set it back to robot.drive_payload, and restart the node' in problem
     assert activate(ros, arm.law)
     guard = arm.law.guard
-    ros.until(lambda: guard.time > 0.2 or guard.supervisor.text or guard.waiting_for)
-    assert guard.supervisor.running, (guard.supervisor.text, guard.waiting_for)
+    ros.until(
+        lambda: (
+            guard.reference.time > 0.2
+            or guard.supervisor.text
+            or guard.starting.waiting_for
+        )
+    )
+    assert guard.supervisor.running, (guard.supervisor.text, guard.starting.waiting_for)
 
 
 def test_service_that_cannot_be_called_is_named(ros, monkeypatch):

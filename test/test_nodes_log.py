@@ -273,7 +273,10 @@ def test_stamps_that_disable_the_watchdog_cause_one_warning_except_in_lockstep(
             JointStateEncoder(JOINTS).encode(10**9, START, ZERO, ZERO)
         )
     ros.until(
-        lambda: law.guard.start_stamp > 0 and law.warned_at == law.guard.start_stamp
+        lambda: (
+            law.guard.reference.start_stamp > 0
+            and law.warned_at == law.guard.reference.start_stamp
+        )
     )
     ros.spin(0.3)
     assert len(log(space, 'a silence is not detected')) == (not simulated)

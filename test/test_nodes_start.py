@@ -195,9 +195,9 @@ def test_gains_that_nobody_measured_are_told_once_where_a_robot_sends_states(
 
     for _ in range(2):
         ros.until(go_on)
-        starts.append(law.guard.start_stamp)
+        starts.append(law.guard.reference.start_stamp)
         law.on_second()
-        law.guard.reset()
+        law.guard.starting.reset()
     assert starts[0] < starts[1]
 
     def lines():
@@ -215,5 +215,5 @@ def test_gains_of_a_simulated_arm_need_no_measuring(ros):
     ros.run(arm, 20)
     law.on_second()
     ros.spin(0.1)
-    assert law.guard.start_stamp > 0  # it has begun
+    assert law.guard.reference.start_stamp > 0  # it has begun
     assert not [line for line in log if 'nobody has measured' in line.msg]

@@ -88,7 +88,7 @@ def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send)
     hold = trajectory(point(sway(0.0), 1.5))
     inputs(law).take_trajectory(hold)
     ros.run(arm, 1700)
-    start = law.guard.time
+    start = law.guard.reference.time
     period = 0.02
     for k in range(150):
         send(law, k, period)
@@ -121,7 +121,7 @@ def test_reference_brakes_when_a_stream_ends(ros, send):
         send(law, k, 0.02)
         ros.run(arm, 20)
     ros.run(arm, 800)
-    reference = law.guard.controller.reference_at(law.guard.time)
+    reference = law.guard.controller.reference_at(law.guard.reference.time)
     np.testing.assert_array_equal(reference[1:], 0.0)
     if send is points_of:  # the last point of a trajectory is held
         np.testing.assert_allclose(reference[0], sway(0.38), atol=1e-7)
@@ -134,18 +134,18 @@ def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
     far = trajectory(point((1.0, 0.5), 2.0))
     inputs(law).take_trajectory(far)
     ros.run(arm, 1000)
-    moving = law.guard.controller.reference_at(law.guard.time)
+    moving = law.guard.controller.reference_at(law.guard.reference.time)
     assert np.abs(moving[1]).min() > 0.1
     response = call_stop(ros)
     assert response.success
     assert 'braking for ' in response.message
     np.testing.assert_allclose(
-        law.guard.controller.reference_at(law.guard.time), moving, atol=0.02
+        law.guard.controller.reference_at(law.guard.reference.time), moving, atol=0.02
     )
     for _ in range(40):
         inputs(law).take_trajectory(far)
         ros.run(arm, 20)
-    at_rest = law.guard.controller.reference_at(law.guard.time)
+    at_rest = law.guard.controller.reference_at(law.guard.reference.time)
     np.testing.assert_array_equal(at_rest[1:], 0.0)
     # from v at 6 rad/s^2, which is reached in 0.05 s
     distance = np.abs(at_rest[0] - moving[0])
@@ -153,7 +153,10 @@ def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
     ros.run(arm, 1100)
     inputs(law).take_trajectory(far)
     ros.run(arm, 1000)
-    assert np.abs(law.guard.controller.reference_at(law.guard.time)[1]).min() > 0.1
+    assert (
+        np.abs(law.guard.controller.reference_at(law.guard.reference.time)[1]).min()
+        > 0.1
+    )
 
 
 def test_stop_and_a_trajectory_without_points_are_always_accepted(ros):
@@ -165,7 +168,7 @@ def test_stop_and_a_trajectory_without_points_are_always_accepted(ros):
     ros.run(arm, 300)
     inputs(law).take_trajectory(trajectory())
     ros.run(arm, 800)
-    reference = law.guard.controller.reference_at(law.guard.time)
+    reference = law.guard.controller.reference_at(law.guard.reference.time)
     np.testing.assert_array_equal(reference[1:], 0.0)
     assert inputs(law).rejected == 0
 
@@ -195,7 +198,7 @@ def test_without_control_msgs_the_reason_is_said_once_and_all_else_works(ros, ca
     ros.run(arm, 1100)
     inputs(law).take_trajectory(trajectory(point((1.9, 1.4), 1.0)))
     ros.run(arm, 1500)
-    reference = law.guard.controller.reference_at(law.guard.time)
+    reference = law.guard.controller.reference_at(law.guard.reference.time)
     np.testing.assert_allclose(reference[0], (1.9, 1.4), atol=1e-9)
     said = capfd.readouterr().err
     assert said.count('control_msgs is not installed') == 1

@@ -104,8 +104,8 @@ def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(
         message = trajectory(joints, np.array(shift), duration=3.0, fields=fields)
         assert send(ros, law, message) == ''
         ros.run(arm, 1800)
-    begin = law.guard.start_stamp
-    last = [1e-9 * (law.guard.last_stamp - begin)]
+    begin = law.guard.reference.start_stamp
+    last = [1e-9 * (law.guard.reference.last_stamp - begin)]
     ros.run(arm, 3500)
 
     assert inputs(law).accepted == 3
@@ -143,7 +143,7 @@ def test_long_chunk_is_followed_from_the_sample_that_was_promised_on(ros):
     after = law.guard.controller.reference_vector
     ros.until(lambda: motions and len(references) > 3000)
     promised = decode(motions[0]).content['at']
-    begin = law.guard.start_stamp
+    begin = law.guard.reference.start_stamp
     stamps = [Time.from_msg(each.header.stamp).nanoseconds for each in references]
     assert set(np.diff(stamps)) == {SECOND // 1000}
     times = 1e-9 * (np.array(stamps) - begin)
@@ -201,7 +201,7 @@ def test_header_stamp_sets_the_start_of_a_trajectory(ros):
     sent = trajectory(JOINTS, 0.0, duration=0.1)
     assert 'not in command: starting' in send(ros, law, sent)
     ros.run(arm, 20)
-    begin = law.guard.start_stamp + 3 * SECOND
+    begin = law.guard.reference.start_stamp + 3 * SECOND
     sent = trajectory(JOINTS, 0.0, duration=0.1, stamp=begin)
     send(ros, law, sent)
     assert inputs(law).accepted == 1
@@ -287,7 +287,7 @@ def test_trajectory_that_cannot_be_planned_two_seconds_ahead_is_rejected(
         plans.append(plan.at)
         raise LatePlanError(['it was planned too late'])
 
-    monkeypatch.setattr(law.guard, 'adopt', late)
+    monkeypatch.setattr(law.guard.motions, 'adopt', late)
     sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
     assert 'it was planned too late' in send(ros, law, sent)
     assert len(plans) == 8

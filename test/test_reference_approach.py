@@ -288,14 +288,14 @@ def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(
     if rest:
         rig.plant.state[3:5] = 0.0
     rig.step(1)
-    rig.guard.activate()
+    rig.guard.starting.activate()
     first = len(rig.commands)
     rig.step(1500)
     assert rig.guard.supervisor.running, rig.supervisor.text
     assert rig.guard.samples.ratio.max() < 0.6
     # it starts from the beginning, or goes on
-    assert (rig.guard.time < 2.0) == rest
-    assert rest or rig.guard.settled < 1.6
+    assert (rig.guard.reference.time < 2.0) == rest
+    assert rest or rig.guard.reference.settled < 1.6
     assert np.abs(rig.commands[first:]).max() < 15.0
 
 
@@ -304,15 +304,15 @@ def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop()
     rig.step(500)
     rig.guard.deactivate()
     rig.step(1)
-    rig.guard.activate()
+    rig.guard.starting.activate()
     rig.step(500)
-    assert rig.guard.time == pytest.approx(1.0)
+    assert rig.guard.reference.time == pytest.approx(1.0)
     rig.deliver(b'')
     rig.step(1)
-    rig.guard.activate()
+    rig.guard.starting.activate()
     rig.step(1)
     assert rig.supervisor.running
-    assert rig.guard.time == 0.0
+    assert rig.guard.reference.time == 0.0
 
 
 def test_waypoints_are_passed_at_their_times_and_the_last_is_held():

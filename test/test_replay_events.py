@@ -71,7 +71,9 @@ class Recorder(Rig):
             if law.samples == 1:
                 self.telemetry.restart()
             known = law.sample, law.settings.torque.limit, guard.samples.ratio
-            for topic, message in self.telemetry.sample(guard.last_stamp, *known, 0.0):
+            for topic, message in self.telemetry.sample(
+                guard.reference.last_stamp, *known, 0.0
+            ):
                 if topic is not BOUND:  # of which the node also sends the changed ones
                     self.record(topic, message)
         self.publish_events()
@@ -125,29 +127,31 @@ def eventful():
     )
     rig.step(50)
     point = TrajectoryPoint(0.4, (2.2, 1.6), (0.0, 0.0), (0.0, 0.0))
-    rig.guard.adopt(rig.guard.plan(Trajectory(JOINTS, (point,))))
+    rig.guard.motions.adopt(rig.guard.motions.plan(Trajectory(JOINTS, (point,))))
     rig.step(100)
-    plan = rig.guard.plan(Trajectory(JOINTS, (point,)), rig.guard.time + 0.02)
+    plan = rig.guard.motions.plan(
+        Trajectory(JOINTS, (point,)), rig.guard.reference.time + 0.02
+    )
     rig.step(10)
-    rig.guard.adopt(plan)
+    rig.guard.motions.adopt(plan)
     rig.step(50)
     for k in range(5):  # a stream, each target before the one before is reached
-        now = rig.guard.time
+        now = rig.guard.reference.time
         ahead = rig.guard.controller.reference_at(now + 0.03)
         beside = tuple((ahead[0] + 1e-4 * k).tolist())
         rates = tuple(ahead[1].tolist())
         target = Target(beside, rates, now + 0.03, now + 0.06, k > 2)
-        plan = rig.guard.plan(target, now + 0.004)
+        plan = rig.guard.motions.plan(target, now + 0.004)
         rig.step(4)
-        rig.guard.adopt(plan)
+        rig.guard.motions.adopt(plan)
         rig.step(20)
-    rig.guard.brake()
+    rig.guard.motions.brake()
     rig.step(50)
-    here = rig.guard.controller.reference_at(rig.guard.time)[0]
+    here = rig.guard.controller.reference_at(rig.guard.reference.time)[0]
     near = TrajectoryPoint(0.005, tuple((here + 0.002).tolist()))
-    stretched = rig.guard.plan(Trajectory(JOINTS, (near,)))
+    stretched = rig.guard.motions.plan(Trajectory(JOINTS, (near,)))
     assert stretched.motion.note
-    rig.guard.adopt(stretched)
+    rig.guard.motions.adopt(stretched)
     rig.step(50)
     rig.guard.retune(change(rig.config, {'feedback.gain': (50.0, 25.0)}))
     rig.step(50)
@@ -155,11 +159,11 @@ def eventful():
     rig.step(30)
     rig.wait(100)  # the watchdog commands while the controller is inactive, too
     rig.step(30)
-    rig.guard.activate()
+    rig.guard.starting.activate()
     rig.step(30)
     rig.wait(100)
     rig.step(30)
-    rig.guard.reset()
+    rig.guard.starting.reset()
     rig.step(10)
     rig.deliver(b'')
     rig.step(10)
@@ -212,7 +216,7 @@ def test_dropped_states_are_detected(tmp_path):
     rig.step(50)
     rig.guard.deactivate()
     rig.step(50)
-    rig.guard.activate()
+    rig.guard.starting.activate()
     rig.step(50)
     rig.release()
     result = rig.verify(tmp_path)
@@ -229,7 +233,7 @@ def test_dropped_state_is_told_from_a_missing_answer_beside_torques_of_the_watch
     rig.drops = (20,)
     rig.step(50)
     rig.wait(100)
-    rig.guard.reset()
+    rig.guard.starting.reset()
     rig.step(30)
     rig.release()
     result = rig.verify(tmp_path)
@@ -258,7 +262,7 @@ def test_replay_ends_where_the_stamps_restart(tmp_path):
     rig.step(50)
     rig.base -= 20 * MILLISECOND
     rig.step(5)
-    rig.guard.reset()
+    rig.guard.starting.reset()
     rig.step(50)
     result = rig.verify(tmp_path)
     stamp = rig.base + 55 * MILLISECOND

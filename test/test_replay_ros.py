@@ -88,7 +88,7 @@ def test_trajectories_and_gain_change_replay_where_they_took_effect(tmp_path):
     run.run(300)
     run.change('feedback.gain', [50.0, 25.0])
     run.run(200)
-    begin = run.law.guard.last_stamp + SECOND // 4
+    begin = run.law.guard.reference.last_stamp + SECOND // 4
     later = trajectory(
         JOINTS[::-1], np.array([0.05, -0.1]), duration=0.5, fields=2, stamp=begin
     )
@@ -135,7 +135,7 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
     deactivate(run.ros, run.arm)
     clock.advance(0.1)
     run.ros.until(lambda: run.law.guard.supervisor.text)
-    silent = run.law.guard.last_stamp
+    silent = run.law.guard.reference.last_stamp
     activate(run.ros, run.arm)
     run.ros.until(lambda: clock.advance(0.01) or run.arm.is_offered)
     run.run(20)

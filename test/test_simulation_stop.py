@@ -122,7 +122,7 @@ def test_law_that_was_stopped_does_not_go_on_in_the_compiled_loop():
     plant_config = build(PlantConfig, {'duration': 3.0})
     plant = plant_of(plant_config)
     guard = Guard(config)
-    guard.activate()
+    guard.starting.activate()
     record = new_record(guard.controller, config, plant_config, guard.journal)
     parts = _run_supervised(guard, plant, record.rows, record.stamps.size)
     for _ in range(2):  # the first sample, and a chunk of a second

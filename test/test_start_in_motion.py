@@ -43,7 +43,7 @@ class Arm:
         }
         self.config = change(config, given)
         self.guard = Guard(self.config)
-        self.guard.activate()
+        self.guard.starting.activate()
         self.plant = plant_of(change(loop.plant, dict(load)))
         self._draw = draw
 
@@ -95,7 +95,7 @@ def test_arm_that_is_taken_over_in_motion_gets_no_faster_than_it_is_asked_to(
     leaving, _ = arm.run(0.005, 0.3)
     before = leaving[-1]
     assert before.max() > 0.1
-    getattr(arm.guard, back)()
+    getattr(arm.guard.starting, back)()
     speed, asked = arm.run(1.0, 1.0)
     assert arm.guard.supervisor.running, arm.guard.supervisor.text
     over = speed.max(axis=0) - np.maximum(before, asked.max(axis=0))
@@ -113,7 +113,7 @@ def test_arm_that_forgets_its_load_in_motion_gets_no_faster_than_it_is_asked_to(
     """
     arm = Arm('ur5e_driver', np.inf, np.random.default_rng(0), LOAD)
     before, _ = arm.run(seconds, seconds)
-    arm.guard.reset()
+    arm.guard.starting.reset()
     speed, asked = arm.run(0.6, 0.6)
     assert arm.guard.supervisor.running, arm.guard.supervisor.text
     most = np.maximum(before[-100:].max(axis=0), asked.max(axis=0))
@@ -131,7 +131,7 @@ def test_arm_that_is_reset_at_rest_gets_no_faster_than_before_or_asked(preset, s
     before, _ = arm.run(seconds, seconds)
     arm.guard.fail('by hand')
     arm.run(2.0, 2.0)
-    arm.guard.reset()
+    arm.guard.starting.reset()
     speed, asked = arm.run(0.6, 0.6)
     assert arm.guard.supervisor.running, arm.guard.supervisor.text
     most = np.maximum(before[-200:].max(axis=0), asked.max(axis=0))
@@ -143,7 +143,7 @@ def test_wrist_of_an_arm_that_is_reset_in_motion_does_not_fall_with_its_load(pre
     """It got 0.2 rad/s too fast in 20 ms, until the feedback caught it."""
     arm = Arm(preset, np.inf, np.random.default_rng(0), LOAD)
     before, _ = arm.run(4.5, 4.5)
-    arm.guard.reset()
+    arm.guard.starting.reset()
     speed, asked = arm.run(0.08, 0.08)
     most = np.maximum(before[-200:].max(axis=0), asked.max(axis=0))
     assert (speed.max(axis=0) - most).max() < SLACK['hold']
@@ -157,7 +157,7 @@ def test_first_torque_in_motion_continues_the_one_that_acts(preset):
     arm.guard.deactivate()
     arm.run(0.05, 0.05)
     last = arm.guard.safe_torque.commanded.copy()
-    arm.guard.reset()
+    arm.guard.starting.reset()
     arm.run(arm.config.sample_time, arm.config.sample_time)
     first = arm.guard.safe_torque.commanded
     step = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
@@ -172,9 +172,9 @@ def test_restarted_controller_says_that_the_arm_still_moves():
     speed = np.abs(arm.plant.truth()[-7:]).max()
     small = {'torque.first_step': [0.01] * 7}  # N m
     arm.guard = Guard(change(arm.config, small))
-    arm.guard.activate()
+    arm.guard.starting.activate()
     arm.guard.update(START + arm.plant.elapsed_ns, arm.plant.measure().copy())
-    text = str(arm.guard.start_error)
+    text = str(arm.guard.starting.error)
     assert 'the arm still moves' in text
     said = float(re.search(r'at ([\d.]+) rad/s: start again when it rests', text)[1])
     assert said == pytest.approx(speed, rel=0.05)  # as measured

@@ -79,7 +79,7 @@ def test_no_joint_of_a_panda_gets_much_faster_in_a_stop():
     for moment in np.linspace(2.0, 4.5, 12):  # s, half of its period
         plant = plant_of(change(loop.plant, load))
         guard = Guard(loop.controller)
-        guard.activate()
+        guard.starting.activate()
 
         def run(seconds, plant=plant, guard=guard):
             speeds = []

@@ -331,11 +331,11 @@ def test_controller_waits_silently_for_the_first_usable_state(safety, raw):
     rig = Rig({'safety.torque': safety})
     for _ in range(3):
         assert rig.deliver(raw(rig.state())) is None
-        assert rig.guard.waiting_for
+        assert rig.guard.starting.waiting_for
     assert (rig.supervisor.phase, rig.supervisor.stops) == (Phase.STARTING, 0)
     rig.step(2)
     assert rig.supervisor.phase is Phase.TRACKING
-    assert not rig.guard.waiting_for
+    assert not rig.guard.starting.waiting_for
     assert len(rig.commands) == 2
 
 
@@ -343,7 +343,7 @@ def test_unusable_states_after_a_reset_leave_the_safe_torque_in_force():
     """A driver that holds the last torque of the law for ever must get another."""
     rig = Rig(HOLDING)
     rig.step(20)
-    rig.guard.reset()
+    rig.guard.starting.reset()
     torque = rig.deliver(rig.state().raw(dq=NAN))
     assert rig.supervisor.phase is Phase.STARTING
     assert (np.abs(torque) > 1.0).all()
@@ -377,6 +377,13 @@ def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     assert (np.abs(rig.commands[-1]) > 0.1).all()
 
 
+CALLS = {
+    'deactivate': lambda guard: guard.deactivate(),
+    'activate': lambda guard: guard.starting.activate(),
+    'reset': lambda guard: guard.starting.reset(),
+}
+
+
 @pytest.mark.parametrize('late', [0, 60])
 @pytest.mark.parametrize(
     ('calls', 'phase'),
@@ -396,7 +403,7 @@ def test_gravity_is_held_in_silence_only_for_the_fade_time(calls, phase, late):
     rig.step(20)
     rig.wait(late)
     for call in calls:
-        getattr(rig.guard, call)()
+        CALLS[call](rig.guard)
     rig.wait(60 - late)
     assert (np.abs(rig.commands[-1]) > 1.0).all()
     rig.wait(1000)
@@ -415,7 +422,7 @@ def test_torque_that_has_faded_is_not_commanded_again_after_a_reset():
     rig.step(20)
     rig.wait(1000)
     commands = len(rig.commands)
-    rig.guard.reset()
+    rig.guard.starting.reset()
     rig.wait(100)
     assert len(rig.commands) == commands
 
@@ -434,7 +441,7 @@ def test_after_a_long_silence_nothing_is_commanded_until_a_reset():
     assert back.startswith('joint states are back after 3 s')
     assert rig.supervisor.stops == 1
     assert rig.guard.release() is None
-    rig.guard.reset()
+    rig.guard.starting.reset()
     rig.step(5)
     assert rig.supervisor.running
     rig.guard.deactivate()

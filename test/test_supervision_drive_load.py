@@ -52,8 +52,8 @@ def test_load_is_told_in_steps_of_half_a_percent_of_a_torque_limit(law):
         assert step.max() < 0.005 * (1.0 + 1e-9)
     assert len(told) > 10
     assert (np.diff(told) > 0.0).all()
-    assert loads.told.mass == pytest.approx(2.5)  # with the declared 0.5 kg
-    np.testing.assert_allclose(loads.told.moments[1:], 2.0 * np.array(CENTRE))
+    assert loads.in_force.mass == pytest.approx(2.5)  # with the declared 0.5 kg
+    np.testing.assert_allclose(loads.in_force.moments[1:], 2.0 * np.array(CENTRE))
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_load_that_is_put_down_after_a_reset_leaves_what_it_held(law):
         if load is None:
             break
         loads.take(law, load)
-    assert loads.told.mass == pytest.approx(1.5)
-    np.testing.assert_allclose(loads.told.centre, CENTRE)
+    assert loads.in_force.mass == pytest.approx(1.5)
+    np.testing.assert_allclose(loads.in_force.centre, CENTRE)
 
 
 def test_told_load_is_left_as_it_is_until_another_is_weighed(law):

@@ -114,7 +114,7 @@ def stopped_by(config, plant, spoil=None, reach=None, at=2.0, after=3.0):
     arm = plant_of(plant)
     n = len(config.joints)
     guard = Guard(config, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     torques = []
     positions = []
     speeds = []
@@ -277,7 +277,7 @@ def estimates_of(scale):
     config = change(loop.controller, {'robot.effort': 'whole'})
     arm = plant_of(change(loop.plant, {'duration': 0.0}))
     guard = Guard(config, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     for k in range(12_000):
         torque = guard.update(FIRST_STAMP + k * 1_000_000, arm.measure().copy())
         arm.step(scale * torque)

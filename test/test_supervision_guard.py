@@ -227,7 +227,7 @@ def test_arm_that_was_fast_at_the_stop_speeds_up_only_if_it_gets_faster(
 ):
     """At a stop from 0.8 rad/s, from 2 * 0.8 + 0.5 rad/s on."""
     guard = Guard(change(ControllerConfig(), {'safety.torque': 'damping'}))
-    guard.activate()
+    guard.starting.activate()
     q = np.array([0.3, -0.4])
     for k in range(700):
         if k == 100:
@@ -245,7 +245,7 @@ def test_torque_continues_after_immediate_reactivation():
     before = rig.commands[-1]
     rig.guard.deactivate()
     rig.step(1)
-    rig.guard.activate()
+    rig.guard.starting.activate()
     rig.step(100)
     assert rig.supervisor.phase is Phase.TRACKING
     # The surface filter restarts: that changes the torque of 9 N m by K_p = 60 N m
@@ -265,7 +265,7 @@ def test_rate_limit_applies_from_the_torque_before_an_activation(again):
     assert not rig.commands[-1].any()
     steps = np.abs(np.diff(rig.commands[-13:], axis=0))
     assert (steps <= rate * 1e-3 * (1.0 + 1e-12)).all()
-    rig.guard.activate() if again == 'activate' else rig.guard.reset()
+    rig.guard.starting.activate() if again == 'activate' else rig.guard.starting.reset()
     rig.step(12)
     steps = np.abs(np.diff(rig.commands[-13:], axis=0))
     assert (steps <= rate * 1e-3 * (1.0 + 1e-12)).all()
@@ -283,13 +283,15 @@ def test_estimates_are_kept_over_an_activation_and_forgotten_by_a_reset(again):
     learned = state.estimate.copy()
     window = state.window.rows[0]
     rig.guard.deactivate()
-    getattr(rig.guard, again)()
+    getattr(rig.guard.starting, again)()
     start = rig.guard.controller.settings.initial_estimate
     np.testing.assert_array_equal(state.estimate, learned if keep else start)
     assert state.window.rows[0] == (window if keep else 0.0)
     assert not np.array_equal(learned, start)
     rig.step()
-    assert (rig.guard.time > 0.1) == keep  # an empty window fills from t = 0 on
+    assert (
+        rig.guard.reference.time > 0.1
+    ) == keep  # an empty window fills from t = 0 on
 
 
 def test_estimates_before_a_fault_are_kept_but_not_the_window():
@@ -310,7 +312,7 @@ def test_estimates_before_a_fault_are_kept_but_not_the_window():
     for other in (start, rig.guard.controller.state.estimate):
         assert not np.array_equal(other, learned)
     rig.guard.deactivate()
-    rig.guard.activate()
+    rig.guard.starting.activate()
     controller = rig.guard.controller
     kept = controller.save()
     controller.reset()  # nothing else of the state survives
@@ -324,17 +326,17 @@ def test_limit_changed_at_run_time_stops_the_arm_and_its_reference_begins_anew()
     rig = Rig()
     rig.step(200)
     rig.guard.deactivate()
-    rig.guard.activate()
+    rig.guard.starting.activate()
     rig.step(50)
-    assert rig.guard.time > 0.2
+    assert rig.guard.reference.time > 0.2
     rig.guard.retune(change(rig.guard.config, {'safety.error_ratio': 1e-3}))
     rig.step()
     assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
     rig.guard.retune(rig.config)
-    rig.guard.activate()
+    rig.guard.starting.activate()
     rig.step(5)
     assert rig.supervisor.running
-    assert rig.guard.time < 0.01
+    assert rig.guard.reference.time < 0.01
 
 
 def test_reactivation_restarts_the_surface_filter_at_the_current_state():
@@ -343,7 +345,7 @@ def test_reactivation_restarts_the_surface_filter_at_the_current_state():
     rig.step(1500)
     rig.guard.deactivate()
     rig.plant.state[3:5] = 0.0
-    rig.guard.activate()
+    rig.guard.starting.activate()
     assert rig.guard.controller.samples == 0
     rig.step(1)
     # rad/s; it was at 0.3 rad/s
@@ -355,7 +357,7 @@ def test_learning_waits_for_a_full_window_after_a_reset_in_motion():
     rig.step(1200)
     state = rig.guard.controller.state
     assert state.latch.latched[0] == 1.0
-    rig.guard.reset()
+    rig.guard.starting.reset()
     rig.step(999)  # the window and the settling time of the filters
     assert rig.guard.supervisor.running
     assert state.latch.latched[0] == 0.0
@@ -461,15 +463,15 @@ def test_plan_keeps_one_in_force_that_has_not_begun():
     to = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
     guard = rig.guard
     running = guard.controller.reference_at
-    times = guard.time + np.linspace(0.001, 0.02, 20)
+    times = guard.reference.time + np.linspace(0.001, 0.02, 20)
     before = [running(t) for t in times]
-    guard.adopt(guard.plan(to, guard.time + 0.02))
+    guard.motions.adopt(guard.motions.plan(to, guard.reference.time + 0.02))
     rig.step(10)
-    guard.adopt(guard.plan(to, guard.time + 0.02))
+    guard.motions.adopt(guard.motions.plan(to, guard.reference.time + 0.02))
     np.testing.assert_allclose([running(t) for t in times], before, atol=1e-12)
     rig.step(1200)
     assert rig.supervisor.phase is Phase.TRACKING
-    guard.adopt(guard.plan(to))
+    guard.motions.adopt(guard.motions.plan(to))
     assert len(unpack(guard.controller.reference_vector)) == 1  # the past is forgotten
 
 
@@ -478,13 +480,13 @@ def test_arm_approaches_a_motion_that_begins_later_and_then_tracks_it():
     rig.step(1500)
     assert rig.supervisor.phase is Phase.TRACKING
     to = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
-    begin = rig.guard.time + 0.3
-    plan = rig.guard.plan(to, begin)
+    begin = rig.guard.reference.time + 0.3
+    plan = rig.guard.motions.plan(to, begin)
     assert plan.motion.settled >= begin
-    rig.guard.adopt(plan)
+    rig.guard.motions.adopt(plan)
     assert rig.supervisor.phase is Phase.APPROACHING
     T = rig.guard.config.sample_time
-    rig.step(round((plan.motion.settled - rig.guard.time) / T) - 1)
+    rig.step(round((plan.motion.settled - rig.guard.reference.time) / T) - 1)
     assert rig.supervisor.phase is Phase.APPROACHING
     rig.step(2)
     assert rig.supervisor.phase is Phase.TRACKING
@@ -495,21 +497,22 @@ def test_plan_is_followed_from_its_start_unless_late_or_from_a_replaced_referenc
     rig.step(100)
     to = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
     late, replaced, plan = (
-        rig.guard.plan(to, rig.guard.time + lead) for lead in (0.01, 0.03, 0.03)
+        rig.guard.motions.plan(to, rig.guard.reference.time + lead)
+        for lead in (0.01, 0.03, 0.03)
     )
     before = rig.guard.controller.reference_at(plan.at)
     rig.step(20)
     with pytest.raises(LatePlanError):
-        rig.guard.adopt(late)
-    rig.guard.adopt(plan)
+        rig.guard.motions.adopt(late)
+    rig.guard.motions.adopt(plan)
     with pytest.raises(TrajectoryError, match='replaced while it was planned'):
-        rig.guard.adopt(replaced)
+        rig.guard.motions.adopt(replaced)
     np.testing.assert_allclose(
         rig.guard.controller.reference_at(plan.at), before, atol=1e-12
     )
     rig.step(1200)
     np.testing.assert_allclose(
-        rig.guard.controller.reference_at(rig.guard.time)[0], (2.1, 1.5)
+        rig.guard.controller.reference_at(rig.guard.reference.time)[0], (2.1, 1.5)
     )
     assert rig.supervisor.phase is Phase.TRACKING
 
@@ -518,12 +521,12 @@ def test_trajectory_in_the_sample_of_a_stop_continues_from_there():
     rig = Rig()
     rig.step(100)
     away = Trajectory(JOINTS, (TrajectoryPoint(1.0, (2.1, 1.5)),))
-    rig.guard.adopt(rig.guard.plan(away))
+    rig.guard.motions.adopt(rig.guard.motions.plan(away))
     rig.step(200)
-    rig.guard.brake()
-    before = rig.guard.controller.reference_at(rig.guard.time)
-    rig.guard.adopt(rig.guard.plan(away))
-    after = rig.guard.controller.reference_at(rig.guard.time)
+    rig.guard.motions.brake()
+    before = rig.guard.controller.reference_at(rig.guard.reference.time)
+    rig.guard.motions.adopt(rig.guard.motions.plan(away))
+    after = rig.guard.controller.reference_at(rig.guard.reference.time)
     np.testing.assert_allclose(after[:2], before[:2], atol=1e-12)
     rig.step(1500)
     assert rig.supervisor.phase is Phase.TRACKING
@@ -568,8 +571,10 @@ def test_states_of_a_run_relieve_saturation_as_those_that_come_one_by_one():
     guard, T, k = rig.guard, rig.guard.config.sample_time, 20
     before = guard.samples.saturated_time
     assert before > 0.25 * k * T
-    stamps = guard.last_stamp + guard.config.sample_time_ns * np.arange(1, k + 1)
-    measurements = np.tile(guard.last_state.measurement, (k, 1))
+    stamps = guard.reference.last_stamp + guard.config.sample_time_ns * np.arange(
+        1, k + 1
+    )
+    measurements = np.tile(guard.safe_torque.last.measurement, (k, 1))
     guard.advance(stamps, measurements, np.zeros((k, 2)))
     assert guard.samples.saturated_time == pytest.approx(before - 0.25 * k * T)
 
@@ -647,7 +652,7 @@ def test_estimates_are_discarded_by_a_reset_at_once():
     rig.step(300)
     initial = rig.guard.controller.settings.initial_estimate
     assert rig.guard.samples.disturbance.any()
-    rig.guard.reset()
+    rig.guard.starting.reset()
     np.testing.assert_array_equal(rig.guard.samples.estimate, initial)
     assert not rig.guard.samples.disturbance.any()
 

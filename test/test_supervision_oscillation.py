@@ -56,7 +56,7 @@ def stopped(loop):
     """Run a loop until 1.2 s after its stop."""
     plant = plant_of(loop.plant)
     guard = Guard(loop.controller, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     period = loop.plant.sample_time_ns
     n = len(loop.controller.joints)
     speed, torque, stop = [], [], -1

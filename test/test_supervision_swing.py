@@ -130,7 +130,7 @@ def test_stop_names_the_joints_that_swing_in_it():
     study = random_arms.study_of('fr3', 'wide')
     guard = Guard(study.controller)
     arm = plant_of(random_arms.arm_of(study, 9))
-    guard.activate()
+    guard.starting.activate()
     with np.errstate(all='ignore'):
         for k in range(1500):
             stamp = FIRST_STAMP + k * study.controller.sample_time_ns

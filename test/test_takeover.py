@@ -38,9 +38,9 @@ class Arm:
     def restart(self, acting=None):
         """Start another controller, which knows nothing but what it is told."""
         self.guard = Guard(self.config, lambda: 0, lambda: 0)
-        self.guard.activate()
+        self.guard.starting.activate()
         if acting is not None:
-            self.guard.take_over_from(acting)
+            self.guard.starting.take_over_from(acting)
 
     def run(self, seconds):
         """Return torques (k, n) and the largest speed [rad/s] of so many seconds."""
@@ -79,7 +79,7 @@ def test_it_goes_on_from_the_torque_that_holds_the_arm(arm):
 def test_a_reset_in_command_forgets_what_was_learned_and_goes_on_to_carry_the_load(arm):
     """Elsewhere the arm sags, as the next test shows."""
     held = arm.guard.controller.state.torque.copy()
-    arm.guard.reset()
+    arm.guard.starting.reset()
     state, settings = arm.guard.controller.state, arm.guard.controller.settings
     np.testing.assert_array_equal(state.estimate, settings.initial_estimate)
     torques, speed = arm.run(0.5)
@@ -91,7 +91,7 @@ def test_a_reset_of_an_arm_that_has_stopped_goes_on_to_carry_its_load(arm):
     """As the safe torque does: else the arm falls until the feedback catches it."""
     arm.guard.fail('by hand')
     torques, _ = arm.run(2.0)
-    arm.guard.reset()
+    arm.guard.starting.reset()
     first, speed = arm.run(0.5)
     assert arm.guard.supervisor.running, arm.guard.supervisor.text
     assert speed < 0.02  # rad/s
@@ -101,8 +101,8 @@ def test_a_reset_of_an_arm_that_has_stopped_goes_on_to_carry_its_load(arm):
 def test_a_start_that_is_refused_after_a_reset_leaves_the_load_to_the_safe_torque(arm):
     arm.guard.fail('by hand')
     arm.run(2.0)
-    arm.guard.reset()
-    arm.guard.refuse(StartError('by hand'))
+    arm.guard.starting.reset()
+    arm.guard.starting.refuse(StartError('by hand'))
     _, speed = arm.run(0.5)
     assert arm.guard.supervisor.phase is Phase.SAFE_STOP
     assert speed < 0.04  # rad/s; a Panda that is left alone has up to 0.03
@@ -110,14 +110,14 @@ def test_a_start_that_is_refused_after_a_reset_leaves_the_load_to_the_safe_torqu
 
 def test_an_invalid_state_after_a_reset_lets_no_load_fall(arm):
     """The law waits for another, and the safe torque carries the load meanwhile."""
-    arm.guard.reset()
+    arm.guard.starting.reset()
     n = len(arm.config.joints)
     for _ in range(round(0.2 / arm.config.sample_time)):
         measurement = arm.plant.measure().copy()
         measurement[n : 2 * n] = np.nan
         arm.plant.step(arm.guard.update(arm.stamp, measurement))
         arm.stamp += arm.config.sample_time_ns
-    assert arm.guard.waiting_for
+    assert arm.guard.starting.waiting_for
     assert np.abs(arm.plant.truth()[-n:]).max() < 0.02  # rad/s
     _, speed = arm.run(0.5)
     assert arm.guard.supervisor.running, arm.guard.supervisor.text
@@ -136,7 +136,7 @@ def test_a_reset_begins_without_a_load_that_nothing_shows(torque, gap, is_stoppe
     if is_stopped:
         arm.guard.fail('by hand')
         arm.run(0.1)
-    arm.guard.reset()
+    arm.guard.starting.reset()
     arm.stamp += round(1e9 * gap)
     arm.run(arm.config.sample_time)
     assert arm.guard.supervisor.running, arm.guard.supervisor.text
@@ -153,7 +153,7 @@ def test_a_reset_begins_without_a_load_if_commands_may_not_have_reached_the_arm(
     carried = np.abs(arm.guard.controller.state.disturbance).max()
     arm.guard.stop(reason, 'by hand')
     arm.run(arm.config.sample_time)
-    arm.guard.reset()
+    arm.guard.starting.reset()
     arm.run(arm.config.sample_time)
     assert np.abs(arm.guard.controller.state.disturbance).max() < 0.01 * carried
 
@@ -184,7 +184,7 @@ def test_two_resets_in_a_row_carry_the_load():
     arm = Arm('fr3')
     arm.run(3.0)
     for seconds in (0.0, 0.05, 0.1):
-        arm.guard.reset()
+        arm.guard.starting.reset()
         _, speed = arm.run(seconds)
         assert speed < 0.02
 
@@ -194,7 +194,7 @@ def test_a_controller_that_is_told_nothing_lets_the_load_sag(arm):
     """What the torque that is told saves; also after a reset, which forgets it."""
     held = arm.guard.controller.state.torque.copy()
     arm.restart(held)
-    arm.guard.reset()
+    arm.guard.starting.reset()
     _, speed = arm.run(0.5)
     assert speed > 0.05
 
@@ -204,7 +204,7 @@ def test_without_it_an_arm_that_rests_by_another_torque_is_not_taken_over():
     arm.run(3.0)
     arm.restart()
     assert not len(arm.run(0.1)[0])
-    assert 'gravity twice' in str(arm.guard.start_error)
+    assert 'gravity twice' in str(arm.guard.starting.error)
 
 
 def test_the_largest_first_step_is_one_from_there():
@@ -218,7 +218,7 @@ def test_the_largest_first_step_is_one_from_there():
     far = held + 50.0 * np.sign(held)
     arm.restart(far)
     assert not len(arm.run(0.1)[0])
-    assert isinstance(arm.guard.start_error, StartError)
+    assert isinstance(arm.guard.starting.error, StartError)
 
 
 def test_a_bag_of_it_replays_bit_for_bit(tmp_path):
@@ -226,7 +226,7 @@ def test_a_bag_of_it_replays_bit_for_bit(tmp_path):
     arm.run(1.0)
     held = arm.guard.controller.state.torque.copy()
     with blf.ArmController(arm.config, record=tmp_path / 'bag') as controller:
-        controller.guard.take_over_from(held)
+        controller.guard.starting.take_over_from(held)
         for k in range(200):
             q, dq, effort = arm.plant.measure().reshape(3, -1)
             arm.plant.step(controller.update(1.0 + 0.001 * k, q, dq, effort))

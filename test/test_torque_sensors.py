@@ -219,7 +219,7 @@ class Failing:
         loop = loop_of('panda', seconds)
         plant, n = plant_of(loop.plant), len(loop.controller.joints)
         self.guard = Guard(loop.controller, lambda: 0, lambda: 0)
-        self.guard.activate()
+        self.guard.starting.activate()
         self.error = self.step = 0.0
         before, held = None, None
         for k in range(round(seconds / DT)):
@@ -248,7 +248,7 @@ def test_panda_whose_sensors_fail_in_motion_goes_on_without_them(fails):
     """It does not stop for commands without effect, which efforts would tell."""
     run = Failing(fails)
     assert run.guard.supervisor.phase is Phase.TRACKING
-    assert 'what is commanded while the arm follows' in run.guard.untrusted
+    assert 'what is commanded while the arm follows' in run.guard.findings.untrusted
     assert run.guard.controller.state.observer.faded[0] == 1.0
     assert run.error < 0.03
 
@@ -258,7 +258,7 @@ def test_brakes_that_close_still_stop_an_arm_whose_efforts_say_so():
     loop = loop_of('panda', 2.0)
     plant, n = plant_of(loop.plant), len(loop.controller.joints)
     guard = Guard(loop.controller, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
     rest = None
     for k in range(2000):
         measurement = np.array(plant.measure())
@@ -269,5 +269,5 @@ def test_brakes_that_close_still_stop_an_arm_whose_efforts_say_so():
         if guard.supervisor.phase is Phase.SAFE_STOP:
             break
         plant.step(torque)
-    assert not guard.untrusted
+    assert not guard.findings.untrusted
     assert guard.supervisor.reason in (Reason.NO_EFFECT, Reason.OUTSIDE_BOUND)

@@ -91,7 +91,7 @@ def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
     unlimited = {} if armed else {'actuator.rate_limit': 0.0}
     guard = Guard(loop.controller)
     plant = plant_of(change(loop.plant, unlimited))
-    guard.activate()
+    guard.starting.activate()
     line = TorqueWatchdog(loop.controller, TIMEOUT, armed=armed)
     T = loop.controller.sample_time
     n = len(loop.controller.joints)

@@ -135,7 +135,7 @@ def test_positions_are_believed_at_the_next_start_after_a_wrap():
         rig.sense = lambda state: [state.raw(q=state.q - [tau, 0.0])]
         rig.step(10)
         assert rig.supervisor.reason is Reason.WRAPPED
-        rig.guard.reset()
+        rig.guard.starting.reset()
         rig.step(500)
         assert rig.supervisor.running, rig.supervisor.text
         assert rig.guard.controller.signals.q[0] == pytest.approx(3.0 - tau, abs=0.01)
@@ -259,15 +259,15 @@ def test_normalised_plan_is_followed_the_short_way(start, points):
         planned(np.array(start), end, wrap)[points]
         for wrap in (within_a_turn, np.asarray)
     )
-    plan = rig.guard.plan(Trajectory(JOINTS, tuple(sent)))
-    rig.guard.adopt(plan)
+    plan = rig.guard.motions.plan(Trajectory(JOINTS, tuple(sent)))
+    rig.guard.motions.adopt(plan)
     is_other = any(
         np.abs(np.subtract(a.positions, b.positions)).max() > 1.0
         for a, b in zip(sent, meant, strict=True)
     )
     told = 'goes the short way, shifted by whole turns: joint1 by '
     assert (told in plan.motion.turned) == is_other
-    times = np.linspace(rig.guard.time, plan.motion.end, 500)
+    times = np.linspace(rig.guard.reference.time, plan.motion.end, 500)
     q, dq = sampled(plan.motion.vector, times)[:, :2].transpose(1, 0, 2)
     np.testing.assert_allclose(q[-1], end, atol=1e-9)
     assert np.abs(q - start).max() < 0.11
@@ -279,12 +279,12 @@ def test_joints_with_a_range_go_where_they_are_sent():
     rig = resting((3.3, -1.0), BOUNDED)
     points = tuple(planned(np.array([3.3, -1.0]), [3.4, -1.0])[-1:])
     late = points[0]._replace(time=30.0)
-    plan = rig.guard.plan(Trajectory(JOINTS, (late,)))
+    plan = rig.guard.motions.plan(Trajectory(JOINTS, (late,)))
     assert plan.motion.turned == ''
     assert sampled(plan.motion.vector, [99.0])[0, 0, 0] == pytest.approx(3.4 - tau)
     beyond = TrajectoryPoint(5.0, (6.4, -1.0))
     with pytest.raises(TrajectoryError, match='position_upper'):
-        rig.guard.plan(Trajectory(JOINTS, (beyond,)))
+        rig.guard.motions.plan(Trajectory(JOINTS, (beyond,)))
 
 
 class Kept:
@@ -316,7 +316,7 @@ def test_normalised_stream_goes_on_past_pi_and_this_is_said_once():
         assert np.abs(rig.guard.controller.signals.dqr).max() < 0.5
     assert inputs.targets == 100
     rig.step(500)
-    q, dq, _ = rig.guard.controller.reference_at(rig.guard.time)
+    q, dq, _ = rig.guard.controller.reference_at(rig.guard.reference.time)
     np.testing.assert_allclose(q, true, atol=0.03)  # it coasts for 0.06 s, and brakes
     assert not dq.any()
     assert [line for line in log.lines if 'short way' in line] == log.lines[:1]
@@ -350,7 +350,10 @@ def test_configured_reference_begins_where_the_arm_is(reference):
         moved.append(rig.guard.controller.signals.qr - [6.3, -3.2])
     assert rig.supervisor.running, rig.supervisor.text
     assert np.abs(moved).max() < 0.21
-    assert 'shifted by whole turns: joint1 by +1; joint2 by -1' in rig.guard.turned
+    assert (
+        'shifted by whole turns: joint1 by +1; joint2 by -1'
+        in rig.guard.reference.turned
+    )
 
 
 def test_loop_of_ones_own_says_once_that_it_goes_the_short_way(caplog):

@@ -39,7 +39,7 @@ def killed(study, config, late=0.0):
     given = study.controller
     guard, arm = Guard(given), plant_of(config)
     line = TorqueWatchdog(given, TIMEOUT)
-    guard.activate()
+    guard.starting.activate()
     T, n = given.sample_time, len(given.joints)
     torque, speeds, stop = np.zeros(n), [], None
     for k in range(round(2.2 / T)):

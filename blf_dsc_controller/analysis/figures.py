@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ from blf_dsc_controller.writing import writing
 NAMES = ('tracking.png', 'change.png', 'parameters.png')
 """Names of the files that `draw` can write."""
 
+_MOTION = ('Motion', 'Tracking', 'Torque')
+_LEARNING = ('Parameters', 'Disturbance', 'Excitation', 'Monitors')
 _SIZE = (6.2, 2.6)  # inches
 _LOW = (4.3, 1.75)
 _ABREAST = 3  # joints, at most, in columns; more are in rows
@@ -154,73 +156,109 @@ def draw(run: Run, folder: str | Path, metrics: Metrics | None = None) -> list[P
     These are change.png if a simulated arm changed, and parameters.png if parameters
     were learned. The folder is created if necessary. `metrics` are those of the run, if
     they have been measured already.
+
+    Raises ArgumentTypeError if it is no run.
     """
     check_type('run', run, Run, 'simulate(...).run() and read_run return one')
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     tracking, change, parameters = (folder / name for name in NAMES)
     metrics = metrics or measure(run)
-    n = len(run.joints)
     found = panels([run])
+    _draw_motion(tracking, run, metrics, _of_groups(found, _MOTION))
+    paths = [tracking]
+    changes = true_change_times(run)
+    if changes and run.column('error', 0) is not None:
+        title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
+        draw_panels(change, title, list(close_up(run, changes[0])), 1, _CLOSE_UP)
+        paths.append(change)
+    if _of_groups(found, ('Parameters',)):
+        title = _learning_title(run, metrics)
+        draw_panels(parameters, title, _of_groups(found, _LEARNING), 2, _HIGH)
+        paths.append(parameters)
+    return paths
 
-    def of(*groups: str) -> list[Panel]:
-        return [panel for panel in found if panel.group in groups]
 
+def _of_groups(shown: Iterable[Panel], groups: Sequence[str]) -> list[Panel]:
+    """Return the panels of some groups, in their order."""
+    return [panel for panel in shown if panel.group in groups]
+
+
+def _draw_motion(path: Path, run: Run, metrics: Metrics, shown: list[Panel]) -> None:
+    """Draw the panels of the joints: a column for each, or a row if there are many."""
+    n = len(run.joints)
+    title = _motion_title(run, metrics)
+    if n <= _ABREAST:
+        draw_panels(path, title, shown, n, _SIZE)
+        return
+    linear = [panel for panel in shown if not panel.log]
+    rows = [panel for i in range(n) for panel in linear[i::n]]
+    draw_panels(path, title, rows, len(linear) // n, _LOW, legend_above=True)
+
+
+def _motion_title(run: Run, metrics: Metrics) -> str:
+    """Return for how long the arm moved, whether the bound was kept, and the first stop."""
     title = f'Motion over {run.duration:.4g} s'
     if metrics.held is not None:
         kept = 'held' if metrics.held else 'VIOLATED'
         title = f'Tracking over {run.duration:.4g} s: bound {kept}'
     for time, stop in run.timed_stops[:1]:
         title += f', stopped at {time:.3f} s ({stop.reason})'
-    motion = of('Motion', 'Tracking', 'Torque')
-    paths = [tracking]
-    if n <= _ABREAST:
-        draw_panels(tracking, title, motion, n, _SIZE)
-    else:
-        motion = [panel for panel in motion if not panel.log]
-        rows = [panel for i in range(n) for panel in motion[i::n]]
-        draw_panels(tracking, title, rows, len(motion) // n, _LOW, legend_above=True)
-    changes = true_change_times(run)
-    if changes and run.column('error', 0) is not None:
-        paths.append(change)
-        title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
-        draw_panels(change, title, list(close_up(run, changes[0])), 1, _CLOSE_UP)
-    if of('Parameters'):
-        title = 'Learning'
-        error = metrics.final_parameter_error
-        if not math.isnan(error):
-            what = 'relative parameter error' if run.arm is None else 'torque error'
-            title += f': {what} {100 * error:.2g} % at the end'
-        paths.append(parameters)
-        learned = of('Parameters', 'Disturbance', 'Excitation', 'Monitors')
-        draw_panels(parameters, title, learned, 2, _HIGH)
-    return paths
+    return title
+
+
+def _learning_title(run: Run, metrics: Metrics) -> str:
+    """Return the error of what was learned at the end, if the truth is known."""
+    error = metrics.final_parameter_error
+    if math.isnan(error):
+        return 'Learning'
+    what = 'relative parameter error' if run.arm is None else 'torque error'
+    return f'Learning: {what} {100 * error:.2g} % at the end'
 
 
 def close_up(run: Run, change: float) -> Iterator[Panel]:
-    """Yield errors, torques and the error of the model around a change."""
+    """Yield errors, torques and the error of the model around a change at a time [s]."""
     begin, end = change - _BEFORE, change + _AFTER
     found = panels([run], begin, end)
-    marks = [Mark(change, 'the arm changes', INK)]
-    marks += [
-        Mark(t, 'learning restarts', BLUE) for t in change_times(run) if begin < t < end
+    marks = _marks_of_change(run, change, end)
+    unnamed = tuple(mark._replace(text='') for mark in marks)
+    errors = _all_joints(run, found, 'Tracking', 'error of ')
+    if errors is not None:
+        yield replace(errors, marks=marks)
+    torques = _all_joints(run, found, 'Torque', 'torque of ')
+    if torques is not None:  # the marks are named once
+        yield replace(torques, marks=marks if errors is None else unnamed)
+    last = marks if errors is None and torques is None else unnamed
+    for panel in _of_groups(found, ('Parameters',)):
+        if panel.log:
+            yield replace(panel, marks=last, note='')
+
+
+def _marks_of_change(run: Run, change: float, end: float) -> tuple[Mark, ...]:
+    """Return when the arm changed, and when learning restarted before `end` [s]."""
+    restarts = [t for t in change_times(run) if change - _BEFORE < t < end]
+    return (
+        Mark(change, 'the arm changes', INK),
+        *(Mark(t, 'learning restarts', BLUE) for t in restarts),
+    )
+
+
+def _all_joints(
+    run: Run, shown: Sequence[Panel], group: str, kind: str
+) -> Panel | None:
+    """Return one panel instead of one for each joint, with the bound of the first.
+
+    The titles of those begin with `kind`.  None if there are none.
+    """
+    of_joints = [panel for panel in shown if panel.title.startswith(kind)]
+    if not of_joints:
+        return None
+    lines = [
+        next(iter(panel.lines))._replace(name=joint)
+        for panel, joint in zip(of_joints, run.joints, strict=False)
     ]
-    for group, kind in (('Tracking', 'error of '), ('Torque', 'torque of ')):
-        of_joints = [panel for panel in found if panel.title.startswith(kind)]
-        lines = [
-            next(iter(panel.lines))._replace(name=joint)
-            for panel, joint in zip(of_joints, run.joints, strict=False)
-        ]
-        lines += [
-            line for panel in of_joints[:1] for line in panel.lines if line.shaded
-        ]
-        if lines:
-            unit = of_joints[0].unit
-            yield Panel(group, f'{kind}each joint', unit, lines, marks=tuple(marks))
-            marks = [mark._replace(text='') for mark in marks]  # named once
-    for panel in found:
-        if panel.group == 'Parameters' and panel.log:
-            yield replace(panel, marks=tuple(marks), note='')
+    lines += [line for line in of_joints[0].lines if line.shaded]
+    return Panel(group, f'{kind}each joint', of_joints[0].unit, lines)
 
 
 def draw_panels(
@@ -251,16 +289,12 @@ def draw_panels(
 
 def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str]) -> None:
     own = [line for line in panel.lines if not line.colour]
-    followed = any(line.colour == INK and line.dashed for line in panel.lines)
+    is_followed = any(line.colour == INK and line.dashed for line in panel.lines)
     for k, line in enumerate(own):
         colour = COLOURS[(line.run if runs else k) % len(COLOURS)]
         if panel.group == 'Torque' and len(own) == 1:
             colour = ORANGE
-        width, alpha = (_WIDE, 0.6) if followed else (_NARROW, 1.0)
-        if runs and followed:
-            # one upon the other
-            width = (_WIDEST, _WIDE)[line.run % 2]
-            alpha = 1.0
+        width, alpha = _stroke(line, is_followed=is_followed, has_runs=bool(runs))
         label = runs[line.run] if runs else line.name
         _draw_line(axes, line, label=label, color=colour, lw=width, alpha=alpha)
     for line in panel.lines:
@@ -269,6 +303,18 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str]) -> None:
     for row, mark in enumerate(panel.marks):
         _draw_mark(axes, mark, row)
     _set_scale(axes, panel)
+
+
+def _stroke(line: Line, *, is_followed: bool, has_runs: bool) -> tuple[float, float]:
+    """Return width [points] and opacity of a line, which is wide below a dashed one.
+
+    Of several runs, every other line is wider, since one lies upon the other.
+    """
+    if not is_followed:
+        return _NARROW, 1.0
+    if has_runs:
+        return (_WIDEST, _WIDE)[line.run % 2], 1.0
+    return _WIDE, 0.6
 
 
 def _set_scale(axes: Axes, panel: Panel) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as people and programs read them: a table for the terminal, and JSON."""
+"""Output of numbers: a table for the terminal, and JSON for programs."""
 
 from __future__ import annotations
 

@@ -113,37 +113,55 @@ def panels(runs: Sequence[Run], begin: float = -inf, end: float = inf) -> list[P
     """
     found: dict[tuple[str, str], Panel] = {}
     for k, run in enumerate(runs):
-        latched = latch_time(run)
-        latch = () if isnan(latched) else (Mark(latched, 'latch'),)
-        changes = true_change_times(run)
-        changed = dict.fromkeys(_CHANGED, 'the arm changes')
-        stops = list(_stops(run))
-        shown = chain(_motion(run), _contact(run), _learning(run), _monitors(run))
-        for panel in shown:
-            marks = latch if panel.group in _LEARNING else panel.marks
-            marks = (*marks, *(stops if panel.group in _STOPPED else ()))
-            if panel.group in _CHANGED:
-                texts = (changed.pop(panel.group, ''), *[''] * len(changes))  # once
-                marks = (
-                    *marks,
-                    *(Mark(*each, INK) for each in zip(changes, texts, strict=False)),
-                )
+        for panel in _panels_of(run):
             marks = tuple(
-                mark._replace(run=k) for mark in marks if begin <= mark.time <= end
+                mark._replace(run=k)
+                for mark in panel.marks
+                if begin <= mark.time <= end
             )
             lines = tuple(
                 _drawn(line, begin, end)._replace(run=k) for line in panel.lines
             )
-            before = found.get((panel.group, panel.title))
-            found[panel.group, panel.title] = replace(
-                panel,
-                lines=(*(before.lines if before else ()), *lines),
-                marks=(*(before.marks if before else ()), *marks),
-                note=panel.note if len(runs) == 1 else '',
-                span=panel.span if len(runs) == 1 else 0.0,
-            )
+            key = panel.group, panel.title
+            own = replace(panel, lines=lines, marks=marks)
+            found[key] = _overlaid(found[key], own) if key in found else own
+    if len(runs) > 1:
+        found = {key: replace(panel, note='', span=0.0) for key, panel in found.items()}
     drawn = [panel for panel in found.values() if panel.lines]
     return sorted(drawn, key=lambda panel: GROUPS.index(panel.group))
+
+
+def _overlaid(before: Panel, panel: Panel) -> Panel:
+    """Return a panel with the lines and marks of another one before its own."""
+    return replace(
+        panel,
+        lines=(*before.lines, *panel.lines),
+        marks=(*before.marks, *panel.marks),
+    )
+
+
+def _panels_of(run: Run) -> Iterator[Panel]:
+    """Yield the panels of a run with all their marks: latch, stops and changes of the arm."""
+    latched = latch_time(run)
+    latch = () if isnan(latched) else (Mark(latched, 'latch'),)
+    stops = tuple(_stops(run))
+    changes = true_change_times(run)
+    unnamed = set(_CHANGED)  # groups in which no mark says yet what the changes are
+    for panel in chain(_motion(run), _contact(run), _learning(run), _monitors(run)):
+        marks = latch if panel.group in _LEARNING else panel.marks
+        if panel.group in _STOPPED:
+            marks = (*marks, *stops)
+        if panel.group in _CHANGED:
+            text = 'the arm changes' if panel.group in unnamed else ''
+            unnamed.discard(panel.group)
+            marks = (*marks, *_marks_at(changes, text))
+        yield replace(panel, marks=marks)
+
+
+def _marks_at(times: Sequence[float], text: str) -> Iterator[Mark]:
+    """Yield marks at times [s], the first one with a text."""
+    for k, time in enumerate(times):
+        yield Mark(time, '' if k else text, INK)
 
 
 def _drawn(line: Line, begin: float, end: float) -> Line:
@@ -195,32 +213,41 @@ def _stops(run: Run) -> Iterator[Mark]:
 
 def _motion(run: Run) -> Iterator[Panel]:
     t = run.time
-    for i, joint in enumerate(run.joints):
-        position = run.column('position', i)
-        reference = run.column('reference', i)
-        lines = [Line('measured', t, np.asarray(position))]
-        if reference is not None:
-            lines.append(Line('reference', t, reference, INK, dashed=True))
-        unit = run.units(joint).position
-        yield Panel('Motion', f'position of {joint}', unit, lines)
+    for i in range(len(run.joints)):
+        yield _position(run, t, i)
         error = run.column('error', i)
         if error is not None:
             yield _error(run, t, i, 1e3 * error)
-        torque = run.column('torque', i)
-        limit = run.column('torque_limit', i)
-        if torque is None or np.isnan(torque).all():
-            continue
-        lines = [Line('torque', t, torque)]
-        if limit is not None and not np.isnan(limit).all():
-            lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
-        note = f'peak {np.nanmax(np.abs(torque)):.3g}'
-        unit = run.units(joint).torque
-        yield Panel('Torque', f'torque of {joint}', unit, lines, note)
-    for i in range(len(run.joints)) if t.size > _PIECES else ():
-        error = run.column('error', i)
-        if error is not None:
-            yield _error_size(run, t, i, 1e3 * error)
+        yield from _torque(run, t, i)
+    if t.size > _PIECES:
+        for i in range(len(run.joints)):
+            error = run.column('error', i)
+            if error is not None:
+                yield _error_size(run, t, i, 1e3 * error)
     yield from _tool(run, t)
+
+
+def _position(run: Run, t: Floats, i: int) -> Panel:
+    joint = run.joints[i]
+    lines = [Line('measured', t, np.asarray(run.column('position', i)))]
+    reference = run.column('reference', i)
+    if reference is not None:
+        lines.append(Line('reference', t, reference, INK, dashed=True))
+    return Panel('Motion', f'position of {joint}', run.units(joint).position, lines)
+
+
+def _torque(run: Run, t: Floats, i: int) -> Iterator[Panel]:
+    """Yield the panel of the torque with its limit, if there is a torque."""
+    joint = run.joints[i]
+    torque = run.column('torque', i)
+    if torque is None or np.isnan(torque).all():
+        return
+    lines = [Line('torque', t, torque)]
+    limit = run.column('torque_limit', i)
+    if limit is not None and not np.isnan(limit).all():
+        lines.append(Line('limit', t, limit, MUTED, dashed=True, mirrored=True))
+    note = f'peak {np.nanmax(np.abs(torque)):.3g}'
+    yield Panel('Torque', f'torque of {joint}', run.units(joint).torque, lines, note)
 
 
 def _tool(run: Run, t: Floats) -> Iterator[Panel]:

@@ -175,29 +175,13 @@ def _shown(value: object) -> str:
 def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
     """Write the page of some bags; raises MissingExtraError without plotly."""
     plotly = import_extra('plotly.offline', 'report', 'the page')
-    events = sorted(
-        (
-            (time, k, kind, text)
-            for k, bag in enumerate(bags)
-            for time, kind, text in bag.events
-        ),
-        key=itemgetter(0, 1),  # those of one time as they are told
-    )
-    measured = [measure(bag.run) for bag in bags]
-    parameters = []  # name, value in each bag, and whether these differ
-    for name in dict.fromkeys(name for bag in bags for name in bag.parameters):
-        values = [bag.parameters.get(name, 'not recorded') for bag in bags]
-        parameters.append((name, values, len(set(values)) > 1))
     write_page(
         path,
         'report.html',
         ' and '.join(bag.name for bag in bags),
         names=[bag.name for bag in bags],
         versions=sorted({bag.content.version or 'unknown' for bag in bags}),
-        summaries=[
-            (verdict_of(each), figures_of(each), rows(each), list(sentences(each)))
-            for each in measured
-        ],
+        summaries=[_summary_of(bag) for bag in bags],
         data={
             'panels': plots(panels([bag.run for bag in bags]), bags),
             'seconds': max(bag.run.duration for bag in bags),
@@ -205,10 +189,45 @@ def write_report(bags: Sequence[ReportedBag], path: Path) -> None:
         pieces=PIECES,
         plotly=plotly.get_plotlyjs(),
         colours=[_colour(k) for k in range(len(bags))],
-        events=events,
+        events=_events_by_time(bags),
         alarming=_ALARMING,
-        parameters=parameters,
+        parameters=_parameter_rows(bags),
     )
+
+
+def _summary_of(bag: ReportedBag) -> tuple[Any, ...]:
+    """Return verdict, figures, rows of the table and sentences about a run."""
+    metrics = measure(bag.run)
+    return (
+        verdict_of(metrics),
+        figures_of(metrics),
+        rows(metrics),
+        [*sentences(metrics)],
+    )
+
+
+def _events_by_time(
+    bags: Sequence[ReportedBag],
+) -> list[tuple[float, int, str, str]]:
+    """Return time [s], number of the bag, kind and text of all events, by time."""
+    events = []
+    for k, bag in enumerate(bags):
+        events += [(time, k, kind, text) for time, kind, text in bag.events]
+    return sorted(events, key=itemgetter(0, 1))  # those of one time stay in order
+
+
+def _parameter_rows(
+    bags: Sequence[ReportedBag],
+) -> list[tuple[str, list[str], bool]]:
+    """Return name, value in each bag, and whether these differ, of each parameter."""
+    names: dict[str, None] = {}  # a set in order
+    for bag in bags:
+        names |= dict.fromkeys(bag.parameters)
+    table = []
+    for name in names:
+        values = [bag.parameters.get(name, 'not recorded') for bag in bags]
+        table.append((name, values, len(set(values)) > 1))
+    return table
 
 
 def plots(shown: Sequence[Panel], bags: Sequence[ReportedBag]) -> list[dict[str, Any]]:

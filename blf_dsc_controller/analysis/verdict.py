@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run says at first sight: one sentence, and the figures that matter most."""
+"""The verdict on a run: one sentence, and the figures that matter most."""
 
 from __future__ import annotations
 

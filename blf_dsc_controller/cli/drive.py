@@ -130,8 +130,8 @@ def _print(outcome: Outcome, loop: DriveLoop, controller: ArmController) -> None
         print(f'load          {mass:.2f} +- {interval:.2f} kg more than at the start')
     if loop.remark:
         print(f'load          no longer declared to the drives: {loop.remark}')
-    if controller.guard.untrusted:
-        print(f'sensors       {controller.guard.untrusted}')
+    if controller.guard.findings.untrusted:
+        print(f'sensors       {controller.guard.findings.untrusted}')
     median, most = loop.latency.quantile(0.5), loop.latency.quantile(0.99)
     print(
         f'latency       from state to torque: median {1e6 * median:.0f} us, 99 % '

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from typing import NamedTuple
 
@@ -164,11 +164,11 @@ def plan(
 ) -> list[Planned]:
     """Return the motions around postures (k, n) [rad] by which an arm is measured.
 
-    With swings that keep its joints sliding, if these stick without (`sliding`).
+    `sliding` adds swings that keep joints sliding which would stick without.
 
-    Raises BlfDscError if the arm is not from a URDF, has feedback through its inertia
-    matrix, with which no arm with elastic joints is safe to be measured, or damping that
-    lags, of which the choice does not know.
+    Raises BlfDscError if the arm is not from a URDF; if its feedback acts through the
+    inertia matrix, which may make an arm with elastic joints unstable; or if its damping
+    lags, which the choice of gains does not model.
     """
     if config.model != 'urdf':
         raise BlfDscError(
@@ -200,57 +200,108 @@ def commissioned(
 ) -> Commissioned:
     """Return what runs of `plan` show, each with the configuration that it had.
 
+    `margin` is the modulus margin that the gains are chosen for.
+
     Raises BlfDscError if a run is not one of its motions, or has a stop.
     """
-    arm, _ = design_of(config)
-    start = measuring_gains(arm)
+    _check_joints(config, runs)
     T = config.sample_time
+    arm, _ = design_of(config)
+    responses = tuple(response_of(run, motion.lines_in(each), T) for run, each in runs)
+    found = findings_of([run for run, _ in runs], responses)
+    assumed = _assumed_inertia(arm, responses)
+    inertia = _largest_inertia(arm, found, assumed)
+    loops = Loops(responses, inertia, T)
+    start = measuring_gains(arm)
+    rigid = RigidArm(_least(found.inertias, assumed), found.timing(T, arm.lag))
+    gains_of = _gains_by_factors(config, start, inertia)
+    return Commissioned(
+        joints=config.joints,
+        responses=responses,
+        loops=loops,
+        start=start,
+        choice=choose(loops, start, gains_of, rigid, margin),
+        findings=found,
+        assumed=assumed.max(axis=0),
+        rotors=_rotors(config, arm, found, assumed),
+        friction=_expected_friction(found, start),
+        unseen=_unseen(found, assumed),
+        lag=_lag(config, found),
+        date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
+        aim=margin,
+        before=config,
+    )
+
+
+def _check_joints(
+    config: ControllerConfig, runs: Sequence[tuple[Run, ControllerConfig]]
+) -> None:
+    """Raise BlfDscError if a run is of other joints."""
     for run, _ in runs:
         if run.joints != config.joints:
             raise BlfDscError(
                 f'the run is of the joints {", ".join(run.joints)}, the configuration of '
                 f'{", ".join(config.joints)}'
             )
-    responses = tuple(response_of(run, motion.lines_in(each), T) for run, each in runs)
-    found = findings_of([run for run, _ in runs], responses)
+
+
+def _assumed_inertia(arm: Design, responses: Sequence[Response]) -> Floats:
+    """Return the inertias (k, n) [kg m^2] of the model in the postures of k runs."""
     postures = np.array([each.posture for each in responses])
-    model = arm.parameters.model
     P = arm.parameters.of(arm.chain.inertias, arm.rotors)
-    here = np.diagonal(inertia_matrices(model, P, postures), axis1=1, axis2=2)
-    elsewhere = arm.over_postures().inertia - here.max(axis=0)
-    known = np.where(np.isnan(found.inertia), here.max(axis=0), found.inertia)
-    inertia = known + np.maximum(elsewhere, 0.0)
-    loops = Loops(responses, inertia, T)
-    rotors = arm.rotors
-    if not config.robot.torque_loop:  # else drives hide their motors
-        beyond = _least(found.inertias - here, 0.0 * here)  # least: a load is no motor
-        rotors = (rotors + beyond).clip(0.0)
-    least = _least(found.inertias, here)
-    rigid = RigidArm(least, found.timing(T, arm.lag))
+    M = inertia_matrices(arm.parameters.model, P, postures)
+    return np.diagonal(M, axis1=1, axis2=2)
 
-    def by_factors(factors: Floats) -> JointGains:
-        if config.feedback.joint_stiffness:
-            return start.scaled(factors)
-        return damped_arm(factors * start.damping, inertia)
 
-    lag = found.lag(T)
-    return Commissioned(
-        joints=config.joints,
-        responses=responses,
-        loops=loops,
-        start=start,
-        choice=choose(loops, start, by_factors, rigid, margin),
-        findings=found,
-        assumed=here.max(axis=0),
-        rotors=rotors,
-        friction=found.friction
-        * np.where(found.damping > start.damping, CREEPING, 1.0),
-        unseen=_unseen(found, here),
-        lag=config.robot.lag if np.isnan(lag) else lag,
-        date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
-        aim=margin,
-        before=config,
-    )
+def _largest_inertia(arm: Design, found: Findings, assumed: Floats) -> Floats:
+    """Return the largest inertia (n,) [kg m^2] of each joint over all postures.
+
+    It was measured, or is `assumed` (k, n) where it was not seen, in the postures of the
+    runs.  In others the model says how much larger it is.
+    """
+    here = assumed.max(axis=0)
+    elsewhere = arm.over_postures().inertia - here
+    known = np.where(np.isnan(found.inertia), here, found.inertia)
+    return np.asarray(known + np.maximum(elsewhere, 0.0))
+
+
+def _rotors(
+    config: ControllerConfig, arm: Design, found: Findings, assumed: Floats
+) -> Floats:
+    """Return the inertias of the rotors (n,) [kg m^2]: what is missing in the `assumed` (k, n).
+
+    Of k runs the least counts, since a load is no rotor.  Drives with torque loops hide
+    their rotors: those of the arm are returned.
+    """
+    if config.robot.torque_loop:
+        return arm.rotors
+    missing = _least(found.inertias - assumed, 0.0 * assumed)
+    return np.asarray((arm.rotors + missing).clip(0.0))
+
+
+def _gains_by_factors(
+    config: ControllerConfig, start: JointGains, inertia: Floats
+) -> Callable[[Floats], JointGains]:
+    """Return the gains as a function of factors (n,) on the damping of the measurement.
+
+    Where the configuration gives a stiffness, it grows with the damping; else it follows
+    from the damping and the inertia (n,) [kg m^2].
+    """
+    if config.feedback.joint_stiffness:
+        return start.scaled
+    return lambda factors: damped_arm(factors * start.damping, inertia)
+
+
+def _expected_friction(found: Findings, start: JointGains) -> Floats:
+    """Return the friction (n,) [N m] to expect, more than measured where joints crept."""
+    is_creeping = found.damping > start.damping
+    return np.asarray(found.friction * np.where(is_creeping, CREEPING, 1.0))
+
+
+def _lag(config: ControllerConfig, found: Findings) -> float:
+    """Return `robot.lag` [s]: measured, or that of the configuration."""
+    lag = found.lag(config.sample_time)
+    return config.robot.lag if np.isnan(lag) else lag
 
 
 def _least(measured: Floats, assumed: Floats) -> Floats:

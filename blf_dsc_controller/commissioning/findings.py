@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm is, by its responses: inertias, damping, lags, resonances and readings.
+"""Properties of an arm by its responses: inertias, damping, lags, resonances and readings.
 
 Below its resonances an arm is rigid.  The inverse of its response, D = G_y^-1, has on its
 diagonal what each joint asks for while the others are held, with a lag on the way,
@@ -105,17 +105,14 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
     by_friction = _SEEN * damping / (2.0 * np.pi * _RIGID[1])
     hidden = np.where(unfit, asked, np.where(inertia < by_friction, by_friction, 0.0))
     inertia[hidden > 0.0] = np.nan
-    friction = np.maximum(
-        damping.clip(0.0) * np.array([each.speed for each in responses]),
-        np.array([each.friction for each in responses]),
-    )
     gaps = np.concatenate([np.diff(run.stamp) for run in runs]) * 1e-9
     usual = float(np.median(gaps))
+    missed = np.maximum(np.rint(gaps / usual) - 1.0, 0.0)
     return Findings(
         inertia=_largest(inertia),
         inertias=inertia,
         damping=damping.mean(axis=0),
-        friction=friction.max(axis=0),
+        friction=_friction(damping, responses).max(axis=0),
         hidden=hidden,
         unfit=unfit,
         drive_lag=_drive_lag(responses),
@@ -123,9 +120,20 @@ def findings_of(runs: Sequence[Run], responses: Sequence[Response]) -> Findings:
         resonances=tuple(each for found in peaks for each in found),
         rate=1.0 / usual,
         jitter=float(gaps.std()),
-        lost=float(np.maximum(np.rint(gaps / usual) - 1.0, 0.0).sum() / gaps.size),
+        lost=float(missed.sum() / gaps.size),
         resolution=_resolution(runs),
     )
+
+
+def _friction(damping: Floats, responses: Sequence[Response]) -> Floats:
+    """Return the friction (k, n) [N m] in each run.
+
+    Constant friction takes as much power as the damping (k, n) [N m s/rad] of the run, or
+    as swings show that keep the joints sliding.
+    """
+    by_damping = damping.clip(0.0) * np.array([each.speed for each in responses])
+    by_swings = np.array([each.friction for each in responses])
+    return np.asarray(np.maximum(by_damping, by_swings))
 
 
 def rubs(response: Response, damping: Floats) -> bool:

@@ -155,8 +155,8 @@ class OverRos(PostureByPosture):
         finally:
             node.end(disturbed)
             node.end(recorder, recorder.close)
-        if guard.start_error is not None:
-            raise BlfDscError(f'{name}: {guard.start_error}')
+        if guard.starting.error is not None:
+            raise BlfDscError(f'{name}: {guard.starting.error}')
         if end is not End.DURATION:
             raise self._ended(name, end, text)
         if node.outputs.problem:
@@ -175,7 +175,7 @@ class OverRos(PostureByPosture):
                 return trouble
             if text := disturbed.text or self._of_others():
                 return End.STOPPED, text
-            passed = (guard.journal.stamp - guard.start_stamp) * _NANO
+            passed = (guard.journal.stamp - guard.reference.start_stamp) * _NANO
             if guard.commanding and passed >= duration:
                 return End.DURATION, ''
 

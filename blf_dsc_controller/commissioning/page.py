@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A commissioning for people: a table, sentences and a picture."""
+"""The result of a commissioning: a table, sentences and a picture."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
+from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST
 from blf_dsc_controller.commissioning.commissioning import (
     CREEPING,
@@ -22,6 +24,7 @@ from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.expected_errors import expectation
 
 Floats = NDArray[np.float64]
@@ -89,6 +92,22 @@ def table(found: Commissioned) -> str:
 
 def sentences(found: Commissioned) -> Iterator[str]:
     """Yield what was found, what limits the gains, and what to do about it."""
+    yield from _of_states(found)
+    yield from _of_hidden(found)
+    yield from _of_friction(found)
+    yield from _of_margin(found)
+    yield from _of_factors(found)
+    if found.has_margin:
+        yield f'errors to expect with these gains: {expectation(found.config)}'
+        yield from _of_bound(found)
+    yield (
+        f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
+        'measure again'
+    )
+
+
+def _of_states(found: Commissioned) -> Iterator[str]:
+    """Yield how often joint states come, in which steps, and how late they and torques are."""
     arm = found.findings
     states = f'joint states at {arm.rate:.4g} Hz, jitter {1e3 * arm.jitter:.3f} ms'
     step = float(arm.resolution.max())
@@ -99,15 +118,16 @@ def sentences(found: Commissioned) -> Iterator[str]:
             f'a torque takes {1e3 * arm.drive_lag:.2g} ms to its motion, sampling included, and '
             f'velocities are {1e3 * arm.velocity_lag:.2g} ms old'
         )
-    choice = found.choice
-    yield from _of_hidden(found)
-    yield from _of_friction(found)
-    limit = choice.margin
-    joint = found.joints[limit.joint]
+
+
+def _of_margin(found: Commissioned) -> Iterator[str]:
+    """Yield what limits the gains: a frequency, inertia or noise."""
+    choice, limit = found.choice, found.choice.margin
     yield (
-        f'the gains are limited near {limit.frequency:.2g} Hz by {joint}: there the modulus '
-        f'margin is {limit.value:.2g}; that of the gains it was measured with is '
-        f'{choice.measured.value:.2g} at {choice.measured.frequency:.2g} Hz'
+        f'the gains are limited near {two_digits(limit.frequency)} Hz by '
+        f'{found.joints[limit.joint]}: there the modulus margin is {limit.value:.2g}; that of the '
+        f'gains it was measured with is {choice.measured.value:.2g} at '
+        f'{two_digits(choice.measured.frequency)} Hz'
     )
     if not found.has_margin:
         yield (
@@ -125,20 +145,17 @@ def sentences(found: Commissioned) -> Iterator[str]:
             f'noise costs {doubt:.2g} of the margin: a larger --torque may show that the arm '
             'bears more'
         )
-    most = float(choice.factors.max())
+
+
+def _of_factors(found: Commissioned) -> Iterator[str]:
+    """Yield how to go to gains that are far above those of the measurement."""
+    most = float(found.choice.factors.max())
     if most > _FAR:
-        joint = found.joints[int(choice.factors.argmax())]
+        joint = found.joints[int(found.choice.factors.argmax())]
         yield (
-            f'{joint} gets {most:.2g} times the gains it was measured with: raise '
+            f'{joint} gets {two_digits(most)} times the gains it was measured with: raise '
             'feedback.stiffness from 0.25 to 1 in steps, or measure again with this file at 0.25'
         )
-    if found.has_margin:
-        yield f'errors to expect with these gains: {expectation(found.config)}'
-        yield from _of_bound(found)
-    yield (
-        f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
-        'measure again'
-    )
 
 
 def _of_hidden(found: Commissioned) -> Iterator[str]:
@@ -173,7 +190,7 @@ def _of_hidden(found: Commissioned) -> Iterator[str]:
 
 
 def _of_friction(found: Commissioned) -> Iterator[str]:
-    """Yield in which joints friction adds damping that motion lacks, or is not in the file."""
+    """Yield where friction adds damping that is gone in steady motion, or is not in the file."""
     names = np.array(found.joints)
     hidden = np.isnan(found.findings.inertia)
     rubbing = ~hidden & (found.findings.damping > found.choice.gains.damping)
@@ -261,48 +278,61 @@ def _doubt_at(found: Commissioned) -> float:
 
 
 def draw(found: Commissioned, names: Sequence[str], path: Path) -> None:
-    """Draw the margins of measured and chosen gains, and the response of each joint."""
-    title = 'Commissioning: what the arm bears'
+    """Draw the margins of measured and chosen gains, and the response of each joint.
+
+    `names` are those of the runs.
+    """
     n = len(found.joints)
-    rows = 1 + -(-n // 2)
+    rows = 1 + -(-n // 2)  # two joints in each, below the margins
+    title = 'Commissioning: margins and responses'
     picture = Picture(rows, 2, title, _SIZE, share_time=False)
-    labels = ('as measured', 'as chosen')
-    for axes, label, gains in zip(
-        picture.axes[0], labels, (found.start, found.choice.gains), strict=True
-    ):
-        values = found.loops.singular_values(gains)
-        for (value, doubt), response, name, colour in zip(
-            values, found.responses, names, _colours(names), strict=True
-        ):
-            least, doubted, f = (
-                each[response.seen] for each in (value, doubt, response.frequency)
-            )
-            axes.semilogx(f, least, color=colour, label=name)
-            axes.fill_between(
-                f, least - doubted, least, color=colour, alpha=0.2, lw=0.0
-            )
-        axes.axhline(found.aim, color=ALARM, lw=1.0, ls='--')
-        axes.axvspan(axes.get_xlim()[0], SLOWEST, color=SHADE, alpha=0.5, lw=0.0)
-        axes.set_ylim(0.0, 1.5)
-        axes.set_title(f'least singular value of I + L, gains {label}', loc='left')
-        axes.set_xlabel('frequency [Hz]')
-    picture.axes[0, 0].legend(frameon=False, fontsize=8, loc='lower right')
+    before, after = picture.axes[0]
+    _draw_margin(before, found, found.start, 'as measured', names)
+    _draw_margin(after, found, found.choice.gains, 'as chosen', names)
+    before.legend(frameon=False, fontsize=8, loc='lower right')
     panels = list(picture.axes[1:].flat)
-    for j, (axes, joint) in enumerate(zip(panels, found.joints, strict=False)):
-        for response, colour in zip(found.responses, _colours(names), strict=True):
-            f = response.frequency
-            own = np.abs(response.position[:, j, j])
-            axes.loglog(f, own * (2.0 * np.pi * f) ** 2, color=colour)
-        axes.set_title(f'{joint}: acceleration by torque', loc='left')
-        axes.set_ylabel('rad/(s^2 N m)')
-        axes.set_xlabel('frequency [Hz]')
+    for j, axes in enumerate(panels[:n]):
+        _draw_response(axes, found, j)
     for axes in panels[n:]:
         axes.set_visible(False)
     picture.save(path)
 
 
-def _colours(names: Sequence[str]) -> list[str]:
-    return [_COLOURS[k % len(_COLOURS)] for k in range(len(names))]
+def _draw_margin(
+    axes: Axes, found: Commissioned, gains: JointGains, label: str, names: Sequence[str]
+) -> None:
+    """Draw the least singular value over the frequency, with what noise takes from it."""
+    values = found.loops.singular_values(gains)
+    for k, ((value, doubt), response) in enumerate(
+        zip(values, found.responses, strict=True)
+    ):
+        seen = response.seen
+        f, least, doubted = response.frequency[seen], value[seen], doubt[seen]
+        axes.semilogx(f, least, color=_colour(k), label=names[k])
+        axes.fill_between(
+            f, least - doubted, least, color=_colour(k), alpha=0.2, lw=0.0
+        )
+    axes.axhline(found.aim, color=ALARM, lw=1.0, ls='--')
+    axes.axvspan(axes.get_xlim()[0], SLOWEST, color=SHADE, alpha=0.5, lw=0.0)
+    axes.set_ylim(0.0, 1.5)
+    axes.set_title(f'least singular value of I + L, gains {label}', loc='left')
+    axes.set_xlabel('frequency [Hz]')
+
+
+def _draw_response(axes: Axes, found: Commissioned, j: int) -> None:
+    """Draw the acceleration of joint j by its own torque, over the frequency."""
+    for k, response in enumerate(found.responses):
+        f = response.frequency
+        own = np.abs(response.position[:, j, j])
+        axes.loglog(f, own * (2.0 * np.pi * f) ** 2, color=_colour(k))
+    axes.set_title(f'{found.joints[j]}: acceleration by torque', loc='left')
+    axes.set_ylabel('rad/(s^2 N m)')
+    axes.set_xlabel('frequency [Hz]')
+
+
+def _colour(k: int) -> str:
+    """Return the colour of the k-th run."""
+    return _COLOURS[k % len(_COLOURS)]
 
 
 def _known(value: float) -> str:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.motion import SETTLING, Lines
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.run import Run
+from blf_dsc_controller.run import Run, Stamps
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -176,8 +176,7 @@ def _period(run: Run, period: float, T: float) -> tuple[Floats, Floats, Floats]:
         raise BlfDscError(
             f'the run has {run.duration:.3g} s, but the motion needs {needed:.3g} s'
         )
-    after = np.searchsorted(run.stamp, times).clip(1, run.stamp.size - 1)
-    nearest = after - (times - run.stamp[after - 1] < run.stamp[after] - times)
+    nearest = _nearest(run.stamp, times)
     lost = int(np.count_nonzero(np.diff(nearest) == 0))
     if lost > _MOST_LOST * count:
         raise BlfDscError(
@@ -189,6 +188,13 @@ def _period(run: Run, period: float, T: float) -> tuple[Floats, Floats, Floats]:
         if not np.isfinite(values).all():
             raise BlfDscError(f'the run has {name} that are not finite')
     return found
+
+
+def _nearest(stamp: Stamps, times: Stamps) -> NDArray[np.intp]:
+    """Return the sample (N,) with the stamp [ns] nearest to each of N times [ns]."""
+    after = np.searchsorted(stamp, times).clip(1, stamp.size - 1)
+    is_before = times - stamp[after - 1] < stamp[after] - times
+    return np.asarray(after - is_before)
 
 
 def _spectrum(values: Floats) -> Complex:

@@ -32,7 +32,7 @@ class Proof(NamedTuple):
 
 
 def measured(planned: Planned, plant: PlantConfig, payload: float = 0.0) -> Measured:
-    """Return a run of a motion, of an arm that holds a payload [kg] its law knows nothing of.
+    """Return a run of a motion, of an arm with a payload [kg] that its law does not know.
 
     Raises BlfDscError if the arm stopped.
     """

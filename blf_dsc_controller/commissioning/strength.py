@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How strongly an arm is shaken: as little as shows its margin through the noise.
+"""The torque of the motion: the least that shows the modulus margin through the noise.
 
 Noise is counted against the modulus margin, and falls as the torque of the motion grows.  A
 first, weak motion shows how much it takes; where that is much, the posture is measured again

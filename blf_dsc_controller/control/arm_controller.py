@@ -131,8 +131,8 @@ class ArmController:
         self._states = JointStateEncoder(config.joints)
         self._motors = JointStateEncoder(config.joints, ('position', 'velocity'))
         self._shift: int | None = None  # ns, of the stamps
-        self._told_turns: set[str] = set()
-        self._loop.guard.activate()
+        self._logged_turns: set[str] = set()
+        self._loop.guard.starting.activate()
         if text := not_commissioned(config):
             logging.getLogger(__name__).info(text)
 
@@ -195,11 +195,11 @@ class ArmController:
         finally:
             self._loop.guard.perceive()
             if self._outputs:
-                self._tell(nanoseconds, values, torque)
+                self._write_state(nanoseconds, values, torque)
                 if of_motors is not None:
                     raw = self._motors.encode(nanoseconds, *of_motors)
                     self._outputs.write(nanoseconds, topics.MOTOR_STATES, raw)
-            self._tell_turns('the reference', self._loop.guard.turned)
+            self._log_turns('the reference', self._loop.guard.reference.turned)
         return answer
 
     def prepare(self, q: ArrayLike) -> None:
@@ -213,7 +213,7 @@ class ArmController:
             StartError: the law cannot take over there.
             MotionError: no approach from there keeps the limits.
         """
-        self._loop.guard.prepare(self._checked('q', q))
+        self._loop.guard.starting.prepare(self._checked('q', q))
 
     def _nanoseconds(self, stamp: float) -> int:
         """Return the stamp [ns].
@@ -267,14 +267,14 @@ class ArmController:
                 )
         trajectory = Trajectory(names, tuple(points), begin)
         guard = self._loop.guard
-        plan = guard.plan(trajectory)
-        guard.adopt(plan)
-        self._tell_turns('a motion', plan.motion.turned)
+        plan = guard.motions.plan(trajectory)
+        guard.motions.adopt(plan)
+        self._log_turns('a motion', plan.motion.turned)
 
-    def _tell_turns(self, what: str, turned: str) -> None:
+    def _log_turns(self, what: str, turned: str) -> None:
         """Log once that the reference or a motion is shifted by whole turns."""
-        if turned and what not in self._told_turns:
-            self._told_turns.add(what)
+        if turned and what not in self._logged_turns:
+            self._logged_turns.add(what)
             logging.getLogger(__name__).warning('%s %s', what, turned)
 
     def load_to_tell(self) -> DriveLoad | None:
@@ -303,7 +303,7 @@ class ArmController:
             TareError: the arm moves or has just come to rest, something touches it, the law
                 is not in command, or `contact.enabled` is false.
         """
-        self._loop.guard.tare()
+        self._loop.guard.findings.tare()
 
     @property
     def is_tared(self) -> bool:
@@ -321,11 +321,11 @@ class ArmController:
 
     def start(self) -> None:
         """Take command with the next state, with what was learned."""
-        self._loop.guard.activate()
+        self._loop.guard.starting.activate()
 
     def reset(self) -> None:
         """Forget what was learned, and any fault; take command with the next state."""
-        self._loop.guard.reset()
+        self._loop.guard.starting.reset()
 
     def fail(self, text: str) -> Vector | None:
         """Stop for a reason `text` of your own.
@@ -334,7 +334,7 @@ class ArmController:
         has been commanded yet, so command nothing.
         """
         torque = self._loop.guard.fail(text)
-        self._tell_end(torque)
+        self._write_end(torque)
         return None if torque is None else np.array(torque)
 
     def withdraw(self, text: str) -> None:
@@ -369,7 +369,7 @@ class ArmController:
     def reason(self) -> str:
         """Why the controller stopped or does not start; empty while all is well."""
         guard = self._loop.guard
-        return guard.supervisor.text or guard.waiting_for
+        return guard.supervisor.text or guard.starting.waiting_for
 
     @property
     def reference(self) -> Reference:
@@ -427,7 +427,7 @@ class ArmController:
         End the recording; `output_problem` says whether it is whole.
         """
         torque = self._loop.guard.release()
-        self._tell_end(torque)
+        self._write_end(torque)
         if self._recorder is not None:
             self._outputs.end(self._recorder, self._recorder.close)
             self._recorder = None
@@ -455,7 +455,7 @@ class ArmController:
         """Names of the learned parameters."""
         return tuple(self._loop.estimates)
 
-    def _tell(self, stamp: int, values: Vector, torque: Vector | None) -> None:
+    def _write_state(self, stamp: int, values: Vector, torque: Vector | None) -> None:
         """Give the messages about a state to the outputs."""
         state = self._states.encode(stamp, *values.reshape(3, -1))
         self._outputs.write(stamp, topics.JOINT_STATES, state)
@@ -463,17 +463,17 @@ class ArmController:
             self._outputs.write(stamp, *self._loop.telemetry.command(torque))
         for message in self._loop.messages(torque):
             self._outputs.write(stamp, *message)
-        self._tell_events(stamp)
+        self._write_events(stamp)
 
-    def _tell_end(self, torque: Vector | None) -> None:
+    def _write_end(self, torque: Vector | None) -> None:
         """Give a torque that no state asked for to the outputs, and the events."""
         if not self._outputs:
             return
         stamp = max(self._loop.guard.journal.stamp, 0)
         if torque is not None:
             self._outputs.write(stamp, *self._loop.telemetry.command(torque))
-        self._tell_events(stamp)
+        self._write_events(stamp)
 
-    def _tell_events(self, stamp: int) -> None:
+    def _write_events(self, stamp: int) -> None:
         for message in self._loop.guard.journal.take():
             self._outputs.write(stamp, *message)

@@ -41,7 +41,7 @@ class Goal(NamedTuple):
 
 
 class Cancel(NamedTuple):
-    """A client wants the end of a goal."""
+    """A client cancels a goal."""
 
     number: int
 

@@ -75,7 +75,7 @@ class Goals:
         self._next_feedback = 0.0
 
     def take(self, guard: Guard | None, message: Goal | Cancel) -> None:
-        """Begin or end a goal, as a client wants."""
+        """Begin or cancel the goal of a client."""
         if isinstance(message, Cancel):
             self._cancel(guard, message.number)
         elif guard is None:
@@ -110,7 +110,7 @@ class Goals:
             self._end(Outcome.ABORTED, *_why_out_of_command(guard))
         elif guard.controller.reference_vector is not followed.vector:
             by = self._inputs.source or 'a reset'
-            if guard.contacts.hold:
+            if guard.findings.contacts.hold:
                 by = 'a contact'
             self._end(Outcome.ABORTED, INVALID, f'pre-empted by {by}')
         elif guard.has_sample:
@@ -146,7 +146,7 @@ class Goals:
             plan.motion.note,
             guard.controller.reference_vector,
         )
-        self._next_feedback = guard.time
+        self._next_feedback = guard.reference.time
 
     def _tolerances(self, goal: Goal) -> tuple[Tolerances, Tolerances]:
         """Return those of the path and at the end; the defaults if any is wrong."""
@@ -159,18 +159,13 @@ class Goals:
             return tolerances(self._joints, ()), tolerances(self._joints, ())
 
     def _watch_sample(self, guard: Guard, followed: _Followed) -> None:
+        """End the goal if the arm has arrived, or has left its path or tolerances."""
         signals = guard.controller.signals
-        t = guard.time
-        error = np.stack((signals.xi1, signals.dq - signals.dqr))
+        t = guard.reference.time
         if t >= self._next_feedback:
             self._next_feedback = t + _FEEDBACK_PERIOD
-            desired = [
-                each.tolist() for each in (signals.qr, signals.dqr, signals.ddqr)
-            ]
-            actual = [signals.q.tolist(), signals.dq.tolist()]
-            number = followed.goal.number
-            since = t - followed.begin
-            self._send(Feedback(number, guard.last_stamp, since, desired, actual))
+            self._send_feedback(guard, followed)
+        error = np.stack((signals.xi1, signals.dq - signals.dqr))
         tolerated = followed.arrival if t >= followed.end else followed.path
         violation = ''
         if t >= followed.begin:
@@ -186,6 +181,16 @@ class Goals:
             text = f'not there {followed.goal.time:.3g} s after the end: {violation}'
             self._abort(guard, GOAL_VIOLATED, f'{text} ({late:.3g} s late)')
 
+    def _send_feedback(self, guard: Guard, followed: _Followed) -> None:
+        """Send the client where the arm is, and where it should be."""
+        signals = guard.controller.signals
+        desired = [each.tolist() for each in (signals.qr, signals.dqr, signals.ddqr)]
+        actual = [signals.q.tolist(), signals.dq.tolist()]
+        reference = guard.reference
+        since = reference.time - followed.begin
+        number = followed.goal.number
+        self._send(Feedback(number, reference.last_stamp, since, desired, actual))
+
     def _cancel(self, guard: Guard | None, number: int) -> None:
         followed = self._followed
         if followed is None or followed.goal.number != number:
@@ -196,7 +201,7 @@ class Goals:
             and guard.supervisor.running
             and guard.controller.reference_vector is followed.vector
         ):
-            left = self._inputs.stop(guard, 'a cancel') - guard.time
+            left = self._inputs.stop(guard, 'a cancel') - guard.reference.time
             text = f'cancelled: braking for {left:.3g} s'
         self._end(Outcome.CANCELLED, SUCCESSFUL, text)
 

@@ -47,7 +47,7 @@ class GuardedLoop:
         """Yield the messages about the last state, answered by `torque` (n,) [N m].
 
         They are the telemetry of the law's sample, or the answer of a safe torque.  The
-        tracking errors are left out if nobody wants them; the command is not among
+        tracking errors are left out unless they are wanted; the command is not among
         them.
         """
         guard = self.guard
@@ -56,7 +56,7 @@ class GuardedLoop:
             if controller.samples == 1:
                 self.telemetry.restart()
             yield from self.telemetry.sample(
-                guard.last_stamp,
+                guard.reference.last_stamp,
                 controller.sample,
                 controller.settings.torque.limit,
                 guard.samples.ratio,

@@ -57,12 +57,12 @@ Report = Callable[[Plan | None, str], None]
 
 
 class _Request(NamedTuple):
-    """A motion that is wanted."""
+    """A motion that somebody asked for."""
 
     make: Callable[[], Command]  # may take a while: called where it is planned
     report: Report
     lead: float  # s
-    source: str  # who wants it
+    source: str  # who asked for it
     check: Callable[[Plan], None] | None = None  # raises TrajectoryError: not like this
 
 
@@ -113,7 +113,7 @@ class MotionInput:
         self._points = TargetStream()
         self._target_lead = _TARGET_LEAD
         self._is_stopped = False
-        self._has_told_turns = False
+        self._has_logged_turns = False
         self._last_message = -np.inf  # s since the start
         sys.setswitchinterval(_SWITCH_INTERVAL)
 
@@ -147,7 +147,7 @@ class MotionInput:
         self._drop('the reference was stopped')
         for stream in (self._positions, self._points):
             stream.restart()
-        end = guard.brake()
+        end = guard.motions.brake()
         self.source = source
         return end
 
@@ -161,16 +161,16 @@ class MotionInput:
     ) -> None:
         """Follow a trajectory that came by another way, serialised or still to be made."""
 
-        def tell(plan: Plan | None, reason: str) -> None:
+        def report_to_both(plan: Plan | None, reason: str) -> None:
             self._report(plan, reason)
             report(plan, reason)
 
-        start = guard.start_stamp
+        start = guard.reference.start_stamp
 
         def make() -> Trajectory:
             return _trajectory(given, start) if isinstance(given, bytes) else given()
 
-        self._request(guard, _Request(make, tell, _LEAD, source, check))
+        self._request(guard, _Request(make, report_to_both, _LEAD, source, check))
 
     # Requests.
 
@@ -186,7 +186,7 @@ class MotionInput:
             size = f'it has {len(raw)} bytes, more than {MOST_POINTS} points can have'
             self._reject(f'trajectory rejected: {size}: send it in pieces')
             return
-        start = guard.start_stamp
+        start = guard.reference.start_stamp
         if len(raw) > _SMALL:
             self._request(
                 guard,
@@ -214,7 +214,7 @@ class MotionInput:
         """Return a single point within the time-out as a target, otherwise None."""
         config = guard.config
         timeout = config.reference.stream_timeout
-        now = guard.time
+        now = guard.reference.time
         point = trajectory.points[0]
         begin = now if trajectory.begin is None else trajectory.begin
         ahead = begin + point.time - now
@@ -253,7 +253,7 @@ class MotionInput:
     def stream(self, guard: Guard, positions: np.ndarray, source: str) -> None:
         """Follow the next positions (n,) [rad] of a stream."""
         target = self._positions.target(
-            guard.time,
+            guard.reference.time,
             self._short_way(guard, self._positions, positions),
             timeout=guard.config.reference.stream_timeout,
             fastest=np.array(guard.config.limits.velocity),
@@ -267,17 +267,17 @@ class MotionInput:
     ) -> np.ndarray:
         """Return positions (n,) [rad] nearest to the last ones of a stream, or the reference."""
         config = guard.config
-        near = stream.last(guard.time, config.reference.stream_timeout)
+        near = stream.last(guard.reference.time, config.reference.stream_timeout)
         if near is None:
-            near = guard.controller.reference_at(guard.time)[0]
+            near = guard.controller.reference_at(guard.reference.time)[0]
         (shifted,), turned = short_way(positions[np.newaxis], near, config)
-        self._tell_turns(turned)
+        self._log_turns(turned)
         return np.asarray(shifted)
 
-    def _tell_turns(self, turned: str) -> None:
+    def _log_turns(self, turned: str) -> None:
         """Say once that motions are shifted by whole turns."""
-        if turned and not self._has_told_turns:
-            self._has_told_turns = True
+        if turned and not self._has_logged_turns:
+            self._has_logged_turns = True
             self._log.info(f'a motion {turned}; others are shifted likewise')
 
     def _read_positions(self, raw: bytes) -> np.ndarray:
@@ -300,8 +300,8 @@ class MotionInput:
         self._is_stopped = True
         if guard is None or not guard.supervisor.running:
             return 'the controller is not in command: nothing to stop'
-        self._last_message = guard.time
-        left = self.stop(guard, '~/stop') - guard.time
+        self._last_message = guard.reference.time
+        left = self.stop(guard, '~/stop') - guard.reference.time
         ignored = f'topics are ignored until they pause for {_PAUSE:g} s'
         text = f'braking for {left:.3g} s; {ignored}'
         self._log.info(text)
@@ -309,8 +309,8 @@ class MotionInput:
 
     def _ignore_after_stop(self, guard: Guard) -> bool:
         """Ignore a message of a sender that has not paused since `~/stop`; return whether it is."""
-        pause = guard.time - self._last_message
-        self._last_message = guard.time
+        pause = guard.reference.time - self._last_message
+        self._last_message = guard.reference.time
         if self._is_stopped and 0.0 <= pause < _PAUSE:
             self._log.warning(
                 f'ignored after ~/stop, until messages pause for {_PAUSE:g} s',
@@ -335,7 +335,7 @@ class MotionInput:
         """Plan a motion and follow it, now or as soon as the one before is planned."""
         if not self._is_live(guard):
             try:
-                self._adopt(guard, guard.plan(request.make()), request)
+                self._adopt(guard, guard.motions.plan(request.make()), request)
             except Exception as error:  # noqa: BLE001 - the current reference continues
                 request.report(None, _reason(error))
         elif self.job is None:
@@ -345,10 +345,10 @@ class MotionInput:
             self._next = request
 
     def _submit(self, guard: Guard, request: _Request) -> None:
-        at = guard.time + request.lead
+        at = guard.reference.time + request.lead
 
         def plan() -> Plan:
-            return guard.plan(request.make(), at)
+            return guard.motions.plan(request.make(), at)
 
         self.job = _Job(request, self._thread.submit(plan))
 
@@ -373,7 +373,7 @@ class MotionInput:
     def _adopt(self, guard: Guard, plan: Plan, request: _Request) -> None:
         if request.check is not None:
             request.check(plan)
-        guard.adopt(plan)
+        guard.motions.adopt(plan)
         self.source = request.source
         request.report(plan, '')
 
@@ -402,7 +402,7 @@ class MotionInput:
             points = len(plan.command.points)
             note = f' {plan.motion.note}' if plan.motion.note else ''
             self._log.info(f'following a trajectory of {points} points{note}')
-            self._tell_turns(plan.motion.turned)
+            self._log_turns(plan.motion.turned)
 
     def _report_target(self, plan: Plan | None, reason: str) -> None:
         """Count a target; in a stream the latest wins, which is no rejection."""

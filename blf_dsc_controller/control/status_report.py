@@ -86,11 +86,22 @@ class StatusReport:
         return 'state', level, message, values
 
     def _loop(self, guard: Guard, others: int, missing: str) -> Part:
-        states = guard.states
-        samples = guard.samples
-        state = guard.controller.state
+        values = self._loop_values(guard)
+        if others:
+            return 'loop', ERROR, 'another node commands torques, too', values
+        if message := missing or _unusual(guard):
+            return 'loop', WARN, message, values
+        if chatter := chatter_of(guard.controller, guard.config.joints):
+            self._warn_once(chatter)
+            return 'loop', WARN, chatter, values
+        return 'loop', OK, _PHASES[guard.supervisor.phase][1], values
+
+    def _loop_values(self, guard: Guard) -> dict[str, Any]:
+        """Return counts of states and samples, cuts of the torque, and oscillations."""
+        states, samples, calming = guard.states, guard.samples, guard.calming
+        cuts = guard.controller.state.saturation
         off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
-        values = {
+        return {
             'samples': guard.controller.samples,
             'repeated states ignored': states.repeated,
             'samples outside the bound': samples.outside,
@@ -100,45 +111,18 @@ class StatusReport:
             'samples with a torque at its limit': samples.saturated,
             'messages for other joints': guard.foreign,
             'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
-            'samples cut by the torque limit': _by_joint(
-                guard, state.saturation.level_cuts
-            ),
-            'samples cut by the torque rate limit': _by_joint(
-                guard, state.saturation.rate_cuts
-            ),
-            'share of the rates of the feedback': f'{guard.calming.share:g}',
-            'last oscillation': guard.calming.last.text
-            if guard.calming.last
-            else 'none',
-            'torque sensors': guard.untrusted or 'none or as configured',
+            'samples cut by the torque limit': _by_joint(guard, cuts.level_cuts),
+            'samples cut by the torque rate limit': _by_joint(guard, cuts.rate_cuts),
+            'share of the rates of the feedback': f'{calming.share:g}',
+            'last oscillation': calming.last.text if calming.last else 'none',
+            'torque sensors': guard.findings.untrusted or 'none or as configured',
             **(self.trajectories.values if self.trajectories else {}),
         }
-        level = WARN
-        message = 'torque{} at its limit: adaptation by the tracking error is frozen'
-        if others:
-            level = ERROR
-            message = 'another node commands torques, too'
-        elif missing:
-            message = missing
-        elif samples.outside:
-            message = 'the error has left its bound'
-        elif guard.calming.is_due(guard.time):
-            message = guard.calming.text
-        elif guard.untrusted:
-            message = guard.untrusted
-        elif samples.saturated_time > 0.0:
-            message = message.format('')
-        elif guard.has_sample and guard.controller.sample.cuts.any():
-            message = message.format(' rate')
-        elif chatter := chatter_of(guard.controller, guard.config.joints):
-            message = chatter
-            if not self._has_warned:
-                self._has_warned = True
-                self._log.warning(chatter)
-        else:
-            level = OK
-            message = _PHASES[guard.supervisor.phase][1]
-        return 'loop', level, message, values
+
+    def _warn_once(self, chatter: str) -> None:
+        if not self._has_warned:
+            self._has_warned = True
+            self._log.warning(chatter)
 
     def _learning(self, guard: Guard) -> Part:
         state = guard.controller.state
@@ -161,6 +145,25 @@ class StatusReport:
         return 'learning', OK, learning, values
 
 
+def _unusual(guard: Guard) -> str:
+    """Return what is unusual about the last sample, the most important first; or empty."""
+    samples = guard.samples
+    if samples.outside:
+        return 'the error has left its bound'
+    if guard.calming.is_due(guard.reference.time):
+        return guard.calming.text
+    if guard.findings.untrusted:
+        return guard.findings.untrusted
+    limited = ''
+    if samples.saturated_time > 0.0:
+        limited = 'torque'
+    elif guard.has_sample and guard.controller.sample.cuts.any():
+        limited = 'torque rate'
+    if not limited:
+        return ''
+    return f'{limited} at its limit: adaptation by the tracking error is frozen'
+
+
 def _at_tool(guard: Guard) -> Mapping[str, str]:
     errors = guard.samples.tool_errors
     if errors is None:
@@ -180,16 +183,16 @@ def _load(guard: Guard) -> Part:
 
 def _contact(guard: Guard) -> Part:
     """Return whether something touches the arm, and what did last."""
-    last = guard.contacts.last
+    last = guard.findings.contacts.last
     values: dict[str, Any] = {
-        'contacts': guard.contacts.count,
+        'contacts': guard.findings.contacts.count,
         'distance': f'{guard.controller.sample.contact[DISTANCE]:.3g}',
         'threshold': f'{guard.config.contact.threshold:g}',
         'tared': str(guard.controller.is_tared).lower(),
     }
     if last is not None:
         values |= {
-            'last contact': f'at {(last.stamp - guard.start_stamp) * 1e-9:.3f} s',
+            'last contact': f'at {(last.stamp - guard.reference.start_stamp) * 1e-9:.3f} s',
             'joint': last.joint,
             'external torque': f'{last.torque:+.3g} N m',
             'model error and noise': f'{last.interval:.3g} N m',

@@ -40,8 +40,8 @@ class Beside(ABC):
 
     def _tell_untrusted(self) -> None:
         """Warn once of efforts that the law takes for those of no torque sensors."""
-        if self._guard.untrusted != self._untrusted:
-            self._untrusted = self._guard.untrusted
+        if self._guard.findings.untrusted != self._untrusted:
+            self._untrusted = self._guard.findings.untrusted
             if self._untrusted:
                 self.log.warning(self._untrusted)
 

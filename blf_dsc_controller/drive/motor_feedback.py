@@ -66,7 +66,7 @@ class MotorFeedback:
         signals = guard.controller.signals
         if not guard.has_sample:
             return self._stopping(torque)
-        later = guard.controller.reference_at(guard.time + self._ahead)
+        later = guard.controller.reference_at(guard.reference.time + self._ahead)
         return split(
             torque,
             Motion(signals.q, signals.dq),
@@ -82,7 +82,7 @@ class MotorFeedback:
         damping = np.array(safety.damping)
         if safety.torque == 'zero':
             damping[:] = 0.0
-        measured = Motion(guard.last_state.q, guard.last_state.slow)
+        measured = Motion(guard.safe_torque.last.q, guard.safe_torque.last.slow)
         here = Motion(measured.q, self._nothing.dq)
         gains = Gains(self._nothing.q, damping)
         return split(torque, measured, here, here, gains, self.ranges)

@@ -83,7 +83,7 @@ class Script(Beside):
         super().follow()
         if (self._is_alone or self._asked) and not self._closes:
             self._close()
-        if self._guard.time >= self._rests_at:
+        if self._guard.reference.time >= self._rests_at:
             self._rests_at = math.nan
             self._end_loop()
 
@@ -139,7 +139,7 @@ class Script(Beside):
     def _move(self, wanted: dict[str, Any]) -> Trajectory:
         """Return the way from the present reference to rest at some positions."""
         guard, config = self._guard, self._guard.config
-        here = guard.controller.reference_at(guard.time)[0]
+        here = guard.controller.reference_at(guard.reference.time)[0]
         (there,), _ = short_way(np.array([wanted['positions']]), here, config)
         limits = config.limits.velocity, config.limits.acceleration
         speed, acceleration = wanted['speed'] * np.array(limits)
@@ -157,7 +157,7 @@ class Script(Beside):
 
     def _tare(self, number: int) -> None:
         try:
-            self._guard.tare()
+            self._guard.findings.tare()
         except TareError as error:
             self._tell_done(number, str(error))
         else:
@@ -166,7 +166,7 @@ class Script(Beside):
     def _declare(self, wanted: dict[str, Any]) -> None:
         load = DriveLoad(wanted['mass'], tuple(wanted['centre']))
         try:
-            self._guard.declare(load)
+            self._guard.loads.declare(self._guard.config, load)
         except BlfDscError as error:
             self._tell_done(wanted['number'], str(error))
         else:
@@ -175,7 +175,7 @@ class Script(Beside):
     def _follow_load(self) -> None:
         """Say when the drives have a load, or why they have not."""
         problem = self._loop.remark if self._loop is not None else ''
-        if self._loading is not None and (problem or self._guard.is_load_told):
+        if self._loading is not None and (problem or self._guard.loads.is_declared):
             self._tell_done(self._loading, problem)
             self._loading = None
 
@@ -183,7 +183,7 @@ class Script(Beside):
         guard = self._guard
         self._follow_load()
         self._goals.watch(guard)
-        while self._braking and guard.time >= self._braking[0][0]:
+        while self._braking and guard.reference.time >= self._braking[0][0]:
             self._tell_done(self._braking.pop(0)[1])
         if not guard.has_sample:
             return
@@ -191,12 +191,12 @@ class Script(Beside):
             self._tells_running = False
             self.tell(script_link.RUNNING, list(self._controller.joints))
         # An old state is worth nothing: send none before the last one is taken.
-        if guard.time - self._told >= _PERIOD and self._link.flush():
+        if guard.reference.time - self._told >= _PERIOD and self._link.flush():
             self._tell_sample()
 
     def _tell_sample(self) -> None:
         if self._guard.has_sample:
-            self._told = self._guard.time
+            self._told = self._guard.reference.time
             self._link.put(script_link.SAMPLE, encode_sample(self._state()))
 
     def _state(self) -> ArmState:
@@ -205,7 +205,7 @@ class Script(Beside):
         load = self._controller.load
         senses = guard.config.contact.enabled
         return ArmState(
-            guard.time,
+            guard.reference.time,
             str(guard.supervisor.phase),
             signals.q,
             signals.dq,

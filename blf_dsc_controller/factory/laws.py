@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The law of a configuration, and what its settings have otherwise than those of `blf_dsc`.
+"""The law of a configuration, and how its settings differ from those of `blf_dsc`.
 
 blf_dsc       (28): filtered surface, barrier, composite learning, d^3     `law.blf_dsc`
 paper         the same without what `blf_dsc` does otherwise, or some of it
@@ -91,7 +91,7 @@ def _of_model_based(_config: ControllerConfig, settings: Settings) -> Settings:
 
 
 def _of_linear_surface(config: ControllerConfig, settings: Settings) -> Settings:
-    """Return what the laws with a linear surface share; they learn if they are told to."""
+    """Return the settings that laws with a linear surface share; they learn if configured so."""
     gains: law_gains.LinearSurface = getattr(config, law_file.GROUP)
     nothing = np.zeros(settings.n)
     return settings._replace(

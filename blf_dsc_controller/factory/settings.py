@@ -147,7 +147,7 @@ def _barrier(config: ControllerConfig) -> barrier.Settings:
 
 
 def _surface(config: ControllerConfig, lag: float) -> surface.Settings:
-    """Return the surface; the filter of an arm from a URDF is told the known rate."""
+    """Return the surface; the filter of an arm from a URDF uses the known rate f."""
     is_urdf = config.model == 'urdf'
     return filled(surface.Settings, config.surface, known_rate=int(is_urdf), lag=lag)
 

@@ -36,7 +36,7 @@ _MOST_STEPS = 20
 
 
 class Settings(NamedTuple):
-    """The parameters `learning.*` of the update, and what is known of theta."""
+    """The parameters `learning.*` of the update, and the prior and range of theta."""
 
     update: int  # NEWTON or GRADIENT
     weight: float  # kappa, of the prediction error

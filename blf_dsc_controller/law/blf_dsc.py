@@ -114,7 +114,7 @@ def compute_surface(
 
 
 def shift_surface(state: State, change: Array) -> None:
-    """Add to alpha2 (n,) [rad/s] as if it had always been more: damping lags by none of it."""
+    """Shift alpha2 by `change` (n,) [rad/s], and the lagged xi2 with it: no transient follows."""
     late = state.feedback.late
     state.alpha2[:] += change
     late -= change[: late.size]

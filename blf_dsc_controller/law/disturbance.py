@@ -41,7 +41,7 @@ def fill_step(
 
 
 @inner
-def hand_over(estimate: Array, H: Array, theta: Array, before: Array) -> None:
+def transfer_learned(estimate: Array, H: Array, theta: Array, before: Array) -> None:
     """Subtract H (theta - `before`) from d^3, the `estimate` (n,) [N m]; H is (n, m)."""
     for j in range(theta.size):
         for i in range(estimate.size):

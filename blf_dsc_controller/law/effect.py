@@ -136,11 +136,11 @@ def effort_follows(state: State, effort: Array) -> bool:
 def compare_effort(
     limits: torque.Settings, state: State, sample: Sample, moves: bool
 ) -> bool:
-    """Average what the efforts lack of the commands; return whether it lasts.
+    """Average commands less efforts; return whether the difference has lasted too long.
 
-    The drives' own model of what they add may differ from the law's: then what the
-    efforts lack must not change while no joint moves.  In motion its usual value
-    explains an error past the bound.
+    The drives' own model of what they add may differ from the law's: then the
+    difference must not change while no joint moves.  In motion, its excess over
+    the usual value explains an error past the bound.
     """
     if state.compares[0] == 0.0:
         return False

@@ -7,7 +7,7 @@ a pole L:
     r = X_L theta^ - u_L,        tau_ext passed through the pole
 
 which is a momentum observer, with what has been learned in place of the URDF.  It is
-linear in theta, so what the last full window knows of theta, and how well, gives the
+linear in theta, so the covariance of theta by the last full window gives the
 covariance of r,
 
     S = a X_L (Phi_e + rho R)^-1 X_L^T + diag(s^2)
@@ -17,7 +17,7 @@ mean square s^2 of r that theta leaves, measured while nothing touches: noise of
 sensors, ripple, friction that its columns do not describe.  A joint that moves slowly, or is
 about to reverse, has an s^2 of its own, and so has one that rests.  Both are means over several
 windows, since what friction leaves is nearly constant in each slow motion and each rest, and at
-least a share of the Coulomb friction, which is never known better there.
+least a share of the Coulomb friction, which is not estimated better there.
 
 *A tare* keeps the row [X_0 | u_0] of an arm at rest, with S_0 and s_0 of then.  As r_0 = X_0
 theta^ - u_0 has the same error of theta as r, it says what r will be:

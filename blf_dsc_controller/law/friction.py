@@ -181,7 +181,7 @@ def fill_compensation(
 
 
 @inner
-def hand_over(
+def transfer_learned(
     settings: Settings, state: State, work: Work, estimate: Array, disturbance: Array
 ) -> None:
     """Subtract from d^3 (n,) what this sample has changed in the compensation of Coulomb friction.

@@ -5,7 +5,7 @@
 
 columns, ripple   the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
-load_observer     the torque that joint torque sensors show and the model lacks
+load_observer     the torque that joint torque sensors show beyond the model's
 torque_sensors    whether they are such sensors, and alive
 absorbed_friction what P^ has taken of the friction of the motors, by these sensors
 window            sums of the rows over tau_d
@@ -207,7 +207,7 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
 def check_sensors(
     settings: Settings, state: State, signals: Signals, begins: bool, dt: float
 ) -> None:
-    """Leave r out where what is read is not the torque of sensors at the links."""
+    """Fade r out where efforts are not those of torque sensors at the links."""
     of, now, work = state.observer, state.sensors, signals.sensors
     limit = settings.torque.limit
     for i in range(settings.n):
@@ -232,8 +232,8 @@ def measure_reversals(settings: Settings, state: State, period: float) -> None:
     """Let `friction` measure reversals, with a row each `period` [s].
 
     It begins T_a after the latch, when the other columns are those of the window, and
-    once a full window is known to be of one arm or this one is half full: those of less
-    are too vague.
+    once a full window is known to be of one arm or this one is half full: with fewer
+    rows they are too uncertain.
     """
     if settings.friction.learns == 0:
         return
@@ -262,8 +262,7 @@ def detect_change(
 ) -> None:
     """Forget the window if the arm has changed: its rows contradict each other, or the solution.
 
-    What a window has taught before it was full is taken back: back to the estimate
-    before.
+    If the window was latched before it was full, the estimate returns to the one before.
     """
     of, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.window)
@@ -300,17 +299,17 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
         taught[j] = state.estimate[j]
         state.estimate[j] = state.latch.anchor[j]
     if settings.disturbance.bumpless == 1:
-        hand_over(settings, state, signals, taught)
+        transfer_learned(settings, state, signals, taught)
 
 
 @inner
-def hand_over(
+def transfer_learned(
     settings: Settings, state: State, signals: Signals, before: Array
 ) -> None:
-    """Let d^3 give up what theta^ has learned since `before` (m,), as far as r does not."""
-    disturbance.hand_over(state.disturbance, signals.H, state.estimate, before)
+    """Subtract from d^3 what theta^ has learned since `before` (m,), less what r gives up."""
+    disturbance.transfer_learned(state.disturbance, signals.H, state.estimate, before)
     if settings.observer.enabled == 1:
-        load_observer.hand_over(
+        load_observer.transfer_learned(
             settings.observer,
             state.observer,
             state.disturbance,
@@ -329,7 +328,7 @@ def follow_absorbed(
     now, work = state.absorbed, signals.absorbed
     of = settings.adaptation
     absorbed_friction.follow(now, work, of.weight, of.adaptation_gain, dt)
-    load_observer.hand_over(
+    load_observer.transfer_learned(
         settings.observer,
         state.observer,
         state.disturbance,
@@ -355,7 +354,7 @@ def adapt(
     if state.frozen[0] > 0.0:
         if not saturated:
             follow_disturbance(settings, state, signals, dt)
-        hand_over_friction(settings, state, signals)
+        transfer_friction(settings, state, signals)
         return
     of, work = settings.adaptation, signals.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
@@ -380,19 +379,19 @@ def adapt(
         follow_disturbance(settings, state, signals, dt)
     if latch.latched[0] == 1.0:
         if settings.disturbance.bumpless == 1:
-            hand_over(settings, state, signals, work.tracked)
+            transfer_learned(settings, state, signals, work.tracked)
         if settings.observer.enabled == 1:
             follow_absorbed(settings, state, signals, dt)
         friction.adapt_breakaway(
             settings.friction, state.friction, signals.friction, dt
         )
-    hand_over_friction(settings, state, signals)
+    transfer_friction(settings, state, signals)
 
 
 @inner
-def hand_over_friction(settings: Settings, state: State, signals: Signals) -> None:
+def transfer_friction(settings: Settings, state: State, signals: Signals) -> None:
     """Subtract from d^3 what this sample has changed in the compensation of Coulomb friction."""
-    friction.hand_over(
+    friction.transfer_learned(
         settings.friction,
         state.friction,
         signals.friction,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Load observer: what acts on the links and the model lacks, by joint torque sensors.
+"""Load observer: torque on the links beyond the model's, by joint torque sensors.
 
 A sensor behind a gear shows the torque tau_J that reaches the links, whatever motor and
 friction do.  With the row X of the last interval (see `prediction`), by the measured
@@ -9,7 +9,7 @@ motion, and P_l, the learned parameters less those of the motors,
 
 is added to the torque: within some 1 / L it has what d^3 and the learning find in seconds.
 It is linear in P^, so that it gives up what is learned at once; d^3 then only has to give
-up the rest (`hand_over`).  Near the reference it is the feedback
+up the rest (`transfer_learned`).  Near the reference it is the feedback
 
     r = L / (s + L) (M - M_l) s^2 xi1
 
@@ -213,7 +213,7 @@ def begin(state: State, disturbance: Array) -> None:
 
 
 @inner
-def hand_over(
+def transfer_learned(
     settings: Settings,
     state: State,
     disturbance: Array,

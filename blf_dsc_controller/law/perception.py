@@ -31,7 +31,7 @@ CONTACT, DISTANCE = 0, 1  # in `sample.contact`
 
 @inner
 def update_covariance(settings: Settings, state: State) -> None:
-    """Tell `external_torque` what is known of theta: at first the prior, then each full window."""
+    """Give `external_torque` the covariance of theta: of the prior, then of each full window."""
     if state.samples[0] <= 1.0:
         external_torque.begin(settings.contact, state.contact, settings.information)
         return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a study knows of a simulated arm: for the terms of (29), and for the law (16).
+"""True parameters and disturbance of a simulated arm, for the terms of (29) and the law (16).
 
 tau_dist(t) = constant + amplitude sin(frequency t + phase)                         [N m]
 """

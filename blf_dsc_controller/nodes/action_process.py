@@ -64,7 +64,7 @@ class ActionProcess:
         self._link.flush()
 
     def messages(self) -> Iterator[Goal | Cancel]:
-        """Send what still waits, and yield what clients want."""
+        """Send what still waits, and yield the requests of clients."""
         self._link.flush()
         for _, content in self._link.messages():
             message = decode(content)

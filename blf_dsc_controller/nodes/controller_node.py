@@ -57,36 +57,37 @@ class ControllerNode(LoopNode[ControllerConfig]):
         starting: what is looked at before the first state is used.
         status: diagnostics and events; its `trajectories` are the motions that were asked for.
         action: offers trajectories as an action; None: nobody can ask for any.
-        load_service: what the drives are told of the load; None: nothing.
+        load_service: declares loads to the drives; None: nothing does.
         warned_at: stamp of the start that the last warning was about [ns].
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(topics.CONTROLLER, ControllerConfig, **options)
+        joints = self.config.joints
         self.guard: Guard | None = None
         self.outputs = Outputs()
         self._loop: GuardedLoop | None = None
         self._load: ReferenceLoad | None = None
         self.load_service: LoadService | None = None
-        joints = self.config.joints
+        self._decoder = JointStateDecoder(joints, required=('position',))
+        self._encoder = Float64MultiArrayEncoder(len(joints))
+        self._started = False
+        self._polled = 0  # joint states at the last poll
+        # whether the tracking errors had subscribers at the last count
+        self._errors_subscribed = False
+        # What has been reported, so that it is not reported again:
         self._columns = b''  # those that are estimated, and whether they were checked
         self._model_changes = 0.0
         self._contacts = self._oscillations = 0
-        self._untrusted = ''  # what was said of the torque sensors
-        self._decoder = JointStateDecoder(joints, required=('position',))
-        self._encoder = Float64MultiArrayEncoder(len(joints))
-        self._polled = 0  # joint states at the last poll
-        self.warned_at = -1  # stamp of the start that the last warning was about
-        self._told_gains = False  # that nobody has measured whether the arm bears them
-        self._turned_at = -1  # likewise, of the last reference shifted by turns
-        # whether the tracking errors had subscribers at the last count
-        self._errors_subscribed = False
-        self._started = False
+        self._untrusted = ''  # sentence about the torque sensors
         # phase, stops, silenced, text of a stop
         self._logged = Phase.INACTIVE, 0, False, ''
-        self._ends_at = 0.0  # s, at the latest, since a signal
-        # joint states processed by then, and when the last was
-        self._last_seen = 0, 0.0
+        self._warned_of_gains = False  # whose margin nobody has measured
+        self.warned_at = -1  # stamp of the start that the last warning was about
+        self._turned_at = -1  # likewise, of the last reference shifted by turns
+        # After a signal:
+        self._ends_at = 0.0  # s, at the latest
+        self._last_seen = 0, 0.0  # joint states processed by then, and s, the last
         self.status = ControllerStatus(self, joints, self.outputs)
         self.action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
@@ -110,15 +111,32 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._loop = GuardedLoop(self.config, self._steady, self._wall)
         self.guard = self._loop.guard
         self._contacts = self._oscillations = 0
-        self.guard.journal.pending[-1].content['topics'] = {
-            topic.leaf: self.resolve_topic_name(topic.relative)
-            for topic in (topics.JOINT_STATES, topics.COMMANDS)
-        }
+        self._record_topics(self.guard)
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
             self.get_logger().warning(warning)
         if end := end_of_waypoints(self.config):
             self.get_logger().info(end)
+        self._begin_declaring_loads()
+        if self.connect(
+            self._output_topics(), topics.JOINT_STATES, self._on_joint_state
+        ):
+            joints = self.config.joints
+            inputs = motion_input_of(self, len(joints), lambda: self.guard)
+            self.status.trajectories = inputs
+            self.action = offered_action(self, inputs, joints)
+        self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
+        self._report()
+
+    def _record_topics(self, guard: Guard) -> None:
+        """Add the names of the topics to the first event of the journal."""
+        guard.journal.pending[-1].content['topics'] = {
+            topic.leaf: self.resolve_topic_name(topic.relative)
+            for topic in (topics.JOINT_STATES, topics.COMMANDS)
+        }
+
+    def _begin_declaring_loads(self) -> None:
+        """Declare loads to the driver's service, if there is one; warn if one is missing."""
         load = self.config.load
         if load.service:
             if self.load_service is None:
@@ -130,32 +148,30 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 "drives: give the driver's service, or set robot.drive_payload and the load of "
                 'the driver'
             )
+
+    def _output_topics(self) -> list[topics.Topic]:
+        """Return the topics that this node publishes in the loop."""
         outputs = [topics.COMMANDS]
-        if self.config.telemetry.enabled:
-            outputs += [
-                topics.REFERENCE,
-                topics.TRACKING_ERROR,
-                topics.BOUND,
-                topics.MONITOR,
-            ]
-            if self.config.contact.enabled:
-                outputs += [topics.EXTERNAL_TORQUE]
-                if self.config.robot.tip:
-                    outputs += [topics.EXTERNAL_WRENCH]
-        if self.connect(outputs, topics.JOINT_STATES, self._on_joint_state):
-            joints = self.config.joints
-            inputs = motion_input_of(self, len(joints), lambda: self.guard)
-            self.status.trajectories = inputs
-            self.action = offered_action(self, inputs, joints)
-        self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
-        self._report()
+        if not self.config.telemetry.enabled:
+            return outputs
+        outputs += [
+            topics.REFERENCE,
+            topics.TRACKING_ERROR,
+            topics.BOUND,
+            topics.MONITOR,
+        ]
+        if self.config.contact.enabled:
+            outputs.append(topics.EXTERNAL_TORQUE)
+            if self.config.robot.tip:
+                outputs.append(topics.EXTERNAL_WRENCH)
+        return outputs
 
     def activate(self) -> None:
         """Take command with the next joint state."""
         self.starting.measure()
         if self.guard is not None:
             self._begin_again(self.guard)
-            self.guard.activate()
+            self.guard.starting.activate()
         self.get_logger().info(
             f'ready for joint states of {", ".join(self.config.joints)}'
         )
@@ -220,10 +236,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def reset(self) -> str:
         """Restart with the next joint state and the initial estimates."""
         if self.guard is not None:
-            if self.guard.start_error is not None:
+            if self.guard.starting.error is not None:
                 self.starting.measure()
             self._begin_again(self.guard)
-            self.guard.reset()
+            self.guard.starting.reset()
         self.failure = None
         self._report()
         return 'estimates cleared: starting with the next state'
@@ -240,7 +256,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if self.guard is None:
             return False, f'{self.get_name()} is {self.state_label}: activate it first'
         try:
-            self.guard.tare()
+            self.guard.findings.tare()
         except TareError as error:
             return False, str(error)
         return True, 'the external torque is zero here'
@@ -259,7 +275,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             trajectories.poll(guard)
         try:
             torque = self._torque_for(guard, raw)
-            self._tell(topics.JOINT_STATES, raw)
+            self._write(topics.JOINT_STATES, raw)
             self._command(torque)
             guard.perceive()
         except Exception as error:  # noqa: BLE001 - the arm needs a torque after any error
@@ -270,9 +286,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._publish_telemetry(torque)
         if self.action is not None:
             self.action.poll(guard)
-        if guard.waiting_for:
+        if guard.starting.waiting_for:
             self.get_logger().warning(
-                f'not started, waiting for a usable joint state: {guard.waiting_for}',
+                f'not started, waiting for a usable joint state: {guard.starting.waiting_for}',
                 throttle_duration_sec=WAITING_PERIOD,
             )
         self.report_if_changed(guard)
@@ -327,7 +343,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 self._publish(message)
 
     def _warn_of_rate(self, guard: Guard) -> None:
-        period = guard.time / (_RATE_SAMPLES - 1)
+        period = guard.reference.time / (_RATE_SAMPLES - 1)
         expected = self.config.sample_time
         if period < _FAST * expected:
             self.get_logger().warning(rate_mismatch(period, expected))
@@ -358,13 +374,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if torque is not None:
             raw = self._encoder.encode(torque)
             self._senders[topics.COMMANDS](raw)
-            self._tell(topics.COMMANDS, raw)
+            self._write(topics.COMMANDS, raw)
 
     def _publish(self, message: topics.Message) -> None:
         super()._publish(message)
-        self._tell(*message)
+        self._write(*message)
 
-    def _tell(self, topic: topics.Topic, raw: bytes) -> None:
+    def _write(self, topic: topics.Topic, raw: bytes) -> None:
         """Give a message to the outputs beside the topics."""
         if self.outputs and self.guard is not None:
             self.outputs.write(max(self.guard.journal.stamp, 0), topic, raw)
@@ -404,16 +420,16 @@ class ControllerNode(LoopNode[ControllerConfig]):
             guard.retune(config)
             if (
                 self._loop is not None
-                and guard.last_stamp >= 0
+                and guard.reference.last_stamp >= 0
                 and config.telemetry.enabled
             ):
-                bound = guard.controller.bound_at(guard.time)
+                bound = guard.controller.bound_at(guard.reference.time)
                 limit = guard.controller.settings.torque.limit
                 telemetry = self._loop.telemetry
                 self._publish(telemetry.bound(guard.journal.stamp, bound, limit))
 
     def report_if_changed(self, guard: Guard) -> None:
-        """Publish new events, and diagnostics if they tell anything new."""
+        """Publish new events, and diagnostics if they have changed."""
         if not self.status.has_news(guard):
             self.status.publish_events(guard)
             return
@@ -421,11 +437,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._log_phase(guard)
         self._started = self._started or supervisor.running
         if (
-            guard.start_error is not None
+            guard.starting.error is not None
             and self.config.autostart
             and not self._started
         ):
-            self.failure = guard.start_error
+            self.failure = guard.starting.error
             self.finished = True
         self._report()
 
@@ -436,8 +452,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.load_service.look()
         super().on_second()
         guard = self.guard
-        if guard is not None and guard.start_stamp != self.warned_at:
-            self.warned_at = guard.start_stamp
+        if guard is not None and guard.reference.start_stamp != self.warned_at:
+            self.warned_at = guard.reference.start_stamp
             if not self._is_simulated():
                 self._warn_of_start(guard)
 
@@ -446,8 +462,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.watchdog.why_off:
             self.get_logger().warning(guard.watchdog.why_off)
         text = not_commissioned(self.config)
-        if text and not self._told_gains:
-            self._told_gains = True
+        if text and not self._warned_of_gains:
+            self._warned_of_gains = True
             self.get_logger().warning(text)
 
     def _look_for_watchdog(self) -> None:
@@ -460,17 +476,17 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _warn(self, guard: Guard) -> None:
         """Warn of what has been found since the last call."""
-        contacts = guard.contacts
+        contacts = guard.findings.contacts
         if contacts.last is not None and contacts.count != self._contacts:
             self._contacts = contacts.count
             self.get_logger().warning(contacts.last.text)
         if guard.calming.count != self._oscillations:
             self._oscillations = guard.calming.count
             self.get_logger().warning(guard.calming.text)
-        if guard.untrusted != self._untrusted:
-            self._untrusted = guard.untrusted
-            if guard.untrusted:
-                self.get_logger().warning(guard.untrusted)
+        if guard.findings.untrusted != self._untrusted:
+            self._untrusted = guard.findings.untrusted
+            if guard.findings.untrusted:
+                self.get_logger().warning(guard.findings.untrusted)
 
     def _log_phase(self, guard: Guard) -> None:
         supervisor = guard.supervisor
@@ -481,9 +497,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if now == self._logged:
             return
         self._logged = now
-        if guard.turned and guard.start_stamp != self._turned_at:
-            self._turned_at = guard.start_stamp
-            self.get_logger().info(f'the reference {guard.turned}')
+        if guard.reference.turned and guard.reference.start_stamp != self._turned_at:
+            self._turned_at = guard.reference.start_stamp
+            self.get_logger().info(f'the reference {guard.reference.turned}')
         if guard.silenced:
             self.get_logger().warning(supervisor.text)
         elif is_stopped:
@@ -492,7 +508,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 f'{stop}; {self.get_fully_qualified_name()}/reset starts again'
             )
         elif supervisor.phase is Phase.APPROACHING:
-            left = guard.settled - guard.time
+            left = guard.reference.settled - guard.reference.time
             self.get_logger().info(f'approaching the reference, for {left:.3g} s')
         elif supervisor.phase is Phase.TRACKING:
             self.get_logger().info('tracking the reference')

@@ -89,7 +89,7 @@ class ControllerStart:
         if is_starting:
             acting = self._conditions.end()
             if acting is not None:
-                guard.take_over_from(acting)
+                guard.starting.take_over_from(acting)
         return False
 
     def release(self, guard: Guard) -> bytes | None:
@@ -118,7 +118,7 @@ class ControllerStart:
         try:
             return self._conditions.check(commanding=guard.commanding)
         except StartError as error:
-            guard.refuse(error)
+            guard.starting.refuse(error)
             return False
 
     def _give_to_gate(self, guard: Guard, raw: bytes) -> bool:
@@ -139,11 +139,11 @@ class ControllerStart:
             return True
         self.held = None
         if state is GateState.REFUSED:
-            guard.refuse(StartError(self._gate.problem))
+            guard.starting.refuse(StartError(self._gate.problem))
         return self._refuse_unsupported(guard)
 
     def _refuse_unsupported(self, guard: Guard) -> bool:
         """Refuse a start without support; return whether it is refused, if by the gate."""
-        if guard.start_error is None:
-            guard.check_support(self._decoder.values)
-        return guard.start_error is not None
+        if guard.starting.error is None:
+            guard.starting.check_support(self._decoder.values)
+        return guard.starting.error is not None

@@ -25,13 +25,13 @@ _DENSITY = 1000.0  # kg/m^3, of the ball that stands for the shape of a load
 
 
 class LoadService:
-    """What the drives are told over ROS, while `load.tell_drive` is true.
+    """Declares loads to the drives over ROS, while `load.tell_drive` is true.
 
     The law takes a step over with the first state after the service has accepted it.
 
     Attributes:
-        problem: why the drives are told nothing more, or empty.
-        told: what they have accepted last; None: nothing.
+        problem: why no more loads are declared, or empty.
+        told: the load that they have accepted last; None: none.
         to_frame: points of the tip in the frame that the service wants (4, 4).
         client: of the service; None until it is found.
     """
@@ -78,7 +78,7 @@ class LoadService:
         self.client = self._node.create_client(service, self._name)
 
     def begin(self) -> None:
-        """Begin with a new law, which knows nothing of loads declared before."""
+        """Begin with a new law, which does not count loads declared before."""
         if self.told is not None and not self.problem:
             self._give_up(
                 f'a load of {self.told.mass:.2f} kg is still declared to the drives, from before '

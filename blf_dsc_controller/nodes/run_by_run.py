@@ -36,7 +36,7 @@ class RunByRunNode(ControllerNode):
         self._acting: np.ndarray | None = None  # N m, the last torque
         self.heard = time.monotonic()
         super().__init__(**options)
-        self._told_gains = True  # they are about to be measured
+        self._warned_of_gains = True  # they are about to be measured
 
     def autostart(self) -> None:
         """Configure the node only: it commands nothing before the first run.
@@ -69,12 +69,12 @@ class RunByRunNode(ControllerNode):
     def position(self) -> np.ndarray | None:
         """Return the positions (n,) [rad] of the last joint state; None: there was none."""
         guard = self.guard
-        if guard is None or not np.isfinite(guard.last_state.age):
+        if guard is None or not np.isfinite(guard.safe_torque.last.age):
             return None
-        return np.array(guard.last_state.q)
+        return np.array(guard.safe_torque.last.q)
 
     def warn(self, text: str) -> None:
-        """Log what somebody has to know."""
+        """Log a warning."""
         self.get_logger().warning(text)
 
     def begin(self, config: ControllerConfig, outputs: tuple[Output, ...]) -> Guard:
@@ -94,8 +94,8 @@ class RunByRunNode(ControllerNode):
         if acting is None:
             self._try_each('activate')
         else:
-            self.guard.activate()
-            self.guard.take_over_from(acting)
+            self.guard.starting.activate()
+            self.guard.starting.take_over_from(acting)
         self._report()
         return self.guard
 

@@ -26,7 +26,7 @@ class TrajectoryAction:
         self._goals = Goals(inputs, joints, self._process.send, node.get_logger())
 
     def poll(self, guard: Guard | None) -> None:
-        """Take what clients want, and watch the goal; between two samples."""
+        """Take the requests of clients, and watch the goal; between two samples."""
         for message in self._process.messages():
             self._goals.take(guard, message)
         self._goals.watch(guard)

@@ -52,5 +52,5 @@ def connect(
 
 def _is_live(guard: Guard) -> bool:
     """Whether the plant does not wait for the controller."""
-    behind = (time.time_ns() - guard.last_stamp) * NANOSECOND
+    behind = (time.time_ns() - guard.reference.last_stamp) * NANOSECOND
     return guard.watchdog.on or abs(behind) < SAME_CLOCK

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `torque_watchdog`: the safe torque if the controller is dead.
+"""The node `torque_watchdog`: the safe torque if the controller has ended.
 
 Effort controllers hold the last torque for ever. When commands stop while joint states
 go on, this node commands the safe torque of the controller's configuration until the
@@ -287,7 +287,7 @@ class WatchdogNode(PlainNode):
         return Status(OK, 'watching' if watchdog.watches else waiting, is_ready=True)
 
     def _lack_of(self, watchdog: TorqueWatchdog) -> str:
-        """Return what this node lacks to take over, or empty."""
+        """Return what is missing for this node to take over, or empty."""
         if not watchdog.has_state:
             return 'no joint states arrive'
         return '' if self._reaches_drives() else 'nobody subscribes to its torques'

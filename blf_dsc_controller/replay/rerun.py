@@ -12,7 +12,7 @@ from __future__ import annotations
 import heapq
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,13 +26,9 @@ from blf_dsc_controller.errors import BlfDscError, TareError
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR, Message, Topic
-from blf_dsc_controller.reference.retargeting import Target, TrajectoryError
-from blf_dsc_controller.reference.trajectory import (
-    Trajectory,
-    TrajectoryPoint,
-)
+from blf_dsc_controller.reference.retargeting import TrajectoryError
+from blf_dsc_controller.replay.guard_calls import GUARD_CALLS
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.supervisor import Reason
 
 _UNREADABLE = frozenset(
@@ -44,6 +40,8 @@ _UNREADABLE = frozenset(
     )
 )
 _EXTERNAL = (Reason.STATE_TIMEOUT, Reason.FAILED)
+_REASONS = frozenset(reason.value for reason in Reason)
+_FIXED = frozenset(each.name for each in parameters(ControllerConfig) if each.read_only)
 _BLOCK = 4096  # states in memory
 _AXES = 3
 _MOST_TORQUES = 1_000_000  # of the watchdog: an hour without joint states
@@ -317,46 +315,43 @@ class Rerun:
                 event.stamp,
             )
 
-    def _act(self, event: Event) -> None:  # noqa: C901, PLR0912 - one branch for each type
+    def _act(self, event: Event) -> None:
         """Do what caused an event, unless a message did."""
-        guard, content = self._guard, event.content
         if _reason(event) is Reason.STATE_TIMEOUT:
-            self._command(event.stamp, guard.time_out(content['text']))
-        elif event.type in (EventType.ACTIVATE, EventType.RESET, EventType.DEACTIVATE):
-            getattr(guard, event.type.value)()
-        elif event.type is EventType.TAKEOVER:
-            guard.take_over_from(np.array(content['torque']))
-        elif event.type is EventType.PREPARE:
-            guard.prepare(np.array(content['positions']))
-        elif event.type is EventType.WITHDRAW:
-            guard.withdraw(content['text'])
-        elif event.type is EventType.RELEASE:
-            torque = guard.release()
-            guard.journal.commands += torque is not None  # after the event's count
+            torque = self._guard.time_out(event.content['text'])
             self._command(event.stamp, torque)
-        elif event.type is EventType.TRAJECTORY:
-            guard.adopt(guard.plan(_trajectory(content), content['at']))
-        elif event.type is EventType.TARGET:
-            guard.adopt(guard.plan(_target(content), content['at']))
-        elif event.type is EventType.BRAKE:
-            guard.brake()
-        elif event.type is EventType.TARE:
-            guard.tare()
-        elif event.type is EventType.DRIVE_LOAD:
-            guard.take_over(DriveLoad(content['mass'], tuple(content['centre'])))
+        elif event.type in GUARD_CALLS:
+            GUARD_CALLS[event.type](self._guard, event.content)
+        elif event.type is EventType.RELEASE:
+            self._release(event)
         elif event.type is EventType.PARAMETERS:
-            where = f'event {event.number} of the journal'
-            given = current(content['parameters'], where, guard.config.law)
-            guard.retune(change(guard.config, given, where))
-            if guard.last_stamp >= 0:
-                stamp = guard.journal.stamp
-                limit = guard.controller.settings.torque.limit
-                bound = guard.controller.bound_at(guard.time)
-                self._add(stamp, self._telemetry.bound(stamp, bound, limit))
+            self._retune(event)
         elif event.type is EventType.SILENCE:
-            while guard.watchdog.torques < content['torques']:
-                self._command(event.stamp, guard.time_out(''))
-            guard.end_silence()
+            self._stay_silent(event)
+
+    def _release(self, event: Event) -> None:
+        """Command the torque to leave behind."""
+        torque = self._guard.release()
+        self._guard.journal.commands += torque is not None  # after the event's count
+        self._command(event.stamp, torque)
+
+    def _retune(self, event: Event) -> None:
+        """Change parameters, and publish the bound by the new ones as the node does."""
+        guard = self._guard
+        where = f'event {event.number} of the journal'
+        given = current(event.content['parameters'], where, guard.config.law)
+        guard.retune(change(guard.config, given, where))
+        if guard.reference.last_stamp >= 0:
+            stamp = guard.journal.stamp
+            limit = guard.controller.settings.torque.limit
+            bound = guard.controller.bound_at(guard.reference.time)
+            self._add(stamp, self._telemetry.bound(stamp, bound, limit))
+
+    def _stay_silent(self, event: Event) -> None:
+        """Command what the watchdog commanded in a silence."""
+        while self._guard.watchdog.torques < event.content['torques']:
+            self._command(event.stamp, self._guard.time_out(''))
+        self._guard.end_silence()
 
     def _compare(self, event: Event, own: Event) -> None:
         """Note what an event says otherwise than the controller's own.
@@ -386,16 +381,6 @@ class Rerun:
         self.departure = self.departure or (what, stamp)
 
 
-def _trajectory(content: Mapping[str, Any]) -> Trajectory:
-    points = tuple(TrajectoryPoint(**point) for point in content['points'])
-    return Trajectory(tuple(content['joints']), points, content['begin'])
-
-
-def _target(content: Mapping[str, Any]) -> Target:
-    fields = {name: content[name] for name in Target._fields}
-    return Target(**fields)
-
-
 def _first_gap(answers: JointStates) -> int:
     """Return the number of answers before the first that the recorder missed."""
     sequence = answers.sequence
@@ -422,32 +407,33 @@ def _commanded_by_states(events: Sequence[Event], commands: int) -> int:
 
 def _check(events: Sequence[Event]) -> None:
     """Raise BlfDscError if an event cannot be repeated."""
-    fixed = {each.name for each in parameters(ControllerConfig) if each.read_only}
-    reasons = {reason.value for reason in Reason}
-    torques = 0
+    silent_torques = 0
     for event in events:
-        problem = ''
-        content = event.content
-        if event.type is EventType.STOP and content['reason'] not in reasons:
-            problem = f'a stop for the unknown reason {content["reason"][:40]!r}'
-        elif (
-            event.type is EventType.PARAMETERS and fixed & content['parameters'].keys()
-        ):
-            names = ', '.join(sorted(fixed & content['parameters'].keys()))
-            problem = f'a change of what is fixed at the start: {names}'
-        elif event.type is EventType.DRIVE_LOAD and len(content['centre']) != _AXES:
-            problem = f'a centre with {len(content["centre"])} coordinates'
-        elif event.type is EventType.SILENCE:
-            torques += content['torques']
-            if torques > _MOST_TORQUES:
-                problem = (
-                    f'{torques} torques of the watchdog, more than {_MOST_TORQUES}'
-                )
+        problem = _problem_of(event)
+        if event.type is EventType.SILENCE:
+            silent_torques += event.content['torques']
+            if silent_torques > _MOST_TORQUES:
+                problem = f'{silent_torques} torques of the watchdog, more than {_MOST_TORQUES}'
         if problem:
             raise BlfDscError(
                 f'event {event.number} of the journal cannot be repeated: {problem}; it is '
                 'damaged or of a later version'
             )
+
+
+def _problem_of(event: Event) -> str:
+    """Return why an event cannot be repeated; empty if it can."""
+    content = event.content
+    if event.type is EventType.STOP and content['reason'] not in _REASONS:
+        return f'a stop for the unknown reason {content["reason"][:40]!r}'
+    if event.type is EventType.PARAMETERS:
+        fixed = _FIXED & content['parameters'].keys()
+        if fixed:
+            names = ', '.join(sorted(fixed))
+            return f'a change of what is fixed at the start: {names}'
+    if event.type is EventType.DRIVE_LOAD and len(content['centre']) != _AXES:
+        return f'a centre with {len(content["centre"])} coordinates'
+    return ''
 
 
 def is_own(event: Event) -> bool:

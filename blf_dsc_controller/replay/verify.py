@@ -118,7 +118,7 @@ class Verification(NamedTuple):
     events: tuple[Event, ...]  #: replayed events but motions
     motions: int  #: number of replayed trajectories and targets of streams
     remarks: tuple[str, ...]  #: limitations of the result
-    incomplete: tuple[str, ...]  #: what the recording lacks
+    incomplete: tuple[str, ...]  #: what is missing in the recording
     difference: Difference | None  #: the earliest, in a topic or in an event
 
     @property
@@ -169,8 +169,6 @@ def verify(
     events, until, other = _events(content)
     _check_format(path, events[0])
     config = content.exact_config(law)
-    recorded = content.configurations[topics.CONTROLLER]
-    newer = sorted(flatten(config).keys() - recorded.keys() - {'insist'})
     errors: dict[int, MessageError] = {}
     states = content.topics[topics.JOINT_STATES].joint_states(
         names.joints_of(config.joints), ('position',), errors
@@ -183,27 +181,51 @@ def verify(
     motions = (event for received, event in content.motions if received < until)
     run.run(events[1:], motions)
     comparisons = tuple(_compared(content, run, answers, config.joints))
+    is_compared = any(found.values for found in comparisons)
+    if run.departure is None and not is_compared:
+        raise _nothing_to_compare(content)
+    end = run.end or other
+    newer = _newer_parameters(content, config)
+    changed_law = _changed_law(config, events[0])
+    return Verification(
+        samples=run.samples,
+        duration=(run.last - run.first) * 1e-9,
+        skipped=run.skipped,
+        comparisons=comparisons,
+        not_compared=_names_of_others(content),
+        events=tuple(run.events),
+        motions=run.motions,
+        remarks=tuple(_remarks(content, end, newer, changed_law)),
+        incomplete=tuple(
+            _incomplete(content, events, comparisons, end, run.alteration)
+        ),
+        difference=_first_difference(content, run, comparisons),
+    )
+
+
+def _newer_parameters(content: Content, config: ControllerConfig) -> list[str]:
+    """Return the parameters that the recorded configuration does not have, by name."""
+    recorded = content.configurations[topics.CONTROLLER]
+    return sorted(flatten(config).keys() - recorded.keys() - {'insist'})
+
+
+def _names_of_others(content: Content) -> tuple[str, ...]:
+    """Return the names of the topics in the bag that are not compared."""
+    return tuple(
+        content.topics[topic].name for topic in _OTHERS if topic in content.topics
+    )
+
+
+def _first_difference(
+    content: Content, run: Rerun, comparisons: Sequence[Comparison]
+) -> Difference | None:
+    """Return the earliest difference; of those with the same stamp, the departure."""
     differences = [found.difference for found in comparisons if found.difference]
     if run.departure is not None:
         differences.insert(0, _departed(run, *run.departure))
-    elif not any(found.values for found in comparisons):
-        raise _nothing_to_compare(content)
     if run.alteration is not None and content.version == __version__:
         differences.append(_altered(content, run, run.alteration))
-    texts = [content.topics[topic] for topic in _OTHERS if topic in content.topics]
-    end = run.end or other
-    return Verification(
-        run.samples,
-        (run.last - run.first) * 1e-9,
-        run.skipped,
-        comparisons,
-        tuple(each.name for each in texts),
-        tuple(run.events),
-        run.motions,
-        tuple(_remarks(content, end, newer, _changed_law(config, events[0]))),
-        tuple(_incomplete(content, events, comparisons, end, run.alteration)),
-        min(differences, key=lambda found: found.stamp, default=None),
-    )
+    return min(differences, key=lambda found: found.stamp, default=None)
 
 
 def _check_format(path: Path, configure: Event) -> None:
@@ -338,34 +360,42 @@ def _compare(
     Those that have other stamps differ.
     """
     fields = _COMPARED[topic]
-    theirs = messages.joint_names()
-    ours = own.joint_names()
-    shared = [name for name in ours if name in theirs and name != topics.COMPUTE_TIME]
-    result.left_out = ', '.join(
-        n for n in dict.fromkeys((*ours, *theirs)) if n not in shared
-    )
+    shared = _shared_names(messages, own, result)
     result.recorded = messages.size * len(shared) * len(fields)
-    recorded, replayed = (each.joint_states(shared, ()) for each in (messages, own))
-    if topic is topics.TRACKING_ERROR:
-        recorded = answers
+    recorded = answers
+    if topic is not topics.TRACKING_ERROR:
+        recorded = messages.joint_states(shared, ())
     recorded, replayed, result.missing = _matched(
-        topic, recorded, replayed, answers.size, run.answers
+        topic, recorded, own.joint_states(shared, ()), answers.size, run.answers
     )
-    stamp = replayed.received
     has_moved = recorded.stamp != replayed.stamp
     names = _labels(topic, shared, joints)
     for begin in range(0, replayed.size, _BLOCK):
         rows = slice(begin, begin + _BLOCK)
-        pair = [
-            np.hstack([states.field(k)[rows] for k in fields])
-            for states in (recorded, replayed)
-        ]
-        pair[1][has_moved[rows]] = np.inf
-        result.add(stamp[rows], run.first, names, *pair)
+        theirs = _table(recorded, rows, fields)
+        ours = _table(replayed, rows, fields)
+        ours[has_moved[rows]] = np.inf
+        result.add(replayed.received[rows], run.first, names, theirs, ours)
     if topic is topics.COMMANDS:
         unreached = (result.recorded - result.values) // len(joints)
         if unreached:
             result.left_out = f'{unreached} torques that the replay does not reach'
+
+
+def _shared_names(
+    messages: TopicMessages, own: TopicMessages, result: Comparison
+) -> list[str]:
+    """Return the names in both, but for the computation time; note the others as left out."""
+    theirs, ours = messages.joint_names(), own.joint_names()
+    shared = [name for name in ours if name in theirs and name != topics.COMPUTE_TIME]
+    others = [name for name in dict.fromkeys((*ours, *theirs)) if name not in shared]
+    result.left_out = ', '.join(others)
+    return shared
+
+
+def _table(states: JointStates, rows: slice, fields: Sequence[int]) -> Floats:
+    """Return some rows of fields of messages, beside each other (rows, fields * names)."""
+    return np.hstack([states.field(k)[rows] for k in fields])
 
 
 def _labels(topic: topics.Topic, shared: list[str], joints: Sequence[str]) -> list[str]:
@@ -467,7 +497,7 @@ def _incomplete(
     end: str,
     alteration: Alteration | None,
 ) -> Iterator[str]:
-    """Yield what the recording lacks: messages, its end, texts of this version."""
+    """Yield what is missing in the recording: messages, its end, texts of this version."""
     for found in comparisons:
         if found.missing:
             yield f'{found.missing} messages of {found.topic}'

@@ -74,7 +74,7 @@ def simulate(
     plant = plant_of(plant_config)
     if supervised:
         guard = Guard(controller_config, lambda: 0, lambda: 0)
-        guard.activate()
+        guard.starting.activate()
         record = new_record(
             guard.controller, controller_config, plant_config, guard.journal
         )
@@ -128,8 +128,8 @@ def _run_supervised(
             first and _run_compiled(loop, guard, plant, record, chunk, is_end=is_end)
         ):
             _run_guarded(guard, plant, record, bound, is_end=is_end)
-        if guard.start_error is not None:
-            raise guard.start_error
+        if guard.starting.error is not None:
+            raise guard.starting.error
         if is_end:
             _release(guard, record)
         bound[:] = record.sample(-1).bound
@@ -338,7 +338,7 @@ def simulate_into_bag(
     Arguments and errors are those of both.
     """
     guard = Guard(controller, lambda: 0, lambda: 0)
-    guard.activate()
+    guard.starting.activate()
 
     def rows_of(rows: range) -> Record:
         return new_record(guard.controller, controller, plant, guard.journal, rows)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Studies: the paper's claims, laws side by side, and random plants by the thousand."""
+"""Studies that a user runs on an arm: laws side by side, and Monte Carlo studies."""

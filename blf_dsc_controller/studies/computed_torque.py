@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computed torque with an integrator, the rival of the studies: a law of a file with a memory.
+"""Computed torque with an integrator: the law that the studies compare with.
 
     tau = M0 (qr'' - k_p e - k_d e' - k_i int e) + C0 q' + G0 + F0(qr'),   e = q - qr
 

@@ -348,22 +348,27 @@ def compare(
         cores(), initializer=chosen_laws, initargs=(laws,)
     ) as pool:
         for arm, name in tqdm(rows, unit='law'):
-            first, *others = (trial(arm, seed) for seed in range(TRUTHS + 1))
-            unseen = torque_rows(trial(arm, UNSEEN).controller)
-            searched = LAWS[name].gains
-            least = {gain.name: gain.least for gain in searched}
-            run(name, first, least, unseen)  # compiles what the workers load
-            gains, cost = {}, None
-            if searched:
-                of_gains = partial(tuning_cost, name=name, loop=first, unseen=unseen)
-                options = {'workers': pool.map, 'updating': 'deferred'}
-                found = search(of_gains, searched, POPULATION, GENERATIONS, **options)
-                gains = values_of(name, found.x)
-                cost = float(found.fun)
-            runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
-            results[arm][name] = Result(gains, cost, list(runs))
+            results[arm][name] = _tuned_and_run(arm, name, pool)
     write_json(results, folder / 'figures.json')
     return results
+
+
+def _tuned_and_run(arm: str, name: str, pool: ProcessPoolExecutor) -> Result:
+    """Tune a law on an arm's first draw, and run it on the others."""
+    first, *others = (trial(arm, seed) for seed in range(TRUTHS + 1))
+    unseen = torque_rows(trial(arm, UNSEEN).controller)
+    searched = LAWS[name].gains
+    least = {gain.name: gain.least for gain in searched}
+    run(name, first, least, unseen)  # compiles what the workers load
+    gains, cost = {}, None
+    if searched:
+        of_gains = partial(tuning_cost, name=name, loop=first, unseen=unseen)
+        options = {'workers': pool.map, 'updating': 'deferred'}
+        found = search(of_gains, searched, POPULATION, GENERATIONS, **options)
+        gains = values_of(name, found.x)
+        cost = float(found.fun)
+    runs = pool.map(partial(run, name, values=gains, unseen=unseen), others)
+    return Result(gains, cost, list(runs))
 
 
 def format_results(results: dict[str, Result]) -> str:

@@ -71,7 +71,7 @@ STILL = 'still.'
 """Prefix of the columns of a run in which nothing moves the parameters."""
 
 UNSEEN = 1000
-"""Seed of the motion on which the torque of a learned model is judged."""
+"""Seed of the motion on which the torque of a learned model is evaluated."""
 
 _ROWS = 200  # postures of that motion
 _ROWS_FOR = 15.0  # s
@@ -194,8 +194,8 @@ def load_study(
     Raises ConfigurationError with all problems of all sections, and their lines.
     """
     path = locate(path)
-    problems: list[str] = []
-    own: list[str] = []
+    problems: list[str] = []  # of the loop
+    own: list[str] = []  # of the section
     loop: LoopConfig | None = None
     settings: MonteCarloConfig | None = None
     try:
@@ -206,29 +206,15 @@ def load_study(
     given = {name: entry.value for name, entry in entries.items()}
     varied = {name: given.pop(name) for name in entries if name.startswith(_VARY)}
     if loop is None:  # the number of events is unknown
-        varied = {
-            name: v
-            for name, v in varied.items()
-            if not name.startswith(f'{_VARY}events.')
-        }
+        varied = _without_events(varied)
     variations = tuple(_variations(varied, loop.plant if loop else PlantConfig(), own))
     try:
         settings = build(MonteCarloConfig, {**given, **(overrides or {})})
     except ConfigurationError as error:
         own += error.problems
     if loop and settings:
-        end = loop.plant.duration
-        settled = settings.settled_after
-        if end == 0.0:
-            own.append(
-                'sim_plant.duration: got 0 s, but every run must end: give its duration'
-            )
-        elif settled >= end:
-            own.append(f'settled_after: got {settled:g} s, but a run ends at {end:g} s')
-    for problem in own:
-        name = problem.split(':', 1)[0]
-        where = f'line {entries[name].line}: ' if name in entries else ''
-        problems.append(f'{_NODE}: {where}{problem}')
+        own += _problems_of_duration(loop.plant.duration, settings.settled_after)
+    problems += [_located(problem, entries) for problem in own]
     if loop and loop.plant.joints != loop.controller.joints:
         problems.append(
             f'joints: {PLANT} and {CONTROLLER} have them in different orders'
@@ -236,6 +222,29 @@ def load_study(
     if problems or loop is None or settings is None:
         raise ConfigurationError(problems, str(path))
     return Study(loop.controller, loop.plant, settings, variations)
+
+
+def _without_events(varied: Mapping[str, object]) -> dict[str, object]:
+    """Return the variations but those of events."""
+    events = f'{_VARY}events.'
+    return {
+        name: value for name, value in varied.items() if not name.startswith(events)
+    }
+
+
+def _problems_of_duration(duration: float, settled_after: float) -> Iterator[str]:
+    """Yield why runs of a duration [s] have no settled error after a time [s]."""
+    if duration == 0.0:
+        yield 'sim_plant.duration: got 0 s, but every run must end: give its duration'
+    elif settled_after >= duration:
+        yield f'settled_after: got {settled_after:g} s, but a run ends at {duration:g} s'
+
+
+def _located(problem: str, entries: Mapping[str, Entry]) -> str:
+    """Return a problem of the section with the line of its parameter, if it has one."""
+    name = problem.split(':', 1)[0]
+    where = f'line {entries[name].line}: ' if name in entries else ''
+    return f'{_NODE}: {where}{problem}'
 
 
 def _section(path: str | Path) -> dict[str, Entry]:
@@ -285,33 +294,43 @@ def draw(study: Study, run: int) -> dict[str, Drawn]:
 
 def plant_with(study: Study, drawn: Mapping[str, Drawn], law: str = '') -> PlantConfig:
     """Return the plant configuration of a run with the law of this prefix."""
+    changes = _drawn_by_group(study, drawn)
+    if 'initial' in changes:
+        changes['initial'] = _start(study, changes['initial'])
+    events = changes.get('events', {})
+    if 'gap' in events:
+        events['begin'] = tuple(np.cumsum(events.pop('gap')).tolist())
+    groups = {
+        group: replace(getattr(study.plant, group), **section)
+        for group, section in changes.items()
+    }
+    seed = int(drawn.get(f'{law}seed', drawn['seed']))
+    return replace(study.plant, seed=seed, **groups)
+
+
+def _drawn_by_group(
+    study: Study, drawn: Mapping[str, Drawn]
+) -> dict[str, dict[str, Any]]:
+    """Return the random values by group and field of the plant, lists as tuples."""
     changes: dict[str, dict[str, Any]] = {}
     for variation in study.variations:
         group, _, field = variation.name.partition('.')
         section = changes.setdefault(group, {})
         value = drawn[variation.column]
-        section[field] = (
-            value if variation.entry < 0 else (*section.get(field, ()), value)
-        )
-    relative = changes.pop('initial', {})
-    if relative:
-        qr, dqr, bound = study.origin
-        start = changes['initial'] = {}
-        if 'error' in relative:
-            start['position'] = tuple((qr + bound * relative['error']).tolist())
-        if 'velocity_error' in relative:
-            start['velocity'] = tuple((dqr + relative['velocity_error']).tolist())
-    if 'gap' in changes.get('events', {}):
-        changes['events']['begin'] = tuple(
-            np.cumsum(changes['events'].pop('gap')).tolist()
-        )
-    groups = {
-        group: replace(getattr(study.plant, group), **section)
-        for group, section in changes.items()
-    }
-    return replace(
-        study.plant, seed=int(drawn.get(f'{law}seed', drawn['seed'])), **groups
-    )
+        is_list = variation.entry >= 0
+        section[field] = (*section.get(field, ()), value) if is_list else value
+    return changes
+
+
+def _start(study: Study, relative: Mapping[str, Any]) -> dict[str, Any]:
+    """Return position [rad] and velocity [rad/s] by errors from the reference's start."""
+    qr, dqr, bound = study.origin
+    start = {}
+    if 'error' in relative:
+        start['position'] = tuple((qr + bound * relative['error']).tolist())
+    if 'velocity_error' in relative:
+        start['velocity'] = tuple((dqr + relative['velocity_error']).tolist())
+    return start
 
 
 _INVERSES: dict[str, Callable[..., Drawn]] = {

@@ -130,40 +130,55 @@ def _compare(study: Study, results: Columns, law: str, other: str = WITHOUT) -> 
     the bound without, with a largest error that is at least 1 % larger or smaller with
     it.
     """
-    laws = {law: 'with', other: 'without'}
-    kept, without = (results[f'{each}outcome'] == KEPT for each in laws)
-    settled, settled_without = (
-        _worst_of(study, results, 'settled_error_ratio', each)[without] for each in laws
-    )
-    factors = settled / settled_without
+    kept = results[f'{law}outcome'] == KEPT
+    without = results[f'{other}outcome'] == KEPT
+    settled = _worst_of(study, results, 'settled_error_ratio', law)
+    before = _worst_of(study, results, 'settled_error_ratio', other)
+    factors = settled[without] / before[without]
     above = np.flatnonzero(~(factors <= ALLOWED))
-    of = factors if factors.size else [np.nan]
-    quantiles = np.quantile(of, [*_FACTORS.values()], method='higher')
-    largest, before = (
-        _worst_of(study, results, 'max_error_ratio', each) for each in laws
-    )
-    near = (_NEAR[0] <= before) & (before <= _NEAR[1])
-    change = largest[near] / before[near]
+    worst_first = above[np.argsort(-factors[above])]
     return {
-        'near': {
-            'larger': int((change >= 1.01).sum()),
-            'smaller': int((change <= 0.99).sum()),
-        },
+        'near': _near_the_bound(study, results, law, other),
         'kept': {'with': int(kept.sum()), 'without': int(without.sum())},
         'broken_only_with': results['run'][without & ~kept].tolist(),
         'broken_only_without': results['run'][kept & ~without].tolist(),
-        'factor': dict(zip(_FACTORS, quantiles, strict=True)),
+        'factor': _factor_quantiles(factors),
         'allowed': 1.0 - above.size / max(1, factors.size),
-        'above': results['run'][without][above[np.argsort(-factors[above])]].tolist(),
+        'above': results['run'][without][worst_first].tolist(),
         'median': {
             name: {
-                label: float(np.median(known)) if known.size else np.nan
-                for each, label in laws.items()
-                for known in [_known(study, results, name, each, other)]
+                'with': _median(_known(study, results, name, law, other)),
+                'without': _median(_known(study, results, name, other, other)),
             }
             for name in ('rms_error_rad', 'torque_error.end')
         },
     }
+
+
+def _near_the_bound(
+    study: Study, results: Columns, law: str, other: str
+) -> dict[str, int]:
+    """Count the runs near the bound without, whose error is larger or smaller with."""
+    largest = _worst_of(study, results, 'max_error_ratio', law)
+    before = _worst_of(study, results, 'max_error_ratio', other)
+    near = (_NEAR[0] <= before) & (before <= _NEAR[1])
+    change = largest[near] / before[near]
+    return {
+        'larger': int((change >= 1.01).sum()),
+        'smaller': int((change <= 0.99).sum()),
+    }
+
+
+def _factor_quantiles(factors: Floats) -> dict[str, float]:
+    """Return the quantiles of `_FACTORS`; NaN without a factor."""
+    of = factors if factors.size else [np.nan]
+    quantiles = np.quantile(of, [*_FACTORS.values()], method='higher')
+    return dict(zip(_FACTORS, quantiles, strict=True))
+
+
+def _median(values: Floats) -> float:
+    """Return the median; NaN without a value."""
+    return float(np.median(values)) if values.size else np.nan
 
 
 def _worst_of(study: Study, results: Columns, name: str, law: str = '') -> Floats:
@@ -190,15 +205,9 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
     kept = pairs['kept']
     factor = pairs['factor']
     noise = pairs['noise']
-    broken, noisy = (
-        [len(each[f'broken_only_{law}']) for law in _LAWS.values()]
-        for each in (pairs, noise)
-    )
+    broken = _broken_only(pairs)
+    noisy = _broken_only(noise)
     interval = _interval(broken[0], max(1, kept['without']), 'exact')
-    rms, model = (
-        ' / '.join(f'{unit * value:.3g}' for value in pairs['median'][name].values())
-        for name, unit in (('rms_error_rad', 1e3), ('torque_error.end', 1e2))
-    )
     return {
         'bound kept with learning / without': f'{kept["with"]} / {kept["without"]}',
         'broken only with / only without': f'{broken[0]} / {broken[1]}',
@@ -215,9 +224,22 @@ def _pair_figures(pairs: Summary) -> dict[str, str]:
         'factor: median, 99.9 %, largest': ', '.join(
             f'{factor[name]:.2f}' for name in ('median', 'p99.9', 'max')
         ),
-        'rms error with / without [mrad]': rms,
-        'torque error on the next motion with / without [%]': model,
+        'rms error with / without [mrad]': _medians(pairs, 'rms_error_rad', 1e3),
+        'torque error on the next motion with / without [%]': _medians(
+            pairs, 'torque_error.end', 1e2
+        ),
     }
+
+
+def _broken_only(pairs: Summary) -> list[int]:
+    """Return how many runs break the bound only with learning, and only without."""
+    return [len(pairs[f'broken_only_{law}']) for law in _LAWS.values()]
+
+
+def _medians(pairs: Summary, name: str, factor: float) -> str:
+    """Return the medians of a figure with and without learning, times a factor."""
+    values = pairs['median'][name].values()
+    return ' / '.join(f'{factor * value:.3g}' for value in values)
 
 
 def format_report(summary: Summary, folder: Path) -> str:
@@ -252,7 +274,7 @@ def _against_none(still: Summary) -> str:
     with_, without = (
         '-' if each is None else f'{1e3 * each:.3g}' for each in rms.values()
     )
-    broken = [len(still[f'broken_only_{law}']) for law in _LAWS.values()]
+    broken = _broken_only(still)
     return (
         'with learning / with neither learning nor adaptation: bound kept '
         f'{kept["with"]} / {kept["without"]}, broken only {broken[0]} / {broken[1]}, '

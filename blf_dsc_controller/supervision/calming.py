@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said and done about an arm that oscillates: softer feedback, then a stop.
+"""The reaction to an arm that oscillates: softer feedback, then a stop.
 
 The rates of the feedback are halved, which is what half of `feedback.stiffness` would
 be, and once more if the arm still oscillates a while later.  If that does not help
@@ -96,7 +96,7 @@ class Calming:
         self.configure(config)
 
     def configure(self, config: ControllerConfig) -> None:
-        """Take note that the law has the gains of a configuration."""
+        """Begin again with the gains of a configuration, which the law has now."""
         self._config = config
         self.share = 1.0
         self._reported = -inf  # s
@@ -104,7 +104,7 @@ class Calming:
     def react(self, t: float) -> bool:
         """React to an oscillation that the law reports at t [s]; return False to stop.
 
-        `last` and `count` change if there is anything to tell.
+        `last` and `count` change if the event is to be recorded.
         """
         reaction = self._config.safety.oscillation
         joints = range(self._state.waves.size)

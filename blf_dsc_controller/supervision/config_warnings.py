@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -25,6 +26,8 @@ from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.supervision.gear_warnings import gear_warnings
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.retuning import settings_in_loop
+
+Floats = NDArray[np.float64]
 
 _MARGIN = 1.25  # recommended torque limit over what the reference needs
 _FIRST_ERROR = 1.5  # recommended bound over the first error
@@ -138,24 +141,9 @@ def worsened(
 
 def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     """Check for implausible figures, and for defaults that are hardly meant."""
-    robot = config.robot
-    chain = robot.chain(config.joints)
-    if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
-        largest = max(joint.effort for joint in chain.joints)
-        yield (
-            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} looks like '
-            'a placeholder on an arm of this weight. The assumed inertia of the drives and '
-            'learning.residual_floor follow from the weight instead: give the rated torques'
-        )
-    if (joints := implausible_friction(robot, chain)) and not (
-        robot.viscous and robot.coulomb
-    ):
-        yield (
-            'robot.coulomb: the friction in the description takes a quarter of the effort of '
-            f'{", ".join(joints)} or more, which looks like a placeholder. Friction is not '
-            'compensated until it is learned: give robot.viscous and robot.coulomb'
-        )
-    if chain.gripper and not robot.tip:
+    yield from _of_placeholders(config)
+    chain = config.robot.chain(config.joints)
+    if chain.gripper and not config.robot.tip:
         yield (
             f'robot.tip: without it, {chain.gripper}, which slides at the end of a turning arm, '
             'is one of the joints of the arm. If it is a gripper, give the link that carries it: '
@@ -176,51 +164,99 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
             )
 
 
+def _of_placeholders(config: ControllerConfig) -> Iterator[str]:
+    """Check for efforts and friction that look like placeholders."""
+    robot = config.robot
+    chain = robot.chain(config.joints)
+    if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
+        largest = max(joint.effort for joint in chain.joints)
+        yield (
+            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} looks like '
+            'a placeholder on an arm of this weight. The assumed inertia of the drives and '
+            'learning.residual_floor follow from the weight instead: give the rated torques'
+        )
+    if (joints := implausible_friction(robot, chain)) and not (
+        robot.viscous and robot.coulomb
+    ):
+        yield (
+            'robot.coulomb: the friction in the description takes a quarter of the effort of '
+            f'{", ".join(joints)} or more, which looks like a placeholder. Friction is not '
+            'compensated until it is learned: give robot.viscous and robot.coulomb'
+        )
+
+
 def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     """Check that the errors to expect are within the bound."""
-    bound = settings.barrier.bound
-    T = config.sample_time
-    robot = config.robot
-    of_tool = ''
-    if config.barrier.bounds_tool:
-        of_tool = POSITION if config.barrier.tool_bound > 0.0 else ANGLE
     errors = expected_errors(config, settings)
-    worst = int(np.argmax(errors.unmodelled / bound))
-    if errors.unmodelled[worst] > bound[worst]:
-        least = f'give more than {bound[worst]:g} rad'
-        if of_tool:
-            wider = float(errors.unmodelled[worst] / bound[worst])
-            least = (
-                f'past its joint bound of {bound[worst]:g} rad; give more than {wider:.2g} times '
-                'this bound at the tool'
-            )
-        yield (
-            f'{of_tool or "barrier.bound"}: friction and unmodelled torque '
-            f'(learning.residual_floor) alone are expected to move {config.joints[worst]} '
-            f'{errors.unmodelled[worst]:.2g} rad from its reference: {least}'
+    yield from _of_unmodelled(config, settings.barrier.bound, errors.unmodelled)
+    yield from _of_pick_up(config, settings.barrier.bound, errors.pick_up)
+
+
+def _tool_parameter(config: ControllerConfig) -> str:
+    """Return the parameter by which the error at the tool is bounded; empty if it is not."""
+    if not config.barrier.bounds_tool:
+        return ''
+    return POSITION if config.barrier.tool_bound > 0.0 else ANGLE
+
+
+def _of_unmodelled(
+    config: ControllerConfig, bound: Floats, errors: Floats
+) -> Iterator[str]:
+    """Check the errors (n,) [rad] by friction and unmodelled torque."""
+    worst = int(np.argmax(errors / bound))
+    if not errors[worst] > bound[worst]:
+        return
+    parameter = 'barrier.bound'
+    remedy = f'give more than {bound[worst]:g} rad'
+    if of_tool := _tool_parameter(config):
+        parameter = of_tool
+        wider = float(errors[worst] / bound[worst])
+        remedy = (
+            f'past its joint bound of {bound[worst]:g} rad; give more than {wider:.2g} times '
+            'this bound at the tool'
         )
-    worst = int(np.argmax(errors.pick_up / bound))
-    peak = errors.pick_up[worst]
-    if peak > bound[worst]:
-        share = bound[worst] / peak
-        faster = loop_delay(T, robot.lag) * math.sqrt(share) - robot.lag
-        remedy = f'a robot.lag below {robot.lag:g} s'
-        stiffer = config.feedback.stiffness / share**_STIFFENING
-        if config.feedback.inertia == 'none':
-            remedy = 'a larger feedback.stiffness, if the arm bears it'
-        elif stiffer <= 1.0:
-            remedy = f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'
-        elif faster > 0.0:
-            remedy = f'a sample time of {faster / SAMPLES:.2g} s'
-        holding = f'{1.1 * peak:.2g} rad'
-        if of_tool:
-            holding = f'{1.1 / share:.2g} times this bound at the tool'
-        yield (
-            f'{of_tool or "barrier.bound"}: when {robot.payload:g} kg (robot.payload) are picked '
-            f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} rad from its '
-            f'reference, past its bound of {bound[worst]:g} rad: give {holding}, or '
-            f'{remedy}, or pick up at most {share * robot.payload:.2g} kg'
-        )
+    yield (
+        f'{parameter}: friction and unmodelled torque '
+        f'(learning.residual_floor) alone are expected to move {config.joints[worst]} '
+        f'{errors[worst]:.2g} rad from its reference: {remedy}'
+    )
+
+
+def _of_pick_up(
+    config: ControllerConfig, bound: Floats, errors: Floats
+) -> Iterator[str]:
+    """Check the errors (n,) [rad] when a load is picked up in motion."""
+    worst = int(np.argmax(errors / bound))
+    peak = errors[worst]
+    if not peak > bound[worst]:
+        return
+    share = bound[worst] / peak
+    parameter = 'barrier.bound'
+    wide_enough = f'{1.1 * peak:.2g} rad'
+    if of_tool := _tool_parameter(config):
+        parameter = of_tool
+        wide_enough = f'{1.1 / share:.2g} times this bound at the tool'
+    payload = config.robot.payload
+    yield (
+        f'{parameter}: when {payload:g} kg (robot.payload) are picked '
+        f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} rad from its '
+        f'reference, past its bound of {bound[worst]:g} rad: give {wide_enough}, or '
+        f'{_remedy_of_pick_up(config, share)}, or pick up at most {share * payload:.2g} kg'
+    )
+
+
+def _remedy_of_pick_up(config: ControllerConfig, share: float) -> str:
+    """Return by what the error of a pick-up gets to this share of what it is."""
+    lag = config.robot.lag
+    if config.feedback.inertia == 'none':
+        return 'a larger feedback.stiffness, if the arm bears it'
+    stiffer = config.feedback.stiffness / share**_STIFFENING
+    if stiffer <= 1.0:
+        return f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'
+    faster = loop_delay(config.sample_time, lag) * math.sqrt(share) - lag
+    if faster > 0.0:
+        return f'a sample time of {faster / SAMPLES:.2g} s'
+    return f'a robot.lag below {lag:g} s'
 
 
 def _of_first_error(
@@ -258,9 +294,18 @@ def _of_gains(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
 def _limits_of_gains(
     config: ControllerConfig, load: ReferenceLoad
 ) -> Iterator[Finding]:
+    """Yield what the gains and torque limits use of their limits; above 1 is too much."""
     settings = settings_in_loop(config)
-    T = config.sample_time
-    damping = np.maximum(load.damping(settings), 1e-12)
+    yield from _limits_of_torque(config, load)
+    yield from _limits_of_feedback(config, settings, load)
+    if settings.has_barrier == 1:
+        yield from _limits_of_surface(config, settings)
+        yield from _limits_of_slope(config, settings, load)
+
+
+def _limits_of_torque(
+    config: ControllerConfig, load: ReferenceLoad
+) -> Iterator[Finding]:
     for joint, need, limit in zip(
         config.joints, load.torque, config.torque.limit, strict=True
     ):
@@ -270,6 +315,12 @@ def _limits_of_gains(
             f'has {limit:g} N m, but with learning.initial_estimate the reference alone needs '
             f'{need:.3g} N m: give a quarter more than that',
         )
+
+
+def _limits_of_feedback(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
+) -> Iterator[Finding]:
+    T = config.sample_time
     rate = load.rate(settings)
     yield Finding(
         'feedback.gain: K_p over the inertia',
@@ -278,16 +329,24 @@ def _limits_of_gains(
         'sample_time. Above 1 the loop has little margin for delays, above 2 it chatters between '
         'the limits: lower feedback.gain or sample_time',
     )
-    absorbed = float(np.max(settings.disturbance.gain * T / damping))
+    absorbed = float(np.max(settings.disturbance.gain * T / _damping(settings, load)))
     yield Finding(
         'disturbance.gain: in each sample the disturbance estimate absorbs',
         2.0 * absorbed,
         f'{absorbed:.2g} of the velocity feedback. Above a half it oscillates against '
         'feedback.gain: lower disturbance.gain',
     )
-    if settings.has_barrier == 0:
-        return
-    filtering = config.surface.time_constant
+
+
+def _damping(settings: Settings, load: ReferenceLoad) -> Floats:
+    """Return the damping (n,) [N m s/rad] of the feedback, above zero."""
+    return np.asarray(np.maximum(load.damping(settings), 1e-12))
+
+
+def _limits_of_surface(
+    config: ControllerConfig, settings: Settings
+) -> Iterator[Finding]:
+    T, filtering = config.sample_time, config.surface.time_constant
     yield Finding(
         'surface.time_constant:',
         T / filtering,
@@ -302,9 +361,14 @@ def _limits_of_gains(
             f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
             f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
         )
-    for joint, ratio in zip(
-        config.joints, settings.barrier.slope_limit * T / damping, strict=True
-    ):
+
+
+def _limits_of_slope(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
+) -> Iterator[Finding]:
+    T, damping = config.sample_time, _damping(settings, load)
+    ratios = settings.barrier.slope_limit * T / damping
+    for joint, ratio in zip(config.joints, ratios, strict=True):
         yield Finding(
             f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
             ratio / 2.0,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What touches an arm: in words, and whether the arm holds since."""
+"""Contacts of an arm: sentences about them, and whether the arm holds after one."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers of messages."""
+"""Numbers in sentences: with two digits and never an exponent, so 120 and not 1.2e+02."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declare a weighed load to the drives, so that no joint torque steps.
 
-Drives that compensate gravity only know the load that is declared to them.  A law that
+Drives that compensate gravity only count the load that is declared to them.  A law that
 has weighed it can declare it.  They then add its weight, and the command is reduced by
 it,
 
@@ -33,7 +33,7 @@ from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 Vector = NDArray[np.float64]
 
-_NARROW = 0.05  # kg, half of the interval of a mass that is told
+_NARROW = 0.05  # kg, half of the interval of a mass that is declared
 _SHARE = 0.05  # or this part of the mass
 _CENTRE = 0.03  # m, likewise of its centre
 _STEP = 0.005  # of the torque limit
@@ -63,27 +63,27 @@ class DriveLoad(NamedTuple):
 
 
 class DriveLoads:
-    """What the drives of an arm are told.
+    """The load that is declared to the drives of an arm, step by step.
 
     Attributes:
-        declared: what they had at the start, `robot.drive_payload`.
-        base: what they had when the law began to learn: at the start, or at a reset.
-        told: what they have now.
-        wanted: what a user declares, whatever is weighed; None: nothing.
+        declared: the load at the start, `robot.drive_payload`.
+        base: the load when the law began to learn: at the start, or at a reset.
+        in_force: the load that the drives have accepted last.
+        wanted: the load that a user declares, whatever is weighed; None: none.
     """
 
     def __init__(self, config: ControllerConfig) -> None:
         robot = config.robot
         self.declared = DriveLoad(robot.drive_payload, robot.drive_payload_centre)
-        self.told = self.base = self.declared
+        self.in_force = self.base = self.declared
         self.wanted: DriveLoad | None = None
         self._robot = robot
         self._chain = robot.chain(config.joints)
-        self._goes_on = False  # not all of a load has been told
+        self._goes_on = False  # a load has been declared in part
 
     def take(self, controller: Controller, load: DriveLoad) -> None:
-        """Let the law know that the drives add the weight of this load from now on."""
-        self.told = load
+        """Count the weight of this load, which the drives add from now on, in the law."""
+        self.in_force = load
         settings = controller.settings
         settings.torque.drive_inertias[:] = self._added()
         # the last command met the drives with this load already
@@ -93,10 +93,10 @@ class DriveLoads:
     def forget(self, controller: Controller) -> None:
         """Begin again with a law that has forgotten what the tip holds.
 
-        It is held by what the drives have been told: both are left out of account.  Joint
-        torque sensors show both, so that the load observer is off from then on.
+        The drives hold it by the load in force: the law counts neither.  Joint torque
+        sensors show both, so the load observer is off from then on.
         """
-        self.base = self.told
+        self.base = self.in_force
         self._goes_on = False
         controller.settings.torque.drive_inertias[:] = self._added()
         is_left_out = not np.allclose(self.base.moments, self.declared.moments)
@@ -106,7 +106,7 @@ class DriveLoads:
     def next(self, controller: Controller) -> DriveLoad | None:
         """Return the load to declare next; None if there is none, or too uncertain.
 
-        Nothing is told while something touches the arm.
+        Nothing is declared while something touches the arm.
         """
         target = self._weighed(controller) if self.wanted is None else self._left()
         if target is None or is_touched(controller.state.contact):
@@ -117,21 +117,25 @@ class DriveLoads:
         )
         q = controller.signals.q[np.newaxis]
         (H,) = regressors_at(chain, q, *np.zeros((3, 1, settings.n)))
-        change = H @ (self._columns(DriveLoad.of(target)) - self._columns(self.told))
+        change = H @ (
+            self._columns(DriveLoad.of(target)) - self._columns(self.in_force)
+        )
         largest = float((np.abs(change) / (_STEP * settings.torque.limit)).max())
         part = min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
-        moments = self.told.moments
+        moments = self.in_force.moments
         self._goes_on = part < 1.0
         return DriveLoad.of(moments + part * (target - moments))
 
     def _left(self) -> Vector | None:
         """Return mass and moments (4,) that a user declares; None: the drives have them."""
-        if self.wanted is None or np.allclose(self.told.moments, self.wanted.moments):
+        if self.wanted is None or np.allclose(
+            self.in_force.moments, self.wanted.moments
+        ):
             return None
         return self.wanted.moments
 
     @property
-    def is_told(self) -> bool:
+    def is_declared(self) -> bool:
         """Whether the drives have what a user declares, if anything."""
         return self._left() is None
 
@@ -150,14 +154,14 @@ class DriveLoads:
             picked_up[:] = load[MASS] * np.array((1.0, *load[MASS + 1 : DEVIATION]))
         target = self.base.moments + picked_up
         target = np.asarray(DriveLoad.of(target).moments)
-        is_new = abs(target[0] - self.told.mass) > narrow
+        is_new = abs(target[0] - self.in_force.mass) > narrow
         return target if is_new or self._goes_on else None
 
     def _added(self) -> Vector:
         """Return the factors of the columns of the drives' gravity, for the law."""
         if self.base is self.declared:
-            return self._columns(self.told)
-        since = self._columns(self.told) - self._columns(self.base)
+            return self._columns(self.in_force)
+        since = self._columns(self.in_force) - self._columns(self.base)
         return self._columns(self.declared) + since
 
     def _columns(self, load: DriveLoad) -> Vector:

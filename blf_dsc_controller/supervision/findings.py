@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the law finds in its arm, and what follows: contacts, oscillations, wrong sensors."""
+"""Reactions to what the law detects: contacts, oscillations, wrong sensors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 
 
 class Findings:
-    """What the law of one arm has found.
+    """Reacts to what the law of one arm has detected.
 
     Attributes:
         contacts: what has touched the arm.
@@ -40,7 +40,7 @@ class Findings:
         self.contacts.hold = False
 
     def check_efforts(self) -> None:
-        """Tell that efforts are not those of joint torque sensors, when the law finds it."""
+        """Record that efforts are not those of joint torque sensors, when the law finds it."""
         command, joints = self._command, self._command.config.joints
         if not command.controller.flags & NOT_SENSORS:
             return
@@ -67,7 +67,7 @@ class Findings:
         return None
 
     def react_to_contact(self) -> None:
-        """Do what `contact.reaction` wants when something touches the arm."""
+        """React to a contact, as `contact.reaction` says."""
         command = self._command
         reaction = command.config.contact.reaction
         stamp = command.reference.last_stamp

@@ -52,20 +52,13 @@ def check_first_torque(
     if config.robot.urdf and acting is None:
         gravity = model_torque(controller.settings, controller.state.estimate, q)
         _check_gravity(config, dq, effort, gravity, torque)
-    step = np.array(config.torque.first_step)
     # Of an effort that only contains commands, a torque is held that this one replaces.
     held = effort if config.robot.effort == 'commanded' else np.zeros_like(q)
     if acting is not None:
         held = acting
-    excess = np.where(step > 0.0, np.abs(torque - held) - step, 0.0)
-    worst = int(np.argmax(excess))
-    if excess[worst] <= 0.0:
+    text = _too_large_step(config, torque, held)
+    if not text:
         return
-    text = (
-        f'the first torque would step to {torque[worst]:.4g} N m on joint '
-        f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
-        '(torque.first_step)'
-    )
     if is_like(torque, gravity):
         text += (
             ': this is the gravity of the URDF. If the drives compensate it themselves, set '
@@ -79,6 +72,23 @@ def check_first_torque(
             'rad/s: start again when it rests'
         )
     raise StartError(text)
+
+
+def _too_large_step(config: ControllerConfig, torque: Vector, held: Vector) -> str:
+    """Return which joint steps most from the `held` torque (n,) [N m]; empty if none by too much.
+
+    `torque` (n,) [N m] is the first one, which replaces it.
+    """
+    step = np.array(config.torque.first_step)
+    excess = np.where(step > 0.0, np.abs(torque - held) - step, 0.0)
+    worst = int(np.argmax(excess))
+    if excess[worst] <= 0.0:
+        return ''
+    return (
+        f'the first torque would step to {torque[worst]:.4g} N m on joint '
+        f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
+        '(torque.first_step)'
+    )
 
 
 def is_like(torque: Vector, gravity: Vector) -> bool:
@@ -102,35 +112,57 @@ def _check_gravity(
     matters = np.abs(gravity[worst]) > MATTERS * config.torque.limit[worst]
     if not (matters and np.abs(dq).max() <= AT_REST and np.isfinite(effort).all()):
         return
-    compensates = config.robot.drive_compensates
+    if config.robot.drive_compensates == 'none':
+        _check_not_twice(config, effort, gravity, torque)
+    else:
+        _check_compensated(config, effort, gravity, torque)
+
+
+def _check_not_twice(
+    config: ControllerConfig, effort: Vector, gravity: Vector, torque: Vector
+) -> None:
+    """Raise StartError if an arm rests by efforts (n,) [N m] before any command.
+
+    A joint torque sensor shows the weight of the arm, whatever holds it.
+    """
+    robot = config.robot
+    shows_drives = robot.effort != 'commanded' and not robot.torque_loop
+    if not (shows_drives and is_like(effort, gravity)):
+        return
+    worst = int(np.argmax(np.abs(gravity)))
     joint = config.joints[worst]
-    holds = is_like(effort, gravity)
+    raise StartError(
+        f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
+        f'but the joint already rests with an effort of {effort[worst]:.4g} N m, before any '
+        'command. If the drives compensate gravity, set robot.drive_compensates to gravity. '
+        'If a torque of another or an earlier controller holds the arm, set robot.effort to '
+        f'commanded (if efforts contain only commands), or {_SEND}{_DRIVER}'
+    )
+
+
+def _check_compensated(
+    config: ControllerConfig, effort: Vector, gravity: Vector, torque: Vector
+) -> None:
+    """Raise StartError if efforts (n,) [N m] do not show the drives that compensate gravity."""
+    worst = int(np.argmax(np.abs(gravity)))
+    joint = config.joints[worst]
     is_commanded = config.robot.effort == 'commanded'
-    if compensates == 'none':
-        # A joint torque sensor shows the weight of the arm, whatever holds it.
-        if not holds or is_commanded or config.robot.torque_loop:
-            return
-        raise StartError(
-            f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
-            f'but the joint already rests with an effort of {effort[worst]:.4g} N m, before any '
-            'command. If the drives compensate gravity, set robot.drive_compensates to gravity. '
-            'If a torque of another or an earlier controller holds the arm, set robot.effort to '
-            f'commanded (if efforts contain only commands), or {_SEND}{_DRIVER}'
-        )
-    # The load observer needs whole efforts.
-    observes = config.disturbance.observer_bandwidth > 0.0
-    off = ' and disturbance.observer_bandwidth to 0' if observes else ''
-    no_gravity = f'no gravity: robot.drive_compensates is {compensates}, but joint {joint!r} rests'
-    if is_commanded and holds:
+    no_gravity = (
+        f'no gravity: robot.drive_compensates is {config.robot.drive_compensates}, but joint '
+        f'{joint!r} rests'
+    )
+    if is_commanded and is_like(effort, gravity):
         raise StartError(
             f'{no_gravity} with a commanded effort of {effort[worst]:.4g} N m, where none should '
             'be needed. If the drives compensate nothing, set robot.drive_compensates to none. If '
             'the effort contains what the drives add, set robot.effort to whole. If a torque of '
             f'another controller holds the arm, set {_SEND}{_DRIVER}'
         )
-    if not is_commanded and np.linalg.norm(effort) <= _NOTICED * np.linalg.norm(
-        gravity
-    ):
+    noticed = _NOTICED * np.linalg.norm(gravity)
+    if not is_commanded and np.linalg.norm(effort) <= noticed:
+        # The load observer needs whole efforts.
+        observes = config.disturbance.observer_bandwidth > 0.0
+        off = ' and disturbance.observer_bandwidth to 0' if observes else ''
         raise StartError(
             f'{no_gravity} with an effort of {effort[worst]:.4g} N m where the drives should hold '
             f'{gravity[worst]:.4g} N m. The first torque, {torque[worst]:.4g} N m, would drop the '

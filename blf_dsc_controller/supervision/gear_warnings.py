@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings on gains that gears may not bear: of unknown ones, and of those that are stated."""
+"""Warnings about gains that are too high for the gears, known ones or unknown ones."""
 
 from __future__ import annotations
 

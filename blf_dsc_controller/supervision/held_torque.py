@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds an arm where its law stops: the command that acts, and the load besides the model.
+"""The torque that holds an arm where its law stops, and the load besides the model.
 
 Both follow from the motion before.  After a gap, in which others may have commanded the
-arm, they follow from its efforts, whoever has sent what acts.
+arm, they follow from its efforts.
 """
 
 from __future__ import annotations

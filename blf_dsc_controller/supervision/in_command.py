@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who commands an arm: its law, the safe torque, or nobody; and how the law leaves command.
+"""The law in command of an arm, or the safe torque in its place; how the law leaves command.
 
-`Supervisor` has the phase, `Readings` stamps, turns and velocities, `RunningReference`
-what is followed and the time, `HeldTorque` what holds the arm, `SafeTorque` and
-`SafeStop` what it gets without the law.
+`Supervisor` holds the phase, `Readings` reads joint states, `RunningReference` holds the
+reference and the time of the law.  `HeldTorque` finds the torque that holds the arm, from
+which `SafeStop` and `SafeTorque` compute the torque without the law.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MANY = 0.5  # states missed for each that came
 
 
 class InCommand:
-    """The law of an arm, the safe torque in its place, and which of them is in command.
+    """The law of an arm, the safe torque in its place, and which of the two is in command.
 
     Attributes:
         config: configuration in force.
@@ -47,12 +47,12 @@ class InCommand:
         states, samples: the checks before and after the law.
         watchdog: the check for missing states.
         journal: events, and counts of what has been processed so far.
-        calming: what oscillates, and how much softer the feedback is since.
+        calming: the last oscillation, and by how much it has softened the feedback.
         readings: stamps, turns and velocities of the joint states.
-        reference: what is followed, and the time of the law.
+        reference: the reference in force, and the time of the law.
         safe_torque: the ramp to the safe torque, and the last usable joint state.
-        held: what holds the arm, by its last motion.
-        safe_stop: what the arm gets while the law is not in command.
+        held: the torque that holds the arm, by its last motion.
+        safe_stop: computes the torque while the law is not in command.
         has_sample: whether the law used the last message, so that there is new telemetry.
         silenced: whether nothing is commanded until the next reset or activation.
         clean: whether the window of the law holds valid samples only.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to say before a robot moves with gains that were not found by measuring it."""
+"""The warning before a robot moves with gains that were not found by measuring it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said of an arm whose efforts are not the torques of joint sensors."""
+"""The message about efforts that are not the torques of joint sensors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fault_of(controller: Controller) -> int:
 
 
 def is_off(controller: Controller) -> bool:
-    """Whether efforts do not even follow the commands, so that they tell nothing about them."""
+    """Whether efforts do not even follow the commands, so that they show nothing about them."""
     return fault_of(controller) == OFF
 
 

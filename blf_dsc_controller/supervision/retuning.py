@@ -23,6 +23,7 @@ from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.blf_dsc import shift_surface
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.state import Settings
 
 Floats = NDArray[np.float64]
 
@@ -68,23 +69,33 @@ def problems(
     controller: Controller, config: ControllerConfig, t: float
 ) -> Iterator[str]:
     """Yield why a running law cannot accept a valid configuration at t [s]."""
-    state = controller.state
-    p = controller.settings.p
-    learning = config.learning
-    errors = np.abs(controller.sample.xi1)
-    torques = np.abs(controller.sample.torque)
     settings = settings_in_loop(config)
-    barrier.update_bound(
-        settings.barrier, controller.signals.barrier, t, controller.signals.bound
-    )
-    for joint, error, bound in zip(
-        config.joints, errors, controller.signals.bound, strict=True
-    ):
+    yield from _outside_bound(controller, config, settings, t)
+    yield from _above_torque_limit(controller, config)
+    yield from _outside_radius(controller, config)
+    yield from _diverging_update(controller, config, settings)
+
+
+def _outside_bound(
+    controller: Controller, config: ControllerConfig, settings: Settings, t: float
+) -> Iterator[str]:
+    """Yield which joints the bound of a configuration leaves outside at t [s]."""
+    signals = controller.signals
+    barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
+    errors = np.abs(controller.sample.xi1)
+    for joint, error, bound in zip(config.joints, errors, signals.bound, strict=True):
         if not error < bound:
             yield (
                 f'barrier.bound: {joint} is {error:.6g} rad from its reference now, outside of a '
                 f'bound of {bound:g} rad: choose a wider one, or try again with a smaller error'
             )
+
+
+def _above_torque_limit(
+    controller: Controller, config: ControllerConfig
+) -> Iterator[str]:
+    """Yield which joints are held by more than their limit."""
+    torques = np.abs(controller.sample.torque)
     for joint, torque, limit in zip(
         config.joints, torques, config.torque.limit, strict=True
     ):
@@ -93,22 +104,34 @@ def problems(
                 f'torque.limit: {joint} is held with {torque:.4g} N m now, more than a limit of '
                 f'{limit:g} N m: choose a higher one'
             )
-    norm = float(np.linalg.norm(state.estimate[:p]))
-    if norm > _ROUNDED * learning.radius:
+
+
+def _outside_radius(controller: Controller, config: ControllerConfig) -> Iterator[str]:
+    """Yield how far the estimate is outside the radius of the projection, if it is."""
+    radius = config.learning.radius
+    norm = float(np.linalg.norm(controller.state.estimate[: controller.settings.p]))
+    if norm > _ROUNDED * radius:
         yield (
             f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
-            f'radius of {learning.radius:g} kg m^2: choose a larger one'
+            f'radius of {radius:g} kg m^2: choose a larger one'
         )
+
+
+def _diverging_update(
+    controller: Controller, config: ControllerConfig, settings: Settings
+) -> Iterator[str]:
+    """Yield how much each step of the learned estimates overshoots, if they diverge."""
+    latch, adaptation = controller.state.latch, settings.adaptation
     step, stretch = 'Newton step', 1.0
-    if settings.adaptation.update != NEWTON:
-        step, stretch = 'gradient step', float(np.linalg.norm(state.latch.Phi, 2))
+    if adaptation.update != NEWTON:
+        step, stretch = 'gradient step', float(np.linalg.norm(latch.Phi, 2))
     share = (
-        learning.weight
-        * float(settings.adaptation.adaptation_gain.max())
+        config.learning.weight
+        * float(adaptation.adaptation_gain.max())
         * stretch
         * config.sample_time
     )
-    if state.latch.latched[0] and share >= _STABLE:
+    if latch.latched[0] and share >= _STABLE:
         yield (
             f'learning.weight: the {step} of each sample would correct the '
             f'estimates by {share:.3g} times their error, which diverges at {_STABLE:g} or more: '

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a law comes into command: activation and reset, the first state, the return after a gap."""
+"""How a law takes command: activation, reset, the first state, and the return after a gap."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import MotionError
+from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.support import check_support
 from blf_dsc_controller.supervision.takeover import Takeover
-from blf_dsc_controller.supervision.told_loads import ToldLoads
 
 Vector = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Starting:
     """
 
     def __init__(
-        self, command: InCommand, findings: Findings, loads: ToldLoads
+        self, command: InCommand, findings: Findings, loads: DeclaredLoads
     ) -> None:
         """Bring the law of `command` into command, without earlier findings."""
         self.error: BlfDscError | None = None
@@ -54,7 +54,7 @@ class Starting:
     def reset(self) -> None:
         """Discard all estimates and faults, and restart with the next state.
 
-        The law goes on to carry what it carries besides the model, or the safe torque does.
+        What law or safe torque carries besides the model is carried on.
         """
         command = self._command
         command.note(EventType.RESET)
@@ -70,7 +70,7 @@ class Starting:
             command.safe_stop.begin_anew(command.config.safety, load)
 
     def _added_by_drives(self) -> Vector:
-        """Return what the law believes the drives to add (n,) [N m], where the arm was last."""
+        """Return the torque (n,) [N m] of the drives at the last state, by the model."""
         command = self._command
         settings = command.controller.settings
         return added_torque(settings.torque, command.safe_torque.last.q)
@@ -91,7 +91,7 @@ class Starting:
         return None if load is None else load - forgotten
 
     def forget_load_after_gap(self, stamp: int, measurement: Vector) -> None:
-        """Carry nothing on in a state that does not follow the last one: others may hold it."""
+        """Drop the carried load after a gap, in which another controller may hold the arm."""
         command = self._command
         fastest, period = (
             command.config.safety.velocity_limit,
@@ -118,8 +118,8 @@ class Starting:
     def take_over_from(self, torque: Vector) -> None:
         """Start from a torque (n,) [N m] by which another node holds the arm.
 
-        The watchdog does so after a controller has died.  The first torque continues this
-        one, and what it carries besides the model is held from the start.
+        The watchdog holds it so after a controller has ended.  The first torque continues
+        this one, and the law carries from the start what it holds besides the model.
         """
         self._command.note(EventType.TAKEOVER, torque=torque.tolist())
         self._takeover.acting = torque.copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm that leaves its bound, or seems unmoved by its commands, suffers from.
+"""The cause of a stop, where an arm left its bound or did not follow its commands.
 
 An oscillation, a torque that only repeats the noise of a sensor, a torque at its limit,
 or feedback that has been softened: whichever it is, its remedy is another than that of

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller is doing, and why it stops."""
+"""The phase of the controller, and the reason of its last stop."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said of joints that swing under the damping of a stop."""
+"""The message about joints that swing under the damping of a stop."""
 
 from __future__ import annotations
 

@@ -236,19 +236,11 @@ def _links_of(chain: Chain, ways: Floats) -> Links:
     slide = np.zeros((n, 3))
     for i, joint in enumerate(joints):
         R = joint.placement[:3, :3]
-        if not revolute[i]:
+        if revolute[i]:
+            rotation[i] = [product(R, part) for part in _rotation_parts(joint.axis)]
+        else:
             rotation[i, 0] = R
             slide[i] = product(R, joint.axis[:, np.newaxis])[:, 0]
-            continue
-        along = np.outer(joint.axis, joint.axis)
-        turned = np.cross(np.eye(3), joint.axis)
-        parts = along, np.eye(3) - along, turned
-        rotation[i] = [product(R, part) for part in parts]
-    curvature = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i, n):
-            later = ways[j] if revolute[j] else float(j > i)
-            curvature[i, j] = curvature[j, i] = revolute[i] * later
     turning = 0.5 * np.outer(revolute, revolute)
     np.fill_diagonal(turning, 0.0)
     return Links(
@@ -258,7 +250,7 @@ def _links_of(chain: Chain, ways: Floats) -> Links:
         axis=np.array([joint.axis for joint in joints]),
         revolute=revolute,
         tip=chain.tip_placement[:3, 3].copy(),
-        curvature=curvature,
+        curvature=_curvature(revolute, ways),
         turning=turning,
         frames=np.zeros((2, 2, 3, 3)),
         axes=np.zeros((2, n, 3)),
@@ -266,3 +258,20 @@ def _links_of(chain: Chain, ways: Floats) -> Links:
         columns=np.zeros((2, n, 3)),
         signs=np.zeros(n),
     )
+
+
+def _rotation_parts(axis: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the parts (3, 3) of a rotation about an axis (3,): constant, with cos, with sin."""
+    along = np.outer(axis, axis)
+    return along, np.eye(3) - along, np.cross(np.eye(3), axis)
+
+
+def _curvature(revolute: Floats, ways: Floats) -> Floats:
+    """Return C (n, n) [m], by which joints turn (n,) and the ways from their axes to the tip."""
+    n = revolute.size
+    C = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i, n):
+            later = ways[j] if revolute[j] else float(j > i)
+            C[i, j] = C[j, i] = revolute[i] * later
+    return C

@@ -333,35 +333,61 @@ class ViewNode(PlainNode):
         return True
 
     def _keep(self, time: float) -> None:
-        state, (xi1, _, tau), (k_c, *_), (monitor, *_), (truth, *_), (*_, external) = (
-            self._values.values()
-        )
-        m = len(truth)
-        tool = monitor[m : m + len(topics.TOOL)].tolist()
-        *load, lambda_min, contact, latched = monitor[m + len(topics.TOOL) :].tolist()
-        if latched != self._latched and np.isfinite(self._latched):
-            text = (
-                'excited window latched' if latched else 'restarts: the arm has changed'
-            )
-            self._events.append((time, 'learning', text))
-        self._latched = latched
-        if np.isnan(self._first_truth).all():
-            self._first_truth = truth
-        loaded = bool((np.abs(truth - self._first_truth) > 0.0).any())
-        tau = state[2] if np.isnan(tau).any() else tau
-        squares = self._model_error.squares(
-            time, state[0], state[1], monitor[:m], truth
-        )
-        learned = monitor[:m], truth, lambda_min, squares, load, loaded, tool
-        felt, interval = np.split(external, 2)
-        now = Snapshot(time, state[0], xi1, k_c, tau, *learned, felt, interval)
-        now = now._replace(touched=bool(contact > 0.0))
+        """Keep a snapshot of the newest values, at a time [s]."""
+        now = self._snapshot(time)
         self.past.append(now)
         self._keep_for_replay(now)
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
         self._events += [e for e in self._planned if self._noted < e[0] <= time]
         self._noted = time
+
+    def _snapshot(self, time: float) -> Snapshot:
+        """Return the newest values of all topics."""
+        position, velocity, effort = self._values[topics.JOINT_STATES]
+        error, _, torque = self._values[topics.TRACKING_ERROR]
+        truth = self._values[topics.TRUTH][0]
+        monitor = self._values[topics.MONITOR][0]
+        external, interval = np.split(self._values[topics.EXTERNAL_TORQUE][2], 2)
+        estimate, tool, rest = np.split(
+            monitor, [truth.size, truth.size + len(topics.TOOL)]
+        )
+        *load, lambda_min, contact, latched = rest.tolist()
+        self._note_latch(time, latched)
+        if np.isnan(self._first_truth).all():
+            self._first_truth = truth
+        return Snapshot(
+            time=time,
+            position=position,
+            error=error,
+            bound=self._values[topics.BOUND][0],
+            torque=effort if np.isnan(torque).any() else torque,
+            estimate=estimate,
+            truth=truth,
+            lambda_min=lambda_min,
+            squares=self._model_error.squares(
+                time, position, velocity, estimate, truth
+            ),
+            load=load,
+            loaded=self._is_loaded(truth),
+            tool=tool.tolist(),
+            external=external,
+            interval=interval,
+            touched=bool(contact > 0.0),
+        )
+
+    def _note_latch(self, time: float, latched: float) -> None:
+        """Note an event where learning begins or restarts."""
+        if latched != self._latched and np.isfinite(self._latched):
+            text = (
+                'excited window latched' if latched else 'restarts: the arm has changed'
+            )
+            self._events.append((time, 'learning', text))
+        self._latched = latched
+
+    def _is_loaded(self, truth: Floats) -> bool:
+        """Whether the true parameters differ from the first ones."""
+        return bool((np.abs(truth - self._first_truth) > 0.0).any())
 
 
 def _quality(topic: Topic) -> Quality:

@@ -16,7 +16,7 @@ import sysconfig
 import time
 import xml.etree.ElementTree as ET
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from html import escape
 from math import inf, isfinite
@@ -50,7 +50,7 @@ _PEAK = 30  # snapshots, a second, of which the largest error is plotted
 _AXIS_OF_SHARE = (0.1, 300.0)  # % of the bound
 _HEIGHT = 130  # px of a plot: three fit below the state at 900 px
 _VIEW = np.array((0.42, -0.88, 0.22))  # direction from the arm to the camera
-_FEWEST = 2  # snapshots of a run that can be replayed
+_FEWEST = 2  # snapshots that can be replayed, or have a path
 _REPLAYED = 1000  # steps of the slider
 _LINE = {'width': 1.5, 'points': {'show': False}}
 _AUTO: Mapping[str, Any] = {}
@@ -182,7 +182,7 @@ class Page:
         self._clear()
         self._arm = arm
         self._joints = [joint.name for joint in arm.chain.joints]
-        self._feels = config.contact.enabled
+        self._shows_contact = config.contact.enabled
         prefix, names = _shortened(self._joints)
         server = self.server
         gui = self.server.gui
@@ -197,33 +197,31 @@ class Page:
         self._corners = None
         tabs = self._tabs = gui.add_tab_group()
         with tabs.add_tab('Plots'):
-            log = {'distr': 3, 'range': _AXIS_OF_SHARE}
-            self.plots = [
-                self._plot(
-                    f'{prefix}: largest error in 1 s [% of bound]',
-                    names,
-                    log,
-                    'bound',
-                    _DECADES,
-                ),
-                self._plot(f'{prefix}: torque [N m]', names),
-                *(
-                    [self._plot(f'{prefix}: external torque [N m]', names)]
-                    if self._feels
-                    else []
-                ),
-                self._plot(
-                    'torque error of the model [%]', ('learned', 'initial'), _FROM_ZERO
-                ),
-                self._plot(
-                    'load at the tip, 95 % interval [kg]',
-                    ('weight', 'from', 'to'),
-                    _FROM_ZERO_KG,
-                ),
-            ]
+            self.plots = list(self._plots(prefix, names))
             self.caption = gui.add_html('')
         with tabs.add_tab('Events'):
             self.event_list = gui.add_html(event_list(self.listed))
+
+    def _plots(self, prefix: str, names: Sequence[str]) -> Iterator[Any]:
+        """Yield the plots of joints with these names, which have a prefix in common."""
+        yield self._plot(
+            f'{prefix}: largest error in 1 s [% of bound]',
+            names,
+            {'distr': 3, 'range': _AXIS_OF_SHARE},
+            'bound',
+            _DECADES,
+        )
+        yield self._plot(f'{prefix}: torque [N m]', names)
+        if self._shows_contact:
+            yield self._plot(f'{prefix}: external torque [N m]', names)
+        yield self._plot(
+            'torque error of the model [%]', ('learned', 'initial'), _FROM_ZERO
+        )
+        yield self._plot(
+            'load at the tip, 95 % interval [kg]',
+            ('weight', 'from', 'to'),
+            _FROM_ZERO_KG,
+        )
 
     def _plot(
         self,
@@ -294,55 +292,65 @@ class Page:
                 self.event_list.content = event_list(self.listed)
 
     def move(self, past: Sequence[Snapshot]) -> None:
-        """Move the arm to the last of these snapshots."""
+        """Move the arm to the last of these snapshots, and draw the way of its tip."""
         now = past[-1]
-        chain = self._arm.chain
-        reach = self._arm.reach
-        scene = self.server.scene
         with self.server.atomic():
             self._drawn.update_cfg(self._posture(now.position))
+            placements = self._at(np.array(frames(self._arm.chain, now.position)))
             if self._corners is None:
-                self._corners = self._at(np.array(frames(chain, now.position)))
+                self._corners = placements
                 self._aim_all()
-            placements = self._at(np.array(frames(chain, now.position)))
-            tip = placements[-1]
             self._mark_contact(now, placements[1:-1])
-            reference = now.position - now.error
-            self.ghost.show_visual = bool(np.abs(now.error).max() > _APART)  # NaN: not
-            if np.isfinite(reference).all():
-                self.ghost.update_cfg(self._posture(reference))
-            scene.add_icosphere(
-                '/payload',
-                0.045 * reach,
-                color=(213, 94, 0),
-                position=tip,
-                visible=now.loaded,
-            )
-            happened = [e for e in self.listed if now.time - _SHOWN < e[0] <= now.time]
-            _, kind, text = happened[-1] if happened else (0.0, '', '')
-            above = tip + np.array((0.0, 0.0, 0.1 * reach))
-            scene.add_label(
-                '/event',
-                f'{kind}: {text}' if text else kind,
-                position=above,
-                visible=bool(kind),
-            )
-            recent = np.array(
-                [each.position for each in past if each.time > now.time - _TRAIL]
-            )
-            if len(recent) > 1:
-                path = self._at(frames(chain, recent)[-1])
-                points = np.stack((path[:-1], path[1:]), axis=1)
-                scene.add_line_segments(
-                    '/path',
-                    points,
-                    (0, 114, 178),
-                    thickness=3.0,
-                    thickness_units='screen',
-                )
+            self._move_ghost(now)
+            self._mark_load(placements[-1], is_loaded=now.loaded)
+            self._mark_event(placements[-1], now.time)
+            self._draw_path(past)
+
+    def _move_ghost(self, now: Snapshot) -> None:
+        """Show the reference as a ghost, if the arm is apart from it."""
+        reference = now.position - now.error
+        self.ghost.show_visual = bool(np.abs(now.error).max() > _APART)  # NaN: not
+        if np.isfinite(reference).all():
+            self.ghost.update_cfg(self._posture(reference))
+
+    def _mark_load(self, tip: Floats, *, is_loaded: bool) -> None:
+        """Mark a load at the tip (3,) [m]."""
+        self.server.scene.add_icosphere(
+            '/payload',
+            0.045 * self._arm.reach,
+            color=(213, 94, 0),
+            position=tip,
+            visible=is_loaded,
+        )
+
+    def _mark_event(self, tip: Floats, time: float) -> None:
+        """Name the last event above the tip (3,) [m], for a while after its time [s]."""
+        recent = [each for each in self.listed if time - _SHOWN < each[0] <= time]
+        _, kind, text = recent[-1] if recent else (0.0, '', '')
+        self.server.scene.add_label(
+            '/event',
+            f'{kind}: {text}' if text else kind,
+            position=tip + np.array((0.0, 0.0, 0.1 * self._arm.reach)),
+            visible=bool(kind),
+        )
+
+    def _draw_path(self, past: Sequence[Snapshot]) -> None:
+        """Draw the way of the tip in the last seconds."""
+        begin = past[-1].time - _TRAIL
+        recent = np.array([each.position for each in past if each.time > begin])
+        if len(recent) < _FEWEST:
+            return
+        path = self._at(frames(self._arm.chain, recent)[-1])
+        self.server.scene.add_line_segments(
+            '/path',
+            np.stack((path[:-1], path[1:]), axis=1),
+            (0, 114, 178),
+            thickness=3.0,
+            thickness_units='screen',
+        )
 
     def _mark_contact(self, now: Snapshot, joints: Floats) -> None:
-        """Mark the joint that feels something, of those at these places (n, 3) [m]."""
+        """Mark the joint in contact, of those at these places (n, 3) [m]."""
         felt = now.felt_at
         reach = self._arm.reach
         k = felt or 0
@@ -373,7 +381,7 @@ class Page:
             curves = (
                 np.vstack((_peaks(share), np.full(t.size, 100.0))),
                 of.torque.T,
-                *([np.array(of.external).T] if self._feels else []),
+                *([np.array(of.external).T] if self._shows_contact else []),
                 shares(of.squares, _PEAK),
                 weights(np.array(of.load)),
             )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The load that is declared to the drives of an arm, if any is."""
+"""The load that is declared to the drives of an arm; nothing of drives that add no weight."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 
 
-class ToldLoads:
-    """`DriveLoads` of a controller, from the first load on, or with `load.tell_drive`."""
+class DeclaredLoads:
+    """`DriveLoads` of a controller, made when they are needed.
+
+    They are needed from the start with `load.tell_drive`, else from the first load on.
+    """
 
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:
         self._controller = controller
@@ -29,7 +32,7 @@ class ToldLoads:
         """
         self._of(config).take(self._controller, load)
 
-    def want(self, config: ControllerConfig, load: DriveLoad) -> None:
+    def declare(self, config: ControllerConfig, load: DriveLoad) -> None:
         """Let `next` lead to this load, whatever is weighed.
 
         Raises:
@@ -38,14 +41,14 @@ class ToldLoads:
         self._of(config).wanted = load
 
     @property
-    def is_told(self) -> bool:
+    def is_declared(self) -> bool:
         """Whether the drives have the load that is wanted, if any."""
-        return self._loads is None or self._loads.is_told
+        return self._loads is None or self._loads.is_declared
 
-    def take_again(self) -> None:
+    def subtract_again(self) -> None:
         """Subtract the weight that the drives add, after the settings were replaced."""
         if self._loads is not None:
-            self._loads.take(self._controller, self._loads.told)
+            self._loads.take(self._controller, self._loads.in_force)
 
     def forget(self) -> None:
         """Begin again with a law that has forgotten what the tip holds."""
