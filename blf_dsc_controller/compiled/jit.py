@@ -94,14 +94,27 @@ def kernel(function: F, *types: type) -> F:
 
     The machine code depends on the files of `types`, too: those of a law of a file.
     """
+    return _kernel(function, types)
+
+
+def uncallable(function: F, *types: type) -> F:
+    """Compile `function` as `kernel` does, but for other kernels alone, by its `Entry`.
+
+    Its arguments may be references, which Python has none of.
+    """
+    return _kernel(function, types, no_cpython_wrapper=True)
+
+
+def _kernel(function: F, dependencies: Sequence[type], **options: object) -> F:
     compiled = numba.njit(
         function,
         error_model='numpy',
         nogil=True,
         no_cfunc_wrapper=True,
         **_KERNEL_COMPILER,
+        **options,
     )
-    add_kernel(compiled, *types)
+    add_kernel(compiled, *dependencies)
     return cast('F', compiled)
 
 

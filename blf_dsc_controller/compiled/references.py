@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 from llvmlite import ir
+from numba import typeof
 from numba.core import cgutils, types
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typing.templates import AttributeTemplate
@@ -47,6 +48,11 @@ def reference(value: T) -> T:
     It holds until the same call of this function is executed again.
     """
     return value
+
+
+def referred(value: Any) -> Reference:
+    """Return the type of a reference to a named tuple."""
+    return Reference(typeof(value))
 
 
 class Reference(types.Type):
