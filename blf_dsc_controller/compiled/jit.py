@@ -16,7 +16,7 @@ import numba
 from llvmlite.binding import get_host_cpu_features
 from numba.core import config
 from numba.core.types.containers import BaseNamedTuple
-from numba.extending import overload_method, register_jitable
+from numba.extending import overload, overload_method, register_jitable
 
 from blf_dsc_controller.compiled.dependencies import add_module, depend_on
 from blf_dsc_controller.compiled.kernel_cache import add_kernel
@@ -60,6 +60,17 @@ def inner(function: F) -> F:
     """Let kernels call `function`, which is compiled into them; in Python it is unchanged."""
     add_module(function.__module__)
     register_jitable(**INLINED)(function)
+    return function
+
+
+def inner_as(function: F, compiled: F) -> F:
+    """Let kernels call `function`, for which `compiled` is compiled into them, as by `inner`."""
+    add_module(function.__module__)
+
+    def chosen(*_arguments: Any, **_named: Any) -> Any:
+        return compiled
+
+    overload(function, strict=False, jit_options=INLINED)(chosen)
     return function
 
 

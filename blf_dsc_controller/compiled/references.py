@@ -214,7 +214,7 @@ def _read_field(
 
 
 @intrinsic
-def _refer(_typing: Any, value: Any) -> Any:
+def compiled_reference(_typing: Any, value: Any) -> Any:
     """Return a reference to a copy of a named tuple."""
 
     def generate(
@@ -228,4 +228,4 @@ def _refer(_typing: Any, value: Any) -> Any:
 
 @overload(reference, strict=False, jit_options=INLINED)
 def _compiled_reference(value: Any) -> Any:  # noqa: ARG001 - numba looks at the names
-    return lambda value: _refer(value)  # noqa: PLW0108
+    return lambda value: compiled_reference(value)  # noqa: PLW0108
