@@ -53,6 +53,7 @@ from blf_dsc_controller.compiled.layout import (
 from blf_dsc_controller.configuration.law_file import load_law
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.law import called_law
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.numerics import elementary
@@ -135,6 +136,12 @@ def test_kernel_of_a_law_depends_on_its_file_and_on_no_other_law(monkeypatch):
     assert str(own) in for_law(update, OwnLaw(1.0))._cache.cache_path
     assert kernel_cache.cache_folder(function) == packaged
     assert kernel_cache.cache_folder(function, OwnLaw) == own
+    for method in called_law._methods(OwnLaw, 'gains[0]'):
+        own = kernel_cache.cache_folder(method.py_func, OwnLaw)
+        assert str(own) in method._cache.cache_path
+        files, _ = dependencies.dependencies(method.py_func, OwnLaw)
+        assert Path(__file__) in files
+        assert names(method) >= sources('law/state', 'law/called_law')
 
 
 FOLDERS = """

@@ -8,14 +8,19 @@ import os
 import pickle
 import sys
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pytest
 from command import finished
+from numba import config as numba_config
+from numba import typeof
 
 import blf_dsc_controller as blf
 from benchmark.studies import path_of
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.compiled.layout import Array, pack, view_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
 from blf_dsc_controller.configuration.law_traits import LAWS, OWN, traits_of
@@ -25,8 +30,17 @@ from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.laws import law_of
-from blf_dsc_controller.law.laws import for_law
-from blf_dsc_controller.law.state import settings_of, signals_of, state_of
+from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.law.called_law import called
+from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
+from blf_dsc_controller.law.state import (
+    settings_of,
+    signals_of,
+    signals_size,
+    state_of,
+    state_size,
+)
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.studies.monte_carlo import UNSEEN, load_study, torque_rows
@@ -83,7 +97,7 @@ class LAW(NamedTuple):
 """
 IMPORTS = (
     'from typing import Annotated, NamedTuple\n'
-    'from blf_dsc_controller.configuration.schema import positive\n'
+    'from blf_dsc_controller.configuration.schema import parameter, positive\n'
 )
 
 
@@ -113,14 +127,27 @@ def test_file_that_defines_no_law_is_refused(text, problem, tmp_path):
     assert problem in str(raised.value)
 
 
-def used(law, model, settings_vector, state_vector, signals_vector):
-    """Run both methods of a law, as a loop does."""
-    settings = settings_of(settings_vector, model)
-    state = state_of(state_vector, settings)
-    signals = signals_of(signals_vector, settings)
-    law.compute_demand(settings, state, signals, 0.0, 1e-3)
-    saturated = False
-    law.finish(settings, state, signals, 1e-3, saturated)
+def views(law=None):
+    """Return settings, state and signals of the default arm, for kernels."""
+    config = build(ControllerConfig, {'law': law} if law else {})
+    made = settings_of_config(config)
+    settings = settings_of(pack(made), made.model)
+    state = state_of(np.zeros(state_size(settings)), settings)
+    return settings, state, signals_of(np.zeros(signals_size(settings)), settings)
+
+
+def law_of_text(path, text):
+    """Return the type of the law in a file with the text."""
+    path.write_text(IMPORTS + text + '    has_barrier = False\n', encoding='utf-8')
+    return load_law(str(path))
+
+
+def used(law, x):
+    """Run a method of a law, as a loop does."""
+    law.compute_demand(x, x, x, 0.0, 1e-3)
+
+
+compiling = pytest.mark.skipif(numba_config.DISABLE_JIT, reason='nothing is compiled')
 
 
 @pytest.mark.parametrize(
@@ -147,19 +174,9 @@ def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tm
     path = tmp_path / 'law.py'
     helper = 'import numpy as np\n\n\ndef doubled(x):\n    return x\n\n\n'
     mistaken = METHODS.replace('pass', f'signals.demand[0] += {line}', 1)
-    path.write_text(
-        IMPORTS + helper + mistaken + '    has_barrier = False\n', encoding='utf-8'
-    )
-    of_package = controller_of(build(ControllerConfig, {}))
-    law = load_law(str(path))(1.0)
+    law = law_of_text(path, helper + mistaken)(1.0)
     with pytest.raises(BlfDscError) as raised:
-        for_law(used, law)(
-            law,
-            of_package.settings.model,
-            of_package.settings_vector,
-            of_package.state_vector,
-            of_package.signals_vector,
-        )
+        for_kernels(law, *views())
     (told,) = str(raised.value).splitlines()
     number = (
         path.read_text(encoding='utf-8')
@@ -168,6 +185,89 @@ def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tm
     )
     assert told.startswith(f'{path}, line {number + 1}: ')
     assert problem in told
+
+
+@compiling
+def test_mistake_in_a_law_that_is_compiled_into_the_loop_is_told_with_its_line(
+    tmp_path,
+):
+    """As all are where kernels have no addresses, and one with a gain that is no number."""
+    path = tmp_path / 'law.py'
+    mistaken = METHODS.replace('pass', 'signals[0] += self.kk', 1)
+    mistaken = mistaken.replace('float', 'str').replace("1.0, 'gain'", "'a', 'word'")
+    mistaken = mistaken.replace('positive', 'parameter')
+    law = law_of_text(path, mistaken)('a')
+    assert for_kernels(law, *views()) is law
+    with pytest.raises(BlfDscError) as raised:
+        for_law(used, law)(law, np.zeros(2))
+    assert 'LAW has no gain kk: did you mean self.k?' in str(raised.value)
+
+
+COUNTING = """\
+class LAW(NamedTuple):
+    gain: Annotated[float, parameter(0.5, 'gain')]
+    count: Annotated[int, parameter(2, 'additions')]
+    inverted: Annotated[bool, parameter(True, 'sign')]
+
+    def compute_demand(self, settings, state, signals, t, dt):
+        for k in range(self.count):
+            signals.values[self.count - 1 - k] += -self.gain if self.inverted else self.gain
+
+    def finish(self, settings, state, signals, dt, saturated):
+        if not saturated:
+            state.values[0] += dt * settings.count
+
+"""
+
+
+class Few(NamedTuple):
+    count: int
+    values: Annotated[Array, 'count']
+
+
+few_of = view_of(Few)
+
+
+@kernel
+def run_law(law, vectors, saturated):
+    settings, state, signals = (
+        few_of(vectors[0]),
+        few_of(vectors[1]),
+        few_of(vectors[2]),
+    )
+    law.compute_demand(settings, state, signals, 0.0, 1e-3)
+    law.finish(settings, state, signals, 1e-3, saturated)
+
+
+@compiling
+def test_law_is_called_with_its_gains_as_they_are_declared(tmp_path):
+    """A count as an integer, a switch as that; its methods are compiled once for all gains."""
+    law = law_of_text(tmp_path / 'law.py', COUNTING)
+    vectors = np.zeros((3, 4))
+    vectors[:, 0] = 3
+    _, state, signals = views = [few_of(each) for each in vectors]
+    given = called(law(0.5, 2, inverted=True), *views)
+    run_law(given, vectors, saturated=False)
+    assert signals.values.tolist() == [-0.5, -0.5, 0.0]
+    run_law(with_gains(given, law(0.25, 1, inverted=False)), vectors, saturated=True)
+    assert signals.values.tolist() == [-0.25, -0.5, 0.0]
+    assert state.values.tolist() == [3e-3, 0.0, 0.0]
+    again = called(law(1.0, 3, inverted=False), *views)
+    assert again.computes.address == given.computes.address
+
+
+@compiling
+def test_kernels_of_the_loop_are_those_of_every_law_of_a_file(tmp_path):
+    """So that none but the two methods of a law are compiled with it."""
+    given = [
+        for_kernels(law(*[1.0] * len(law._fields)), *views(LAW))
+        for law in (law_of_text(tmp_path / 'law.py', METHODS), load_law(LAW))
+    ]
+    mine, computed_torque = given
+    assert typeof(mine) == typeof(computed_torque)
+    assert mine.computes.address != computed_torque.computes.address
+    for each in given:
+        assert for_law(update, each) is update
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,10 @@ F = TypeVar('F', bound=Callable[..., object])
 
 
 class Entry:
-    """A kernel for arguments of certain types, as `invoke` calls it."""
+    """A kernel for arguments of certain types, as `invoke` calls it.
+
+    Of each argument there is a value or its type.
+    """
 
     def __init__(self, called: Callable[..., Any], *arguments: object) -> None:
         self.kernel = called
@@ -50,7 +53,10 @@ class Entry:
         if config.DISABLE_JIT:
             return
         dispatcher = cast('Any', called)
-        given = tuple(map(numba.typeof, arguments))
+        given = tuple(
+            each if isinstance(each, types.Type) else numba.typeof(each)
+            for each in arguments
+        )
         dispatcher.compile(given)
         compiled = dispatcher.overloads[given]
         self.type = EntryType(compiled.signature)

@@ -16,7 +16,7 @@ import numba
 from llvmlite.binding import get_host_cpu_features
 from numba.core import config
 from numba.core.types.containers import BaseNamedTuple
-from numba.extending import overload_method, register_jitable
+from numba.extending import overload, overload_method, register_jitable
 
 from blf_dsc_controller.compiled.dependencies import add_module, depend_on
 from blf_dsc_controller.compiled.kernel_cache import add_kernel
@@ -63,6 +63,17 @@ def inner(function: F) -> F:
     return function
 
 
+def inner_as(function: F, compiled: F) -> F:
+    """Let kernels call `function`, for which `compiled` is compiled into them, as by `inner`."""
+    add_module(function.__module__)
+
+    def chosen(*_arguments: Any, **_named: Any) -> Any:
+        return compiled
+
+    overload(function, strict=False, jit_options=INLINED)(chosen)
+    return function
+
+
 def called(function: F) -> F:
     """Let kernels call `function` without inlining it: large functions compile faster this way."""
     add_module(function.__module__)
@@ -94,14 +105,27 @@ def kernel(function: F, *types: type) -> F:
 
     The machine code depends on the files of `types`, too: those of a law of a file.
     """
+    return _kernel(function, types)
+
+
+def uncallable(function: F, *types: type) -> F:
+    """Compile `function` as `kernel` does, but for other kernels alone, by its `Entry`.
+
+    Its arguments may be references, which Python has none of.
+    """
+    return _kernel(function, types, no_cpython_wrapper=True)
+
+
+def _kernel(function: F, dependencies: Sequence[type], **options: object) -> F:
     compiled = numba.njit(
         function,
         error_model='numpy',
         nogil=True,
         no_cfunc_wrapper=True,
         **_KERNEL_COMPILER,
+        **options,
     )
-    add_kernel(compiled, *types)
+    add_kernel(compiled, *dependencies)
     return cast('F', compiled)
 
 

@@ -34,9 +34,13 @@ from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
-from blf_dsc_controller.compiled.jit import inner
-from blf_dsc_controller.compiled.references import by_reference, reference
-from blf_dsc_controller.compiled.views import part
+from blf_dsc_controller.compiled.jit import inner_as
+from blf_dsc_controller.compiled.references import (
+    by_reference,
+    compiled_reference,
+    reference,
+)
+from blf_dsc_controller.compiled.views import compiled_part, part
 
 Array = np.ndarray
 Cell = Annotated[Array, '1']
@@ -105,8 +109,12 @@ def view_of(layout: type[T]) -> Callable[..., T]:
     by_reference(*tuples.values())
     names = {'_part': part, '_reference': reference, **tuples}
     names['__name__'] = layout.__module__
-    defined: Callable[..., T] = _defined(_view_arguments(layout), body, names)
-    return inner(defined)
+    arguments = _view_arguments(layout)
+    defined: Callable[..., T] = _defined(arguments, body, names)
+    # Hundreds of functions less to be compiled into each kernel.
+    names = names | {'_part': compiled_part, '_reference': compiled_reference}
+    in_kernels: Callable[..., T] = _defined(arguments, body, names)
+    return inner_as(defined, in_kernels)
 
 
 def source_of(layout: type) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 from llvmlite import ir
+from numba import typeof
 from numba.core import cgutils, types
 from numba.core.imputils import impl_ret_borrowed
 from numba.core.typing.templates import AttributeTemplate
@@ -47,6 +48,11 @@ def reference(value: T) -> T:
     It holds until the same call of this function is executed again.
     """
     return value
+
+
+def referred(value: Any) -> Reference:
+    """Return the type of a reference to a named tuple."""
+    return Reference(typeof(value))
 
 
 class Reference(types.Type):
@@ -208,7 +214,7 @@ def _read_field(
 
 
 @intrinsic
-def _refer(_typing: Any, value: Any) -> Any:
+def compiled_reference(_typing: Any, value: Any) -> Any:
     """Return a reference to a copy of a named tuple."""
 
     def generate(
@@ -222,4 +228,4 @@ def _refer(_typing: Any, value: Any) -> Any:
 
 @overload(reference, strict=False, jit_options=INLINED)
 def _compiled_reference(value: Any) -> Any:  # noqa: ARG001 - numba looks at the names
-    return lambda value: _refer(value)  # noqa: PLW0108
+    return lambda value: compiled_reference(value)  # noqa: PLW0108

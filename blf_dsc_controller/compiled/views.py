@@ -39,6 +39,7 @@ def part(vector: Array, at: int, shape: tuple[int, ...]) -> Array:
 if SLOW:
     inner(view)
     inner(part)
+    compiled_part = part
 else:
     from blf_dsc_controller.compiled.linked import part_of, uncounted
 
@@ -49,3 +50,5 @@ else:
     @overload(part, strict=False, jit_options=INLINED)
     def _compiled_part(vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
         return lambda vector, at, shape: part_of(vector, at, shape)  # noqa: PLW0108
+
+    compiled_part = part_of

@@ -42,7 +42,7 @@ from blf_dsc_controller.law.checks import (
     watch_oscillation,
 )
 from blf_dsc_controller.law.interface import Law
-from blf_dsc_controller.law.laws import for_law
+from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
 from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.perception import (
     sense,
@@ -277,6 +277,7 @@ class Controller:
 
     Attributes:
         law: the law, with its own gains.
+        given_law: the same as kernels get it.
         settings: settings of the loop and the learning; views of `settings_vector`.
         state: views of `state_vector`, the whole state of the controller.
         signals: views of the values that the last update computed.
@@ -311,8 +312,16 @@ class Controller:
             self.checks_vector,
             self._measurement,
         )
+        views = self.settings, self.state, self.signals
+        self.given_law = given = for_kernels(law, *views)
         self._update = direct(
-            for_law(update, law), law, *self._vectors, reference_vector, 0.0, 0.0, True
+            for_law(update, given),
+            given,
+            *self._vectors,
+            reference_vector,
+            0.0,
+            0.0,
+            True,
         )
         self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
         self._compare = direct(compare, *self._compared, 0.0)
@@ -329,7 +338,7 @@ class Controller:
     @functools.cached_property
     def kernels(self) -> LawKernels:
         """The kernels of `update` and `perceive`, for a compiled loop."""
-        law = self.law
+        law = self.given_law
         given = (*self._vectors, self.reference_vector, 0.0, 0.0, True)
         weighs = weigh if self.settings.weighing.size else weigh_nothing
         senses = sense if self.settings.contact.enabled else sense_nothing
@@ -384,7 +393,7 @@ class Controller:
         """
         self._take(measurement)
         self.flags = self._update(
-            self.law, *self._vectors, self.reference_vector, t, dt, True
+            self.given_law, *self._vectors, self.reference_vector, t, dt, True
         )
         return self.sample.torque
 
@@ -463,6 +472,7 @@ class Controller:
     def retune(self, law: Law, settings: Settings) -> None:
         """Replace the gains of the law, and settings that change no size; the state stays."""
         self.law = law
+        self.given_law = with_gains(self.given_law, law)
         self.settings_vector[:] = pack(settings)
 
     def save(self) -> Array:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The laws that kernels are compiled with: those of the package, and one of a user's file.
+"""How kernels get a law: `blf_dsc` is compiled into them, the others are called.
 
-`for_law(kernel, law)` is how a loop gets its kernel: the laws of the package are
-compiled into one and the same, whose cache depends on their files; a law of a file has
-kernels of its own, whose cache depends on that file, too.
+`for_kernels(law, ...)` is the law that a kernel gets as its argument, and
+`for_law(kernel, law)` the kernel for it.  Without numba's private parts there are no
+addresses of kernels: then every law is compiled into kernels of its own.
 """
 
 from __future__ import annotations
@@ -12,26 +12,48 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from blf_dsc_controller.compiled.jit import compile_methods, kernel
+from numba.core import config
+
+from blf_dsc_controller.compiled.jit import SLOW, compile_methods, kernel
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
+from blf_dsc_controller.law.called_law import CalledLaw, called, is_callable
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.mistakes import tell_mistakes
+from blf_dsc_controller.law.state import Settings, Signals, State
 
 PACKAGED = (BlfDsc, Backstepping)
 """Types of the package's laws."""
 
-compile_methods(Law, ('compute_demand', 'finish'), *PACKAGED)
+compile_methods(Law, ('compute_demand', 'finish'), BlfDsc, CalledLaw)
 
 
-def for_law(compiled: Callable[..., Any], law: Law) -> Callable[..., Any]:
-    """Return a kernel for a law: the given one, or the same compiled with the law of a file.
+def for_kernels(
+    law: Law, settings: Settings, state: State, signals: Signals
+) -> Law | CalledLaw:
+    """Return a law as kernels get it, for a controller with these settings and vectors.
+
+    Raises BlfDscError where the law of a file cannot be compiled.
+    """
+    is_compiled_in = isinstance(law, BlfDsc) or SLOW or config.DISABLE_JIT
+    if is_compiled_in or not is_callable(law):
+        return law
+    return called(law, settings, state, signals)
+
+
+def with_gains(given: Law | CalledLaw, law: Law) -> Law | CalledLaw:
+    """Return what kernels get with the gains of a law of the same type."""
+    return given.with_gains(law) if isinstance(given, CalledLaw) else law
+
+
+def for_law(compiled: Callable[..., Any], given: Law | CalledLaw) -> Callable[..., Any]:
+    """Return a kernel for a law of `for_kernels`: the same, or compiled with that law.
 
     Its compilation raises BlfDscError where the law of a file cannot be compiled.
     """
-    if isinstance(law, PACKAGED):
+    if isinstance(given, (BlfDsc, CalledLaw)):
         return compiled
-    return _compiled_with(compiled, type(law))
+    return _compiled_with(compiled, type(given))
 
 
 @functools.cache

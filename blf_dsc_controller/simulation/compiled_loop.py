@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # else the loop would be compiled again whenever one of these
 
     from blf_dsc_controller.arms.model import ArmModel
     from blf_dsc_controller.compiled.entry import Entry
+    from blf_dsc_controller.law.called_law import CalledLaw
     from blf_dsc_controller.law.controller import Controller, LawKernels
     from blf_dsc_controller.law.interface import Law
     from sim_plant.arm import Arm
@@ -68,7 +69,7 @@ class LawArguments(NamedTuple):
     """The kernels of a controller, and their arguments."""
 
     kernels: LawKernels
-    law: Law
+    law: Law | CalledLaw
     model: ArmModel
     settings: np.ndarray
     state: np.ndarray
@@ -189,7 +190,7 @@ class CompiledLoop:
         settings = controller.settings
         return LawArguments(
             controller.kernels,
-            controller.law,
+            controller.given_law,
             settings.model,
             controller.settings_vector,
             controller.state_vector,
