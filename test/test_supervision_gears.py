@@ -8,7 +8,7 @@ import pytest
 
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.config_warnings import config_warnings
@@ -35,6 +35,36 @@ def test_an_arm_of_which_nothing_is_known_is_held_softly_and_says_so():
     np.testing.assert_allclose(config.feedback.gain, [7.875] * 3 + [1.47] * 3)
     (warning,) = (text for text in config_warnings(config) if 'softly' in text)
     assert warning.startswith('feedback.joint_stiffness: nothing is known of the gears')
+
+
+def test_default_bound_has_room_for_friction_that_nobody_knows():
+    """5 % of the rated torque of 150 N m, of joints whose friction is not known."""
+    known = {'robot.coulomb': [6.0, 0.0, 6.0, 0.0, 1.1, 1.1]}
+    drives = {
+        'robot.drive_compensates': 'gravity_and_friction',
+        'robot.drive_payload': 0.0,
+    }
+    unknown, partly, compensated = (
+        np.array(built(**GAINS, **each).barrier.bound) for each in ({}, known, drives)
+    )
+    stiffness = np.array(GAINS['feedback.joint_stiffness'])
+    room = 1.5 * 0.05 * np.array([150.0] * 3 + [28.0] * 3) / stiffness
+    np.testing.assert_allclose(unknown - compensated, room, atol=1e-4)
+    np.testing.assert_allclose(unknown - partly, room * [1, 0, 1, 0, 1, 1], atol=1e-4)
+
+
+def test_an_arm_of_which_nothing_is_known_begins_its_motion():
+    """A UR5e with 9 N m of friction at rest, of which its file says nothing."""
+    loop = load_loop('ur5e')
+    moves = {
+        f'reference.{name}': value
+        for name, value in vars(loop.controller.reference).items()
+        if name in ('type', 'offset', 'amplitude', 'frequency', 'phase')
+    }
+    plant = change(loop.plant, {'duration': 6.0})
+    run = simulate(built(**moves), plant).run()
+    assert not run.stops
+    assert not run.oscillations
 
 
 def test_given_gains_of_joints_are_used_and_scaled():

@@ -47,8 +47,8 @@ _SAG = 1.5
 _PHASE = 0.625  # rad, phase lost to the delay at omega_b
 _BRAKING = 0.375  # of the fastest omega_b, by the damping of a stop
 _BOUND = 0.002  # rad, at full stiffness
-# Of gains of joints: fraction of the rated torque that is expected beside gravity, and
-# rad, the widest bound by default
+# Of gains of joints: fraction of the rated torque that is expected beside gravity and
+# unknown friction, and rad, the widest bound by default
 _PUSH, _WIDEST = 0.03, 0.35
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = 5.0  # s
@@ -79,6 +79,7 @@ class Design(NamedTuple):
     parameters: BaseParameters
     efforts: np.ndarray  # (n,) N m, rated torques
     rotors: np.ndarray  # (n,) kg m^2, inertias of the drives
+    friction: np.ndarray  # (n,) N m, dry friction to expect where none is known
     payload: float  # kg, rated
     lag: float  # s
     # None: the whole feedback acts through the inertia matrix
@@ -150,7 +151,7 @@ def _of_joints(
 ) -> dict[str, Value]:
     """Return the gains of joints, each on its own."""
     postures = arm.over_postures()
-    pushed = postures.gravity + _PUSH * arm.efforts
+    pushed = postures.gravity + _PUSH * arm.efforts + arm.friction
     sag = np.minimum(_SAG * pushed / gains.stiffness, _WIDEST)
     usual_bound = np.maximum(sag, _BOUND)
     start = np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)

@@ -50,8 +50,8 @@ def with_gains(
 ) -> ControllerConfig:
     """Return a configuration with values, and what follows from them, as if read from a file.
 
-    `values` have `feedback.joint_stiffness` and `feedback.joint_damping`, and may have
-    `robot.lag` and `robot.rotor_inertia`.  Bounds of joints that follow from one at the tool
+    `values` have `feedback.joint_stiffness` and `feedback.joint_damping`, and may have what was
+    measured of the robot.  Bounds of joints that follow from one at the tool
     follow again.
     """
     changed = _with_gains(config, values)
@@ -66,13 +66,14 @@ def _with_gains(
     """Return a configuration with values, and what follows from them but for the bounds."""
     names = 'feedback.joint_stiffness', 'feedback.joint_damping'
     gains = JointGains(*(np.array(values[name], float) for name in names))
+    of_robot = {name: values[name] for name in values if name.startswith('robot.')}
     arm, _ = design_of(config)
-    bound = np.array(values.get('barrier.bound', config.barrier.bound), float)
-    before = gains_of(arm, np.array(config.barrier.bound))
-    lag = float(np.asarray(values.get('robot.lag', arm.lag), float))
-    rotors = np.array(values.get('robot.rotor_inertia', arm.rotors), float)
-    follows = arm._replace(joints=gains, stiffness=1.0, lag=lag, rotors=rotors)
-    after = gains_of(follows, bound)
+    known, _ = design_of(change(config, of_robot))
+    given = _given_bound(config)
+    before = gains_of(arm, given)
+    if 'barrier.bound' in values:
+        given = np.array(values['barrier.bound'], float)
+    after = gains_of(known._replace(joints=gains, stiffness=1.0), given)
     present = flatten(config)
     of_tool = _BOUNDS if config.barrier.bounds_tool else ()
     followed = {
@@ -82,6 +83,13 @@ def _with_gains(
         or (name in present and present[name] == before[name] and name not in of_tool)
     }
     return change(config, {**followed, **values})
+
+
+def _given_bound(config: ControllerConfig) -> Floats | None:
+    """Return the bounds of the joints (n,) [rad]; None: those that follow from their gains."""
+    bound = config.barrier.bound
+    usual = gains_of(design_of(config)[0], None)['barrier.bound']
+    return None if bound == usual else np.array(bound)
 
 
 def _follow_from_tool(config: ControllerConfig) -> bool:
@@ -129,7 +137,7 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
     values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
     arm, _ = design_of(config)
-    usual = gains_of(arm, np.array(barrier.bound))['barrier.initial_bound']
+    usual = gains_of(arm, _given_bound(config))['barrier.initial_bound']
     if barrier.initial_bound != usual:
         starts = np.array(barrier.initial_bound)
         starts = np.where(starts > 0.0, np.maximum(starts, wide), 0.0)

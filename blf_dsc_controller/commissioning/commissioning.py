@@ -15,6 +15,7 @@ from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, unknown_
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
+from blf_dsc_controller.commissioning.better_known import as_measured, known_friction
 from blf_dsc_controller.commissioning.choice import (
     MARGIN,
     Choice,
@@ -86,6 +87,8 @@ class Commissioned(NamedTuple):
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
+    # (n,) N m, robot.coulomb: measured, of an arm of which nothing was known; else None
+    coulomb: Floats | None
 
     @property
     def has_margin(self) -> bool:
@@ -102,7 +105,7 @@ class Commissioned(NamedTuple):
                 f'no gains have the modulus margin of {self.aim:g}: noise or friction hide the '
                 'response. Measure again with more torque or travel'
             )
-        values = self._values()
+        values = self.shown()
         return values | kept_bound(with_gains(self.before, values))
 
     @property
@@ -113,15 +116,18 @@ class Commissioned(NamedTuple):
         """
         return with_gains(self.before, self.parameters())
 
-    def _values(self) -> dict[str, Value]:
+    def shown(self) -> dict[str, Value]:
+        """Return the parameters that follow but for bounds, whether there is a margin or not."""
         gains = self.choice.gains
         damping = _rounded(gains.damping)
-        motors: dict[str, Value] = {}
+        of_arm: dict[str, Value] = {}
         if not self.before.robot.torque_loop:
-            motors = kept_stop(self.before, np.array(damping))
-            motors['robot.rotor_inertia'] = _rounded(self.rotors)
+            of_arm = kept_stop(self.before, np.array(damping))
+            of_arm['robot.rotor_inertia'] = _rounded(self.rotors)
+        if self.coulomb is not None:
+            of_arm['robot.coulomb'] = _rounded(self.coulomb)
         return {
-            **motors,
+            **of_arm,
             'robot.lag': float(f'{self.lag:.3g}'),
             'feedback.inertia': 'none',
             'feedback.joint_stiffness': _rounded(gains.stiffness),
@@ -206,7 +212,8 @@ def commissioned(
     """
     _check_joints(config, runs)
     T = config.sample_time
-    arm, _ = design_of(config)
+    measured = as_measured(config, [each for _, each in runs])
+    arm, _ = design_of(measured)
     responses = tuple(response_of(run, motion.lines_in(each), T) for run, each in runs)
     found = findings_of([run for run, _ in runs], responses)
     assumed = _assumed_inertia(arm, responses)
@@ -226,10 +233,15 @@ def commissioned(
         rotors=_rotors(config, arm, found, assumed),
         friction=_expected_friction(found, start),
         unseen=_unseen(found, assumed),
-        lag=_lag(config, found),
+        lag=_lag(measured, found),
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
         aim=margin,
         before=config,
+        coulomb=(
+            None
+            if measured is config
+            else np.maximum(known_friction(measured), found.friction)
+        ),
     )
 
 

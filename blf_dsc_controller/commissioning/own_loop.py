@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 
@@ -12,6 +13,13 @@ from numpy.typing import ArrayLike
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.commissioning.better_known import (
+    FAR,
+    TIMES,
+    WORTH,
+    better_known,
+    is_unknown,
+)
 from blf_dsc_controller.commissioning.choice import MARGIN
 from blf_dsc_controller.commissioning.commissioning import (
     TORQUE,
@@ -52,6 +60,10 @@ class Commissioning:
     Attributes:
         config: the configuration that the arm is measured for.
         margin: modulus margin of the gains to choose.
+        measured_with: the configuration that the motions have: stiffer and with more friction
+            compensated, once the arm is better known.
+        slides: whether motions have swings from the first on.
+        times: how often the arm may be better known yet.
     """
 
     def __init__(
@@ -79,6 +91,9 @@ class Commissioning:
             config = load(locate(config), CONTROLLER, ControllerConfig)
         self.config = config
         self.margin = margin
+        self.measured_with = config
+        self.slides = False
+        self.times = TIMES if is_unknown(config) else 0
         self._postures = postures
         self._torque = torque
         self._travel = travel
@@ -112,7 +127,7 @@ class Commissioning:
         Raises:
             BlfDscError: the posture is not one of this arm, or too near its limits.
         """
-        return self._motion(posture, self._torque)
+        return self._motion(posture, self._torque, sliding=self.slides)
 
     def sliding(self, posture: ArrayLike) -> Planned:
         """Return the motion around a posture (n,) [rad] with swings that keep joints sliding.
@@ -147,11 +162,37 @@ class Commissioning:
         gained = float((after[:, :-SLOW_TONES] / before[:, :-SLOW_TONES]).max())
         return again if gained > _WORTH else None
 
+    def better_known(self, motion: Planned, run: Run) -> Commissioning | None:
+        """Return what measures this arm anew, better known by the run of a motion.
+
+        For an arm of which only the URDF is known it has stiffer gains, and compensates the
+        friction that the run shows: at most twice, and while the arm bears 5 times the gains
+        that it is measured with, or 2.5 times and friction hides an inertia.  Its runs belong
+        to the result of this one.  None: the run is good enough.
+
+        Raises:
+            BlfDscError: the run does not show the response.
+        """
+        if not self.times:
+            return None
+        found = commissioned(self.config, [(run, motion.config)], self.margin)
+        hidden = np.isnan(found.findings.inertia)
+        if found.choice.factors.max() <= (WORTH if hidden.any() else FAR):
+            return None
+        better = copy(self)
+        vars(better).pop('motions', None)  # of gains that are softer
+        better.measured_with = better_known(
+            self.config, found.shown(), found.start, found.findings.friction, hidden
+        )
+        better.slides = motion.excitation.sliding
+        better.times -= 1
+        return better
+
     def _motion(
         self, posture: ArrayLike, torque: float, *, sliding: bool = False
     ) -> Planned:
         (motion,) = plan(
-            self.config,
+            self.measured_with,
             np.asarray(posture, float)[None],
             torque=torque,
             travel=self._travel,

@@ -15,6 +15,7 @@ from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST
+from blf_dsc_controller.commissioning.better_known import FAR, known_friction
 from blf_dsc_controller.commissioning.commissioning import (
     CREEPING,
     Commissioned,
@@ -31,7 +32,6 @@ Floats = NDArray[np.float64]
 
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
-_FAR = 5.0  # times the gains of the measurement: friction may act otherwise on theirs
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
 
@@ -150,7 +150,7 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
 def _of_factors(found: Commissioned) -> Iterator[str]:
     """Yield how to go to gains that are far above those of the measurement."""
     most = float(found.choice.factors.max())
-    if most > _FAR:
+    if most > FAR:
         joint = found.joints[int(found.choice.factors.argmax())]
         yield (
             f'{joint} gets {two_digits(most)} times the gains it was measured with: raise '
@@ -199,8 +199,14 @@ def _of_friction(found: Commissioned) -> Iterator[str]:
             f'friction damps {", ".join(names[rubbing])} more than the gains do while shaken, and '
             'less in a steady motion: the true margin is smaller, so prove the gains (--prove)'
         )
-    robot = found.before.robot
-    known = robot.friction(robot.chain(found.joints))['coulomb']
+    if found.coulomb is not None:
+        measured = ', '.join(f'{each:.2g}' for each in found.coulomb)
+        yield (
+            f'friction of {measured} N m is written as robot.coulomb: the last runs and the gains '
+            'have it compensated'
+        )
+        return
+    known = known_friction(found.before)
     more = [
         f'{joint} {measured:.2g} N m instead of {assumed:g}'
         for joint, measured, assumed, floor in zip(

@@ -2,7 +2,9 @@
 """Commissioning of a robot from posture to posture: slowly to each, and the motion there.
 
     rest -> move -> rest -> motion -> rest      for each posture, and the motion again, up to
-                                                twice, if noise or friction hide much
+                                                twice, if noise or friction hide much; all of
+                                                it again in the first posture of an arm of
+                                                which little was known (`better_known`)
 
 Moves and motions are runs that end at rest whatever happens, and have a bag each.  A motion
 is around the posture in which the arm rests by then, so it begins without an error.
@@ -96,6 +98,16 @@ def stronger(
     return again
 
 
+def better_known(
+    commissioning: Commissioning, motion: Planned, bag: Path
+) -> Commissioning | None:
+    """Return what measures the arm anew, better known by the motion of a bag; None: not worth it.
+
+    Raises BlfDscError if the bag does not show the response.
+    """
+    return commissioning.better_known(motion, measured_in(bag)[0])
+
+
 def check(bag: Path) -> None:
     """Raise BlfDscError if the run of a bag does not show the response."""
     run, config = measured_in(bag)
@@ -109,6 +121,14 @@ def _named(name: str) -> Iterator[None]:
         yield
     except BlfDscError as error:
         raise BlfDscError(f'{name}: {error}') from error
+
+
+def _set_aside(bag: Path, why: str) -> None:
+    """Give a bag, that no result comes from, a name of its own."""
+    there = bag.with_name(f'{why}_{bag.name}')
+    while there.exists():
+        there = there.with_name(f'again_{there.name}')
+    bag.rename(there)
 
 
 class PostureByPosture(ABC):
@@ -195,23 +215,35 @@ class PostureByPosture(ABC):
             name = f'posture {k}'
             way = self._aside(move, self._config, self.position(), posture)
             self._run(way.config, way.duration, f'move {k}')
-            here = self._aside(self._commissioning.motion, self.position())
-            bag = self._run(here.config, here.duration, name)
-            for weak in ('weak', 'again_weak')[:REPEATS]:
+            motion, bag = self._measure(name)
+            while k == 1:
                 with _named(name):
-                    again = self._aside(
-                        stronger, self._commissioning, here, bag, self.position()
-                    )
-                if again is None:
+                    better = self._aside(better_known, self._commissioning, motion, bag)
+                if better is None:
                     break
-                bag.rename(bag.with_name(f'{weak}_{bag.name}'))
-                self._run(again.config, again.duration, name)
-                here = again
-            else:
-                with _named(name):
-                    self._aside(check, bag)
+                self._commissioning = better
+                _set_aside(bag, 'soft')
+                motion, bag = self._measure(name)
             self._measured = k
             yield name, bag
+
+    def _measure(self, name: str) -> tuple[Planned, Path]:
+        """Measure the arm where it rests, again if the motion hides much; return the last one."""
+        motion = self._aside(self._commissioning.motion, self.position())
+        bag = self._run(motion.config, motion.duration, name)
+        for _ in range(REPEATS):
+            with _named(name):
+                again = self._aside(
+                    stronger, self._commissioning, motion, bag, self.position()
+                )
+            if again is None:
+                return motion, bag
+            _set_aside(bag, 'weak')
+            motion = again
+            bag = self._run(motion.config, motion.duration, name)
+        with _named(name):
+            self._aside(check, bag)
+        return motion, bag
 
     def proof(self, steps: Sequence[Step]) -> Iterator[tuple[Step, Errors]]:
         """Yield the errors of each step, to whose start the arm goes slowly.

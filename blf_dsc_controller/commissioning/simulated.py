@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.own_loop import (
@@ -19,6 +20,8 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
+
+Floats = NDArray[np.float64]
 
 _PROOF = 30.0  # s, at most
 
@@ -68,20 +71,35 @@ def runs_of(
     Where noise or friction hide much, it is the run of another motion.  The last one may be beyond
     what soft gains hold: then it is the error.
     """
-    strongest: list[Planned] = []
-    planned = commissioning.motions_from(loop.plant.initial.position)
-    for k, each in enumerate(planned, 1):
-        shaken, run = each, measured(each, loop.plant)
-        for _ in range(REPEATS):
-            again = commissioning.stronger(shaken, run[0])
-            if again is None:
-                break
-            shaken, run = again, measured(again, loop.plant)
+    plant = loop.plant
+    postures = [
+        each.posture for each in commissioning.motions_from(plant.initial.position)
+    ]
+    strongest = []
+    for k, posture in enumerate(postures, 1):
+        shaken, run = _strongest(commissioning, posture, plant)
+        while k == 1 and (better := commissioning.better_known(shaken, run[0])):
+            commissioning = better
+            shaken, run = _strongest(commissioning, posture, plant)
         strongest.append(shaken)
         yield f'posture {k}', run
     payload = loop.controller.robot.payload
     name = f'posture 1 with {payload:g} kg'
     try:
-        yield name, measured(strongest[0], loop.plant, payload)
+        yield name, measured(strongest[0], plant, payload)
     except BlfDscError as error:
         yield name, error
+
+
+def _strongest(
+    commissioning: Commissioning, posture: Floats, plant: PlantConfig
+) -> tuple[Planned, Measured]:
+    """Return a motion around a posture (n,) [rad] that shows enough, or the last, and its run."""
+    shaken = commissioning.motion(posture)
+    run = measured(shaken, plant)
+    for _ in range(REPEATS):
+        again = commissioning.stronger(shaken, run[0])
+        if again is None:
+            break
+        shaken, run = again, measured(again, plant)
+    return shaken, run

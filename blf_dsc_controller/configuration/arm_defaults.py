@@ -101,6 +101,7 @@ def stated_design(
         base,
         robot.efforts(chain),
         motors,
+        robot.unknown_friction(chain),
         robot.payload,
         robot.lag,
         None if is_whole else gains,

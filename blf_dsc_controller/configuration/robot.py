@@ -59,6 +59,8 @@ _PLACEHOLDER = 4.0
 # of that torque, where efforts are placeholders: no arm stretches every link
 _NEEDED = 0.5
 _MOST_FRICTION = 0.25  # of the effort
+UNKNOWN_FRICTION = 0.05
+"""Friction to expect where none is known, over the rated torque: its standard deviation."""
 _SLOWEST = {'revolute': 2.0, 'prismatic': 0.5}  # rad/s or m/s, of the drives of arms
 # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 _ROUNDING = 1e-12
@@ -182,6 +184,13 @@ class Robot:
             'coulomb': self.coulomb
             or tuple(share * joint.friction for joint in chain.joints),
         }
+
+    def unknown_friction(self, chain: Chain) -> np.ndarray:
+        """Return the dry friction (n,) [N m] to expect where none is known."""
+        if self.drive_compensates == 'gravity_and_friction':
+            return np.zeros(len(chain.joints))
+        is_known = np.array(self.friction(chain)['coulomb']) > 0.0
+        return np.where(is_known, 0.0, UNKNOWN_FRICTION * self.efforts(chain))
 
     def drive_inertias(self, chain: Chain, links: np.ndarray) -> np.ndarray:
         """Return the inertias (n, 10) of `links` with the declared payload."""

@@ -12,12 +12,10 @@ import numpy as np
 from blf_dsc_controller.arms.base_parameters import ROTORS, UNKNOWN_ROTOR, prior_factor
 from blf_dsc_controller.arms.model import ArmModel, arm_model, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import parameters_of
+from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION, parameters_of
 from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.run import LearnedArm
 
-FRICTION = 0.05
-"""Standard deviation of unknown friction, over the rated torque."""
 _MOST_FRICTION = 3.0  # times its initial estimate
 
 
@@ -82,7 +80,7 @@ def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Col
     is_viscous = block == 'viscous'
     is_friction = block in {'viscous', 'coulomb'}
     velocity = config.limits.velocity[i] if is_viscous else 1.0
-    usual = FRICTION * config.torque.limit[i] / velocity
+    usual = UNKNOWN_FRICTION * config.torque.limit[i] / velocity
     return Column(
         name=f'{block} {config.joints[i]}',
         unit='N m s/rad' if is_viscous else 'N m',

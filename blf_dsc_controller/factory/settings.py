@@ -17,9 +17,12 @@ from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.layout import filled
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.known_arm import known_arm
-from blf_dsc_controller.configuration.robot import drive_model, parameters_of
+from blf_dsc_controller.configuration.robot import (
+    UNKNOWN_FRICTION,
+    drive_model,
+    parameters_of,
+)
 from blf_dsc_controller.factory.estimate import (
-    FRICTION,
     Column,
     columns_of,
     model_of,
@@ -434,7 +437,7 @@ def _unsure_breakaway(config: ControllerConfig) -> np.ndarray:
     known = np.array(
         config.robot.friction(config.robot.chain(config.joints))['coulomb']
     )
-    usual = FRICTION * np.array(config.torque.limit)
+    usual = UNKNOWN_FRICTION * np.array(config.torque.limit)
     return np.asarray(_BREAKAWAY * np.where(known > 0.0, known, usual))
 
 
