@@ -4,6 +4,7 @@
     python -m benchmark commissioning [ARMS] [STUDY ...]
     python -m benchmark commissioning repeat [ARMS] [STUDY ...]
     python -m benchmark commissioning careful [ARMS] [STUDY ...]
+    python -m benchmark commissioning unknown [ARMS] [STUDY ...]
 
 The arms are those of the studies `monte_carlo_elastic_*`: gears, motors, friction, links,
 delays and tables are drawn independently of what controller and commissioning assume.  Each is
@@ -30,6 +31,16 @@ which they can be raised
     here       likewise, by the last run alone: in the first posture, with the load
     holds      until the arm stops or oscillates within 16 s, by bisection; without a limit
                it is 16
+
+`unknown` commissions the same arms by files that have nothing but the URDF, what drivers know
+of their robot, and the motion: the friction, the motors, the gears and the gains that the
+presets have are left out.  With what is written each runs its motion for 16 s
+
+    hidden     joints whose inertia friction hides
+    bound      the largest error over the bound that is written; or why the arm stopped
+    motion     the largest error [mrad] from 3 s on until the pick-up
+    pick-up    likewise from the pick-up at 8 s on
+    bears      as above
 """
 
 from __future__ import annotations
@@ -52,7 +63,7 @@ from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import draw, plant_with
@@ -65,6 +76,7 @@ STUDIES = (
 )
 MARGIN = 0.5
 LONG, SHORT = 60.0, 16.0  # s
+BEGIN = 3.0  # s, from which errors in motion are counted
 PICK_UP, LOADED = 8.0, 4.0  # s, and for how long after it errors are counted
 FACTORS = (1.5, 2.5, 4.0)
 TIMES = 4  # that an arm is commissioned
@@ -153,18 +165,75 @@ def outcome(name: str, number: int) -> Outcome:
 
 
 def commissioning_of(
-    name: str, number: int, seed: int | None = None
+    name: str,
+    number: int,
+    seed: int | None = None,
+    known: Callable[[ControllerConfig], ControllerConfig] = lambda config: config,
 ) -> tuple[Commissioned, PlantConfig]:
-    """Return what is found of an arm of a study, with a seed of its noise, and its plant."""
+    """Return what is found of an arm of a study, with a seed of its noise, and its plant.
+
+    `known` returns what is known of the arm, by the configuration of the study.
+    """
     study = load_study(name)
+    controller = known(study.controller)
     # motors are drawn, which leaves nothing to scale
     plant = change(plant_with(study, draw(study, number)), {'truth.rotor_factor': 1.0})
     if seed is not None:
         plant = change(plant, {'seed': seed})
-    loop = LoopConfig(plant, study.controller, RecorderConfig())
-    runs = [run for _, run in simulated.runs_of(Commissioning(study.controller), loop)]
+    loop = LoopConfig(plant, controller, RecorderConfig())
+    runs = [run for _, run in simulated.runs_of(Commissioning(controller), loop)]
     measured = [run for run in runs if not isinstance(run, BlfDscError)]
-    return commissioned(study.controller, measured, MARGIN), plant
+    return commissioned(controller, measured, MARGIN), plant
+
+
+_STATED = (
+    'sample_time',
+    'joints',
+    'robot.urdf',
+    'robot.tip',
+    'robot.gravity',
+    'robot.effort',
+    'robot.drive_',
+    'torque.rate_limit',
+    'torque.first_step',
+    'reference.',
+)
+
+
+def by_urdf_alone(config: ControllerConfig) -> ControllerConfig:
+    """Return a configuration that has the URDF, the facts of a driver, and the motion."""
+    stated = {
+        name: value
+        for name, value in flatten(config).items()
+        if name.startswith(_STATED)
+    }
+    return build(ControllerConfig, stated)
+
+
+def unknown(name: str, number: int) -> list[str]:
+    """Return the row of `unknown` for an arm."""
+    first = [name.rpartition('_')[2], f'{number}']
+    try:
+        found, plant = commissioning_of(name, number, known=by_urdf_alone)
+        config = found.config
+    except BlfDscError as error:
+        return [*first, str(error), '', '', '', '']
+    run = simulate(config, change(plant, {'duration': SHORT})).run()
+    hidden = f'{np.isnan(found.findings.inertia).sum()}'
+    bears = f'{borne(without_bound(config), plant):g}'
+    if run.error is None or run.stops:
+        text = run.stops[0].text if run.stops else 'no sample'
+        return [*first, hidden, f'stop: {text}', '', '', bears]
+    errors = np.abs(run.error)
+    moving = (run.time >= BEGIN) & (run.time < PICK_UP)
+    used = f'{float((errors / np.array(config.barrier.bound)).max()):.2f}'
+    if run.oscillations:
+        used += ', oscillates'
+    largest_errors = [
+        f'{1e3 * float(errors[rows].max()):.2g}'
+        for rows in (moving, run.time >= PICK_UP)
+    ]
+    return [*first, hidden, used, *largest_errors, bears]
 
 
 def repeated(name: str, number: int) -> list[str]:
@@ -265,8 +334,9 @@ def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
 HEADS = {
     'repeat': ['arm', 'number', 'times', 'stiffness chosen', 'inertia measured'],
     'careful': ['arm', 'number', 'noise', 'margin', 'here', 'holds'],
+    'unknown': ['arm', 'number', 'hidden', 'bound', 'motion', 'pick-up', 'bears'],
 }
-ROWS = {'repeat': repeated, 'careful': careful}
+ROWS = {'repeat': repeated, 'careful': careful, 'unknown': unknown}
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -769,6 +769,96 @@ def stiff(before, friction=None):
     return seen._replace(before=before, choice=choice, friction=friction)
 
 
+@cache
+def better_known():
+    """Return a commissioning of an arm of which its file has too light motors and no friction.
+
+    With the first run, and with one that was made with what this one shows.
+    """
+    first = blf.Commissioning(
+        build(ControllerConfig, {**GIVEN, 'robot.rotor_inertia': [0.05, 0.02]}),
+        [POSTURE],
+    )
+    friction = {'disturbance.coulomb': [1.0, 0.5], 'disturbance.stribeck': 0.5}
+    arm = change(ARM, {**friction, 'truth.rotor_inertia': [0.6, 0.2]})
+    soft = strongest(first, arm)
+    second = first.better_known(*soft)
+    return first, soft, second, strongest(second, arm)
+
+
+def strongest(commissioning, arm):
+    """Return the last motion that measures a simulated arm, and its run."""
+    motion = commissioning.motion(POSTURE)
+    run, _ = simulated.measured(motion, arm)
+    while again := commissioning.stronger(motion, run):
+        motion = again
+        run, _ = simulated.measured(motion, arm)
+    return motion, run
+
+
+def result_of(commissioning, motion, run):
+    return commissioning.result([(run, motion.config)])
+
+
+def test_unknown_arm_is_measured_again_with_better_gains_and_its_friction():
+    first, soft, second, _ = better_known()
+    shown = result_of(first, *soft)
+    hidden = np.isnan(shown.findings.inertia)
+    assert hidden.any()
+    assert not hidden.all()
+    used, before = second.measured_with, first.measured_with
+    np.testing.assert_allclose(used.robot.coulomb, shown.findings.friction)
+    for name in ('stiffness', 'damping'):
+        gains = np.array(getattr(used.feedback, f'joint_{name}'))
+        start = getattr(shown.start, name)
+        bears = np.array(shown.shown()[f'feedback.joint_{name}'])
+        # of a joint that sticks, not more than twice of what it was measured with
+        most = np.where(hidden, 2.0 * start, np.inf)
+        expected = np.maximum(np.minimum(0.5 * bears, most), start)
+        np.testing.assert_allclose(gains, expected)
+    assert before == first.config
+    assert used.robot.lag == shown.parameters()['robot.lag']
+    assert second.times == first.times - 1
+    assert second.motion(POSTURE).excitation.sliding  # as the last motion
+
+
+def test_arm_that_is_better_known_shows_more_and_its_friction_is_written():
+    first, soft, _, better = better_known()
+    before, after = result_of(first, *soft), result_of(first, *better)
+    hidden = [int(np.isnan(e.findings.inertia).sum()) for e in (before, after)]
+    assert hidden[1] < hidden[0]
+    values = after.parameters()
+    assert 'robot.coulomb' not in before.shown()
+    share = np.array(values['robot.coulomb']) / [1.0, 0.5]
+    assert (share > 0.8).all()
+    assert (share < 2.0).all()  # half as much more near rest
+    told = '\n'.join(sentences(after))
+    assert 'N m is written as robot.coulomb' in told
+    assert 'more friction than robot.coulomb' not in told
+    given = {**GIVEN, 'robot.rotor_inertia': [0.05, 0.02]}
+    assert build(ControllerConfig, {**given, **values}) == after.config
+
+
+def test_arm_that_is_known_enough_is_not_measured_again():
+    """Its inertias are seen and it bears little more; or its gains are given, whatever it hides."""
+    run = simulated.measured(planned(), ARM)
+    calm = blf.Commissioning(CONFIG, [POSTURE])
+    assert calm.better_known(planned(), run[0]) is None
+    _, soft, second, _ = better_known()
+    gains = {
+        f'feedback.joint_{name}': getattr(
+            second.measured_with.feedback, f'joint_{name}'
+        )
+        for name in ('stiffness', 'damping')
+    }
+    given = blf.Commissioning(build(ControllerConfig, {**GIVEN, **gains}), [POSTURE])
+    assert given.better_known(*soft) is None
+    second.times, times = 0, second.times
+    assert second.better_known(*soft) is None
+    second.times = times
+    assert second.better_known(*soft) is not None
+
+
 def test_bound_at_the_tool_is_widened_as_those_of_the_joints_are():
     """By friction of which the file knows nothing, and shared out by the same errors."""
     config = build(ControllerConfig, at_the_tool())

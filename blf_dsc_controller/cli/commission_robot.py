@@ -205,7 +205,14 @@ def _limits(
         'rest and ends'
     )
     again = REPEATS * sum(each.duration for each in slid)
+    if commissioning.times:
+        again += commissioning.times * (1 + REPEATS) * slid[0].duration
+        yield (
+            'of this arm only the URDF is known: where friction hides an inertia, posture 1 is '
+            f'measured anew, up to {commissioning.times} times, with half of the gains that it '
+            'bears by then and the friction that it showed'
+        )
     yield (
         f'the arm moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
-        'every posture is measured three times'
+        'every posture is measured as often as that'
     )

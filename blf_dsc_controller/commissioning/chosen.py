@@ -8,7 +8,6 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.tuning import gains_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.plausibility import (
@@ -64,16 +63,18 @@ def _with_gains(
     config: ControllerConfig, values: Mapping[str, Value]
 ) -> ControllerConfig:
     """Return a configuration with values, and what follows from them but for the bounds."""
-    names = 'feedback.joint_stiffness', 'feedback.joint_damping'
-    gains = JointGains(*(np.array(values[name], float) for name in names))
-    of_robot = {name: values[name] for name in values if name.startswith('robot.')}
     arm, _ = design_of(config)
-    known, _ = design_of(change(config, of_robot))
     given = _given_bound(config)
     before = gains_of(arm, given)
+    of_arm = {
+        name: value
+        for name, value in values.items()
+        if name.startswith(('robot.', 'feedback.joint_'))
+    }
+    known, _ = design_of(change(config, {**of_arm, 'feedback.stiffness': 1.0}))
     if 'barrier.bound' in values:
         given = np.array(values['barrier.bound'], float)
-    after = gains_of(known._replace(joints=gains, stiffness=1.0), given)
+    after = gains_of(known, given)
     present = flatten(config)
     of_tool = _BOUNDS if config.barrier.bounds_tool else ()
     followed = {
