@@ -353,6 +353,40 @@ def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):
     assert np.abs(run.velocity[-1]).max() < 0.01  # rad/s, at rest
 
 
+def test_arm_of_which_little_is_known_is_measured_anew_and_its_bag_gives_the_same(
+    arm, capsys
+):
+    """Its motors are ten times as heavy as in its file, which has no friction."""
+    text = arm.read_text()
+    text = text.replace(
+        'rotor_inertia: [0.3, 0.1], pay', 'rotor_inertia: [0.02, 0.01], pay'
+    )
+    text = text.replace('disturbance: {', 'disturbance: {coulomb: [0.05, 0.03], ')
+    text = text.replace('bound: [0.2, 0.2]', 'bound: [0.9, 0.9]')
+    arm.write_text(text)
+    assert commission(arm, 'plant', '--yes', postures=(NEAR, FAR)) == 0
+    told = capsys.readouterr().out
+    assert 'posture 1 is measured anew, up to 2 times' in told
+    assert 'N m is written as robot.coulomb' in told
+    folder = arm.with_name('out_bags')
+    names = {bag.name for bag in folder.iterdir()}
+    assert {'soft_posture_1', 'posture_1', 'posture_2'} <= names
+    soft, first, second = (
+        read_content(folder / name).controller_config()
+        for name in ('soft_posture_1', 'posture_1', 'posture_2')
+    )
+    assert soft.robot.coulomb == ()
+    assert first.robot.coulomb == second.robot.coulomb != ()
+    assert (np.array(first.feedback.gain) >= soft.feedback.gain).all()
+    out, again = arm.with_name('out.yaml'), arm.with_name('again.yaml')
+    bags = [str(folder / name) for name in ('posture_1', 'posture_2')]
+    assert main(['commission', *bags, '--config', str(arm), '--out', str(again)]) == 0
+    measured, recomputed = (blf.load_loop(each).controller for each in (out, again))
+    date = {'commissioning.date': measured.commissioning.date}
+    assert change(recomputed, date) == measured
+    assert measured.robot.coulomb != ()
+
+
 def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
     """Not once all postures have been measured."""
     coarsen(arm, '5.0e-3')

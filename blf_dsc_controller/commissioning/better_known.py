@@ -92,7 +92,8 @@ def as_measured(
     `configs` are those of the runs.
     """
     given = flatten(configs[-1])
-    if not is_unknown(config) or not given['feedback.joint_stiffness']:
+    is_better_known = given['robot.coulomb'] != config.robot.coulomb
+    if not is_unknown(config) or not is_better_known:
         return config
     values = {name: given[name] for name in _NAMES if given[name] != ()}
     return with_gains(config, {**values, 'feedback.stiffness': 1.0})

@@ -42,6 +42,7 @@ _BOUNDS = 'barrier.bound', 'barrier.initial_bound'  # not of gains, with one at 
 _SOFT = 'noise or friction hide the response: measure again with a larger --torque or --travel'
 
 _ROOM = 1.1  # bound over the errors to expect
+_ENDLESS = 1e3  # rad or m: errors that grow without end are no numbers
 
 
 def with_gains(
@@ -190,7 +191,10 @@ def _check_bound(config: ControllerConfig, least: Floats) -> None:
     ):
         if needed > most:
             unit = 'm' if kind == 'prismatic' else 'rad'
+            far = f'by up to {needed / _ROOM:.2g} {unit}'
+            if needed > _ENDLESS:
+                far = 'without end'
             raise BlfDscError(
                 f'the gains that have the margin are too soft for any bound: {joint} would be off '
-                f'by up to {needed / _ROOM:.2g} {unit}. {_SOFT[0].upper()}{_SOFT[1:]}'
+                f'{far}. {_SOFT[0].upper()}{_SOFT[1:]}'
             )
