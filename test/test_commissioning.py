@@ -26,8 +26,12 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, simulated
 from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
-from blf_dsc_controller.commissioning.chosen import kept_stop
-from blf_dsc_controller.commissioning.commissioning import commissioned, plan
+from blf_dsc_controller.commissioning.chosen import kept_stop, with_gains
+from blf_dsc_controller.commissioning.commissioning import (
+    commissioned,
+    measuring_gains,
+    plan,
+)
 from blf_dsc_controller.commissioning.findings import findings_of
 from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
 from blf_dsc_controller.commissioning.own_loop import REPEATS
@@ -39,7 +43,7 @@ from blf_dsc_controller.commissioning.response import (
     response_of,
 )
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -933,6 +937,35 @@ def test_the_second_motion_shows_a_margin_that_noise_had_hidden():
     )
     found = [commissioning.result([each]) for each in runs]
     assert [each.has_margin for each in found] == [False, True]
+
+
+def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
+    """Four times the gains of the others are too high; play and friction keep it within bounds."""
+    arm, _ = design_of(CONFIG)
+    stiff = measuring_gains(arm).scaled(4.0)
+    given = {
+        'feedback.joint_stiffness': tuple(stiff.stiffness.tolist()),
+        'feedback.joint_damping': tuple(stiff.damping.tolist()),
+    }
+    loose = {'joint.backlash': [4e-4, 4e-4], 'disturbance.coulomb': [1.0, 0.5]}
+    plant = change(ARM, loose)
+    assert true_loop(stiff, found().loops.inertia).margin().value == 0.0  # unstable
+    commissioning = blf.Commissioning(with_gains(CONFIG, given), [POSTURE])
+    (first,) = commissioning.motions
+    run = simulated.measured(first, plant)
+    result = commissioning.result([run])
+    with pytest.raises(BlfDscError, match=r'or the arm nearly oscillates .*\(their'):
+        result.parameters()
+    assert any('a smaller feedback.stiffness' in each for each in sentences(result))
+    again = commissioning.stronger(first, run[0])
+    assert (first.share, again.share) == (1.0, 0.5)
+    assert again.config.feedback.gain == tuple(0.5 * stiff.damping)
+    assert (
+        commissioning.motion(POSTURE).config.feedback.gain == again.config.feedback.gain
+    )
+    chosen = commissioning.result([simulated.measured(again, plant)])
+    assert chosen.has_margin
+    assert chosen.start.damping == pytest.approx(stiff.damping)
 
 
 def test_a_posture_is_measured_twice_at_most_and_motion_that_is_hidden_is_an_error():

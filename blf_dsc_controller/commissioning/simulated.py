@@ -71,7 +71,8 @@ def runs_of(
     strongest: list[Planned] = []
     planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):
-        shaken, run = each, measured(each, loop.plant)
+        shaken = commissioning.motion(each.posture)
+        run = measured(shaken, loop.plant)
         for _ in range(REPEATS):
             again = commissioning.stronger(shaken, run[0])
             if again is None:
