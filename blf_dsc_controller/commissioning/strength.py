@@ -8,7 +8,8 @@ more than its gains do, it is measured again with swings that keep its joints sl
 sticks shows its friction, of which a steady motion has none.
 
 An arm that nearly oscillates with the gains of its measurement makes noise of its own, which no
-torque overcomes.  It is measured again with half of them: the response is the same.
+torque overcomes, and the controller reports it.  It is measured again with half of them: the
+response is the same.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Shown(NamedTuple):
 
     factor: float  # from 1 to `MOST`, on the torque of a motion that hides little
     rubs: bool  # friction damps a joint more than its gains do
-    rings: bool  # noise hides much, and the arm nearly oscillates with these gains
+    rings: bool  # noise hides much, and the arm oscillates with these gains, or nearly
 
 
 def shown_by(run: Run, config: ControllerConfig) -> Shown:
@@ -60,5 +61,5 @@ def shown_by(run: Run, config: ControllerConfig) -> Shown:
     return Shown(
         factor=float(np.clip(taken / LITTLE, 1.0, MOST)),
         rubs=rubs(response, gains.damping),
-        rings=taken > LITTLE and clean < BARELY,
+        rings=bool(run.oscillations) and taken > LITTLE and clean < BARELY,
     )
