@@ -5,6 +5,7 @@
     python -m benchmark commissioning repeat [ARMS] [STUDY ...]
     python -m benchmark commissioning careful [ARMS] [STUDY ...]
     python -m benchmark commissioning unknown [ARMS] [STUDY ...]
+    python -m benchmark commissioning above [ARMS] [STUDY ...]
 
 The arms are those of the studies `monte_carlo_elastic_*`: gears, motors, friction, links,
 delays and tables are drawn independently of what controller and commissioning assume.  Each is
@@ -41,6 +42,10 @@ presets have are left out.  With what is written each runs its motion for 16 s
     motion     the largest error [mrad] from 3 s on until the pick-up
     pick-up    likewise from the pick-up at 8 s on
     bears      as above
+
+`above` says whether a motion that ends at 120 Hz misses anything: the modulus margin of the true
+linear arms up to there and above, in the postures of the measurement, with gains of the preset and
+multiples of them.  Play and friction are left out.
 """
 
 from __future__ import annotations
@@ -56,17 +61,33 @@ import numpy as np
 
 from benchmark.harness import print_table
 from benchmark.studies import load_study
+from blf_dsc_controller.arms.joint_gains import linear
+from blf_dsc_controller.arms.linear_loop import (
+    SLOWEST,
+    Feedback,
+    Joints,
+    Timing,
+    TorqueLoop,
+    arm_response,
+    law_response,
+)
+from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.choice import Loops
-from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.commissioning import (
+    Commissioned,
+    commissioned,
+    measuring_gains,
+    postures_of,
+)
 from blf_dsc_controller.commissioning.own_loop import Commissioning
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.monte_carlo import draw, plant_with
+from blf_dsc_controller.studies.monte_carlo import Study, draw, plant_with
 from blf_dsc_controller.studies.runs import cores
 
 STUDIES = (
@@ -86,6 +107,8 @@ MOST, HALVINGS = (
     16.0,
     6,
 )  # the largest factor on the gains that is tried, and how finely
+SEEN = 120.0  # Hz, the fastest line of the motion
+STIFFER = (1.0, 2.0, 4.0)  # times the gains of the preset
 FREE = 0.3  # rad, a bound that no law leaves unless it shakes
 
 
@@ -297,6 +320,64 @@ def careful(name: str, number: int) -> list[str]:
     return [name.rpartition('_')[2], f'{number}', *(f'{f:.2g}' for f in factors)]
 
 
+def drawn_joints(study: Study, number: int) -> tuple[Joints, Timing]:
+    """Return what is between torques and links of an arm of a study, without play and friction."""
+    plant = plant_with(study, draw(study, number))
+    drives, sensor = plant.actuator, plant.sensor
+    loop = TorqueLoop(drives.loop_gain, drives.loop_damping, drives.loop_lag)
+    joints = Joints(
+        motors=np.array(plant.truth.rotor_inertia),
+        viscous=np.array(plant.disturbance.viscous),
+        stiffness=np.array(plant.joint.stiffness),
+        damping_ratio=plant.joint.damping_ratio,
+        torque_loop=loop if drives.loop_gain > 0.0 else None,
+        motor_side=sensor.side == 'motor',
+    )
+    filtered = 1.0 / sensor.velocity_pole if sensor.velocity_pole > 0.0 else 0.0
+    timing = Timing(plant.sample_time, 1 + drives.delay, drives.time_constant, filtered)
+    return joints, timing
+
+
+def least_of(
+    links: np.ndarray,
+    arm: tuple[Joints, Timing],
+    law: Feedback,
+    frequency: np.ndarray,
+) -> float:
+    """Return the least singular value of I + G C at frequencies (f,) [Hz], in all postures."""
+    s = np.asarray(2j * np.pi * frequency, np.complex128)
+    G, C = arm_response(links, *arm, s), law_response(law, arm[1], s)
+    loop = np.eye(links.shape[-1]) + np.matmul(G, C)
+    return float(np.linalg.svd(loop, compute_uv=False).min())
+
+
+def above(name: str, count: int) -> Iterator[list[str]]:
+    """Compute the rows of `above` for a study."""
+    study = load_study(name)
+    arm, _ = design_of(study.controller)
+    P = arm.parameters.of(arm.chain.inertias, 0.0 * arm.rotors)
+    links = inertia_matrices(arm.parameters.model, P, postures_of(study.controller))
+    inertia = arm.over_postures().inertia
+    fastest = 0.48 / study.plant.sample_time
+    bands = np.geomspace(SLOWEST, SEEN, 400), np.geomspace(SEEN, fastest, 800)[1:]
+    arms = [drawn_joints(study, number) for number in range(count)]
+    for factor in STIFFER:
+        law = linear(measuring_gains(arm).scaled(factor), inertia, len(links))
+        least = np.array(
+            [[least_of(links, each, law, f) for f in bands] for each in arms]
+        )
+        yield [
+            name.rpartition('_')[2],
+            f'{count}',
+            f'{factor:g}',
+            *(
+                f'{each:.2f}'
+                for each in (*np.median(least, axis=0), *least.min(axis=0))
+            ),
+            f'{np.count_nonzero(least[:, 1] < least[:, 0])}',
+        ]
+
+
 def of_arms(
     row: Callable[[str, int], list[str]], names: tuple[str, ...], count: int
 ) -> Iterator[list[str]]:
@@ -335,6 +416,16 @@ HEADS = {
     'repeat': ['arm', 'number', 'times', 'stiffness chosen', 'inertia measured'],
     'careful': ['arm', 'number', 'noise', 'margin', 'here', 'holds'],
     'unknown': ['arm', 'number', 'hidden', 'bound', 'motion', 'pick-up', 'bears'],
+    'above': [
+        'arm',
+        'arms',
+        'times the gains',
+        'margin to 120 Hz, median',
+        'above',
+        'to 120 Hz, worst',
+        'above',
+        'least above',
+    ],
 }
 ROWS = {'repeat': repeated, 'careful': careful, 'unknown': unknown}
 
@@ -347,9 +438,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> None:
     """Print a table."""
     words = options.words
-    what = words.pop(0) if words and words[0] in ROWS else ''
+    what = words.pop(0) if words and words[0] in HEADS else ''
     many, *given = words or ['2' if what else '20']
     names = tuple(given) or STUDIES
+    if what == 'above':
+        margins = (row for name in names for row in above(name, int(many)))
+        print_table(HEADS[what], margins)
+        return
     if what:
         print_table(HEADS[what], of_arms(ROWS[what], names, int(many)))
         return

@@ -26,8 +26,12 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, simulated
 from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
-from blf_dsc_controller.commissioning.chosen import kept_stop
-from blf_dsc_controller.commissioning.commissioning import commissioned, plan
+from blf_dsc_controller.commissioning.chosen import kept_stop, with_gains
+from blf_dsc_controller.commissioning.commissioning import (
+    commissioned,
+    measuring_gains,
+    plan,
+)
 from blf_dsc_controller.commissioning.findings import findings_of
 from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
 from blf_dsc_controller.commissioning.own_loop import REPEATS
@@ -39,7 +43,7 @@ from blf_dsc_controller.commissioning.response import (
     response_of,
 )
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
-from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -48,7 +52,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.run import Stop
+from blf_dsc_controller.run import FIRST_STAMP, Oscillation, Stop
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 
@@ -1023,6 +1027,38 @@ def test_the_second_motion_shows_a_margin_that_noise_had_hidden():
     )
     found = [commissioning.result([each]) for each in runs]
     assert [each.has_margin for each in found] == [False, True]
+
+
+def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
+    """Four times the gains of the others are too high; play and friction keep it within bounds."""
+    arm, _ = design_of(CONFIG)
+    stiff = measuring_gains(arm).scaled(4.0)
+    given = {
+        'feedback.joint_stiffness': tuple(stiff.stiffness.tolist()),
+        'feedback.joint_damping': tuple(stiff.damping.tolist()),
+    }
+    loose = {'joint.backlash': [4e-4, 4e-4], 'disturbance.coulomb': [1.0, 0.5]}
+    plant = change(ARM, loose)
+    assert true_loop(stiff, found().loops.inertia).margin().value == 0.0  # unstable
+    commissioning = blf.Commissioning(with_gains(CONFIG, given), [POSTURE])
+    (first,) = commissioning.motions
+    run = simulated.measured(first, plant)
+    result = commissioning.result([run])
+    with pytest.raises(BlfDscError, match=r'or the arm nearly oscillates .*\(their'):
+        result.parameters()
+    assert any('a smaller feedback.stiffness' in each for each in sentences(result))
+    # friction and coarse encoders look alike, but for what the controller reports
+    assert commissioning.stronger(first, run[0]).share == 1.0
+    reported = Oscillation(FIRST_STAMP, 'joint2', 25.0, 8.0, 1.0, 'it oscillates')
+    again = commissioning.stronger(first, replace(run[0], oscillations=(reported,)))
+    assert (first.share, again.share) == (1.0, 0.5)
+    assert again.config.feedback.gain == tuple(0.5 * stiff.damping)
+    assert (
+        commissioning.motion(POSTURE).config.feedback.gain == again.config.feedback.gain
+    )
+    chosen = commissioning.result([simulated.measured(again, plant)])
+    assert chosen.has_margin
+    assert chosen.start.damping == pytest.approx(stiff.damping)
 
 
 def test_a_posture_is_measured_twice_at_most_and_motion_that_is_hidden_is_an_error():

@@ -102,6 +102,25 @@ def test_a_slower_motion_beneath_changes_nothing():
     assert not oscillates(watched(slow, 30.0 * np.sin(np.pi * t)))
 
 
+@pytest.mark.parametrize('frequency', [184.0, 95.0])
+def test_a_light_link_that_rattles_while_friction_reverses_is_none(frequency):
+    """The last wrist of a UR5e in the play of its gear, in steps of its encoder of 17 bits.
+
+    4 N m of friction reverse within 60 ms, a seventh of the limit; the torque shakes by
+    2 %, or by a tenth, which is an oscillation.
+    """
+    t = np.arange(0.0, 1.0, 1e-3)
+    step = 4.8e-5  # rad
+    envelope = np.exp(-np.abs(t - 0.5) / 0.03)
+    rattle = np.sin(2.0 * np.pi * frequency * t) * envelope
+    q = np.rint(3e-4 * rattle / step) * step
+    reversal = 2.0 / 28.0 * LIMIT * np.tanh((t - 0.48) / 0.015)
+    seen = watched(q, reversal - 0.02 * LIMIT * rattle, noise=0.0, resolution=step)
+    assert not oscillates(seen)
+    strong = reversal - 0.1 * LIMIT * rattle
+    assert oscillates(watched(q, strong, noise=0.0, resolution=step))
+
+
 @pytest.mark.parametrize(
     ('noise', 'resolution'), [(2e-6, 0.0), (1e-4, 0.0), (0.0, 3.8e-4)]
 )

@@ -200,6 +200,7 @@ def _limits(
         f'where friction damps a joint more than its gains do, likewise, with swings of {swings} '
         'N m, and friction, which keep all joints sliding'
     )
+    yield 'where the arm nearly oscillates, likewise, with half of the gains of the file'
     yield (
         f'an error of {bound} rad, any other check of the controller, or Ctrl-C brings the arm to '
         'rest and ends'

@@ -38,6 +38,9 @@ Complex = NDArray[np.complex128]
 MARGIN = 0.5
 """Modulus margin of the gains that are chosen."""
 
+BARELY = 0.1
+"""Modulus margin, noise not counted, with which an arm nearly oscillates."""
+
 _STEP = 1.1
 _LEAST, _MOST = 0.05, 100.0  # times the damping of the measurement
 _OF_ONE = 5.0  # times that of all joints, of one joint by itself
@@ -92,13 +95,13 @@ class Loops(NamedTuple):
         """Return for each posture the least singular value of I + L (f,), and its doubt."""
         return [self._least(each, gains)[:2] for each in self.responses]
 
-    def margin(self, gains: JointGains) -> Margin:
-        """Return the margin of gains, noise counted against it."""
+    def margin(self, gains: JointGains, *, noise: bool = True) -> Margin:
+        """Return the margin of gains, `noise` counted against it or not."""
         margins = []
         for k, response in enumerate(self.responses):
             value, doubt, direction = self._least(response, gains)
             counts = response.seen & (response.frequency >= SLOWEST)
-            counted = np.where(counts, value - doubt, np.inf)
+            counted = np.where(counts, value - noise * doubt, np.inf)
             at = int(counted.argmin())
             joint = int(np.abs(direction[at]).argmax())
             frequency = float(response.frequency[at])

@@ -17,6 +17,7 @@ from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.better_known import as_measured, known_friction
 from blf_dsc_controller.commissioning.choice import (
+    BARELY,
     MARGIN,
     Choice,
     Loops,
@@ -35,6 +36,7 @@ from blf_dsc_controller.configuration.plausibility import hint_at_degrees
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run
+from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.reference_load import along
 
 Floats = NDArray[np.float64]
@@ -59,6 +61,7 @@ class Planned(NamedTuple):
     values: dict[str, object]  # of it, that differ from those of the arm in use
     posture: Floats  # (n,) rad
     excitation: motion.Excitation
+    share: float = 1.0  # of the gains of the arm in use
 
     @property
     def duration(self) -> float:
@@ -95,6 +98,22 @@ class Commissioned(NamedTuple):
         """Whether the chosen gains have the modulus margin."""
         return self.choice.margin.value >= self.aim
 
+    @property
+    def what_hides(self) -> str:
+        """What may hide the response of an arm whose gains have no margin, and what to do."""
+        own = self.loops.margin(self.start, noise=False)
+        if own.value >= BARELY:
+            return (
+                'noise or friction hide the response. Measure again with a larger --torque or '
+                '--travel'
+            )
+        return (
+            'noise or friction hide the response, or the arm nearly oscillates with the gains of '
+            f'its file, near {two_digits(own.frequency)} Hz (their modulus margin is '
+            f'{own.value:.2g}). Measure again with a smaller feedback.stiffness, or with a larger '
+            '--torque or --travel'
+        )
+
     def parameters(self) -> dict[str, Value]:
         """Return the parameters that follow, by dotted name.
 
@@ -102,8 +121,7 @@ class Commissioned(NamedTuple):
         """
         if not self.has_margin:
             raise BlfDscError(
-                f'no gains have the modulus margin of {self.aim:g}: noise or friction hide the '
-                'response. Measure again with more torque or travel'
+                f'no gains have the modulus margin of {self.aim:g}: {self.what_hides}'
             )
         values = self.shown()
         return values | kept_bound(with_gains(self.before, values))
@@ -167,10 +185,12 @@ def plan(
     torque: float = TORQUE,
     travel: float = TRAVEL,
     sliding: bool = False,
+    share: float = 1.0,
 ) -> list[Planned]:
     """Return the motions around postures (k, n) [rad] by which an arm is measured.
 
-    `sliding` adds swings that keep joints sliding which would stick without.
+    `sliding` adds swings that keep joints sliding which would stick without.  They have a
+    `share` of the gains of the configuration.
 
     Raises BlfDscError if the arm is not from a URDF; if its feedback acts through the
     inertia matrix, which may make an arm with elastic joints unstable; or if its damping
@@ -190,13 +210,28 @@ def plan(
             f'feedback.damping_lag: got {config.feedback.damping_lag:g} s, but the margin of gains '
             'that are chosen is that of damping which does not lag: give 0.0'
         )
+    gains = _softer(config, share)
+    arm = with_gains(config, gains) if gains else config
     planned = []
     for posture in postures:
         _check_posture(config, posture)
-        excitation = motion.excitation(config, posture, torque, travel, sliding=sliding)
-        values = motion.shaken(config, excitation, posture)
-        planned.append(Planned(change(config, values), values, posture, excitation))
+        excitation = motion.excitation(arm, posture, torque, travel, sliding=sliding)
+        values = {**gains, **motion.shaken(arm, excitation, posture)}
+        planned.append(Planned(change(arm, values), values, posture, excitation, share))
     return planned
+
+
+def _softer(config: ControllerConfig, share: float) -> dict[str, Value]:
+    """Return a share of the gains of the measurement, by dotted name: none, if it is all."""
+    if share == 1.0:
+        return {}
+    arm, _ = design_of(config)
+    gains = measuring_gains(arm).scaled(share)
+    return {
+        'feedback.joint_stiffness': tuple(gains.stiffness.tolist()),
+        'feedback.joint_damping': tuple(gains.damping.tolist()),
+        'feedback.stiffness': 1.0,
+    }
 
 
 def commissioned(

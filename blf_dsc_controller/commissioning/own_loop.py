@@ -37,8 +37,9 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.run import Run
 
 REPEATS = 2
-"""Times that a posture is measured again, at most: with swings, and with more torque."""
+"""Times that a posture is measured again, at most: softer, with swings, and with more torque."""
 
+_SOFTER = 0.5  # of the gains, with which an arm is measured that nearly oscillates
 _WORTH = 1.2  # times the amplitude, for which a posture is measured again
 
 Measured = tuple[Run, ControllerConfig]
@@ -97,6 +98,7 @@ class Commissioning:
         self._postures = postures
         self._torque = torque
         self._travel = travel
+        self._share = 1.0  # of the gains, once the arm was found to oscillate nearly
 
     @cached_property
     def motions(self) -> list[Planned]:
@@ -124,10 +126,14 @@ class Commissioning:
     def motion(self, posture: ArrayLike) -> Planned:
         """Return the motion around a posture (n,) [rad], such as that of the arm at rest.
 
+        Once `stronger` has found that the arm nearly oscillates, it has softer gains.
+
         Raises:
             BlfDscError: the posture is not one of this arm, or too near its limits.
         """
-        return self._motion(posture, self._torque, sliding=self.slides)
+        return self._motion(
+            posture, self._torque, sliding=self.slides, share=self._share
+        )
 
     def sliding(self, posture: ArrayLike) -> Planned:
         """Return the motion around a posture (n,) [rad] with swings that keep joints sliding.
@@ -142,9 +148,10 @@ class Commissioning:
     ) -> Planned | None:
         """Return a motion to repeat one with: with more torque, if noise hides much in its run.
 
-        With swings, if friction damps a joint more than its gains do.  It is around a posture
-        (n,) [rad], or that of the motion.  None: enough is seen, or the travel of the tool and
-        the speeds permit no more.
+        With swings, if friction damps a joint more than its gains do; with half of the gains,
+        if the arm nearly oscillates with them, and then all later motions have these.  It is
+        around a posture (n,) [rad], or that of the motion.  None: enough is seen, or the travel
+        of the tool and the speeds permit no more.
 
         Raises:
             BlfDscError: the run does not show the response.
@@ -155,8 +162,11 @@ class Commissioning:
         if shown.factor == 1.0 and sliding == slid:
             return None
         around = motion.posture if posture is None else posture
-        again = self._motion(around, shown.factor * self._torque, sliding=sliding)
-        if sliding != slid:
+        share = motion.share * (_SOFTER if shown.rings else 1.0)
+        self._share = min(self._share, share)
+        torque = shown.factor * self._torque
+        again = self._motion(around, torque, sliding=sliding, share=share)
+        if sliding != slid or shown.rings:
             return again
         before, after = (each.excitation.amplitude for each in (motion, again))
         gained = float((after[:, :-SLOW_TONES] / before[:, :-SLOW_TONES]).max())
@@ -189,7 +199,12 @@ class Commissioning:
         return better
 
     def _motion(
-        self, posture: ArrayLike, torque: float, *, sliding: bool = False
+        self,
+        posture: ArrayLike,
+        torque: float,
+        *,
+        sliding: bool = False,
+        share: float = 1.0,
     ) -> Planned:
         (motion,) = plan(
             self.measured_with,
@@ -197,6 +212,7 @@ class Commissioning:
             torque=torque,
             travel=self._travel,
             sliding=sliding,
+            share=share,
         )
         return motion
 

@@ -130,10 +130,7 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
         f'{two_digits(choice.measured.frequency)} Hz'
     )
     if not found.has_margin:
-        yield (
-            f'NO GAINS HAVE THE MARGIN of {found.aim:g}: noise or friction hide the response. '
-            'Measure again with a larger --torque or --travel'
-        )
+        yield (f'NO GAINS HAVE THE MARGIN of {found.aim:g}: {found.what_hides}')
     if choice.by_inertia.any():
         names = ', '.join(np.array(found.joints)[choice.by_inertia])
         yield (

@@ -6,6 +6,10 @@ first, weak motion shows how much it takes; where that is much, the posture is m
 with the torque that makes it little, as far as `MOST` allows.  Where friction damps a joint
 more than its gains do, it is measured again with swings that keep its joints sliding: one that
 sticks shows its friction, of which a steady motion has none.
+
+An arm that nearly oscillates with the gains of its measurement makes noise of its own, which no
+torque overcomes, and the controller reports it.  It is measured again with half of them: the
+response is the same.
 """
 
 from __future__ import annotations
@@ -14,9 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.linear_loop import SLOWEST
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.commissioning.choice import Loops
+from blf_dsc_controller.commissioning.choice import BARELY, Loops
 from blf_dsc_controller.commissioning.commissioning import measuring_gains
 from blf_dsc_controller.commissioning.findings import rubs
 from blf_dsc_controller.commissioning.motion import lines_in
@@ -36,6 +39,7 @@ class Shown(NamedTuple):
 
     factor: float  # from 1 to `MOST`, on the torque of a motion that hides little
     rubs: bool  # friction damps a joint more than its gains do
+    rings: bool  # noise hides much, and the arm oscillates with these gains, or nearly
 
 
 def shown_by(run: Run, config: ControllerConfig) -> Shown:
@@ -46,16 +50,16 @@ def shown_by(run: Run, config: ControllerConfig) -> Shown:
     try:
         response = response_of(run, lines_in(config), config.sample_time)
     except HiddenError:
-        return Shown(MOST, rubs=False)
+        return Shown(MOST, rubs=False, rings=False)
     arm, _ = design_of(config)
     P = arm.parameters.of(arm.chain.inertias, arm.rotors)
     (M,) = inertia_matrices(arm.parameters.model, P, response.posture[None])
     gains = measuring_gains(arm)
     loops = Loops((response,), np.diagonal(M), config.sample_time)
-    ((value, doubt),) = loops.singular_values(gains)
-    counted = response.seen & (response.frequency >= SLOWEST)
-    taken = value[counted].min() - (value - doubt)[counted].min()
+    clean = loops.margin(gains, noise=False).value
+    taken = clean - loops.margin(gains).value
     return Shown(
         factor=float(np.clip(taken / LITTLE, 1.0, MOST)),
         rubs=rubs(response, gains.damping),
+        rings=bool(run.oscillations) and taken > LITTLE and clean < BARELY,
     )

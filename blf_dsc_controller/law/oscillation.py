@@ -7,14 +7,17 @@ In it, the error e and the applied torque tau of each joint are
     p = (s/(s + w))^2 e,      u = s/(s + w) tau,      w = 2 pi 8 Hz
 
 A half wave of p ends where p has turned back by a quarter of it.  It counts if it is
-longer than what noise and steps of the sensor explain, if the amplitude sqrt(2 mean u^2)
-of the torque is a twentieth of its limit, if it takes about as long as those before it,
-and if it is not shorter than four half waves earlier.  Six in a row are an oscillation,
-or four of which the last two grow:
+longer than what noise and steps of the sensor explain, if the amplitude
+sqrt(2 mean (u - m)^2) of the torque is a twentieth of its limit, if it takes about as
+long as those before it, and if it is not shorter than four half waves earlier.  m is the
+mean of u in this half wave and the one before.  Six in a row are an oscillation, or four
+of which the last two grow:
 
 - Noise, also that of coarse encoders, is irregular, or its half waves are too short.
 - A push, a load that is picked up, a reversal of friction, or a step of the reference
   excites what dies out, in any loop that is not about to oscillate.
+- Where friction reverses, its compensation sweeps the torque by more than a twentieth,
+  and a light link may rattle in the play of its gear.  m takes that sweep away.
 - Torque ripple has about a hundredth of the limit.
 - A reference of fast tones is followed: the error does not show it.
 
@@ -67,7 +70,9 @@ class Oscillation(NamedTuple):
     slow: Annotated[Array, 2, 'n']  # rad, lags of e
     torque: Annotated[Array, 'n']  # N m, lag of tau
     square: Annotated[Array, 'n']  # (N m)^2 s, int u^2 since the last half wave ended
+    sum: Annotated[Array, 'n']  # N m s, int u since then
     span: Annotated[Array, 'n']  # s, since then
+    before: Annotated[Array, 2, 'n']  # N m s and s, `sum` and `span` of that half wave
     amplitude: Annotated[Array, 'n']  # N m, of u in the last half wave
     # of p in the present half wave: 1, -1; 0: none yet
     direction: Annotated[Array, 'n']
@@ -107,6 +112,7 @@ def watch(
         u = torque[i] - now.torque[i]
         now.torque[i] += share * u
         now.square[i] += dt * u * u
+        now.sum[i] += dt * u
         now.span[i] += dt
         now.since[i] += dt
         now.calm[i] += dt
@@ -168,7 +174,9 @@ def count_down(now: Oscillation, limit: Array, dt: float) -> bool:
 def forget(now: Oscillation, i: int, p: float) -> None:
     """Wait for the next half wave of joint i, from p [rad] on."""
     now.waves[i] = now.grown[i] = now.amplitude[i] = 0.0
-    now.square[i] = now.span[i] = now.since[i] = now.farthest_at[i] = 0.0
+    now.square[i] = now.sum[i] = now.span[i] = 0.0
+    now.before[0, i] = now.before[1, i] = 0.0
+    now.since[i] = now.farthest_at[i] = 0.0
     now.turn[i] = now.farthest[i] = p
 
 
@@ -182,6 +190,23 @@ def forget_all(now: Oscillation) -> None:
 
 
 @inner
+def end_span(now: Oscillation, i: int) -> float:
+    """Return the amplitude of the torque [N m] in the half wave that ends, and begin another.
+
+    It is about the mean of two half waves; of a first one, which may be half of a wave
+    about nothing, it is about 0.
+    """
+    here = now.sum[i] / now.span[i]
+    mean = 0.0
+    if now.before[1, i] > 0.0:
+        mean = (now.before[0, i] + now.sum[i]) / (now.before[1, i] + now.span[i])
+    square = now.square[i] / now.span[i] - mean * (2.0 * here - mean)
+    now.before[0, i], now.before[1, i] = now.sum[i], now.span[i]
+    now.square[i] = now.sum[i] = now.span[i] = 0.0
+    return sqrt(2.0 * max(0.0, square))
+
+
+@inner
 def end_half_wave(
     now: Oscillation, i: int, travel: float, is_clear: bool, strong: float
 ) -> None:
@@ -190,8 +215,7 @@ def end_half_wave(
     `strong` [N m] is the least amplitude of its torque.
     """
     half = now.farthest_at[i]
-    now.amplitude[i] = sqrt(2.0 * now.square[i] / now.span[i])
-    now.square[i] = now.span[i] = 0.0
+    now.amplitude[i] = end_span(now, i)
     k = int(now.waves[i])
     counts = is_clear and half < _LONGEST and now.amplitude[i] > strong
     ratio = half / now.half[i] if k > 0 else 1.0
