@@ -745,6 +745,16 @@ def test_inertia_that_fits_with_the_longest_lag_alone_is_not_believed():
     assert 'would fit best' not in '\n'.join(sentences(found()))
 
 
+def test_inertia_that_is_not_believed_in_one_posture_is_told_as_such():
+    seen = found()
+    findings = seen.findings._replace(
+        inertia=np.full(2, np.nan), unfit=np.array([[True, False], [False, False]])
+    )
+    told = '\n'.join(sentences(seen._replace(findings=findings)))
+    assert 'joint1: an inertia would fit best with a lag' in told
+    assert 'friction hides the inertia of joint2:' in told
+
+
 def at_the_tool(**given):
     """Return the moving arm with a bound of 5 mm at the end of its second link."""
     moves = flatten(moving())
