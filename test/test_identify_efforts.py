@@ -31,6 +31,7 @@ from blf_dsc_controller.identification.left_out import transmitted_torques
 from blf_dsc_controller.identification.mounting import gravity_columns
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.problems import is_usable, problems_of
+from blf_dsc_controller.identification.regression import correlation_length
 from blf_dsc_controller.identification.summary import notes_of
 from blf_dsc_controller.identification.values import (
     COULOMB,
@@ -201,6 +202,19 @@ def test_friction_shows_a_sign_only_if_both_of_its_parts_agree(viscous, coulomb,
     z = np.array([viscous, coulomb, 0.0])
     fit = _Fit(np.ones(3), z, 1e3 * np.eye(3), 1.0, 1.0, 1.0)
     assert _sign(fit, [0, 1], 1.0) == sign
+
+
+@pytest.mark.parametrize(
+    ('residual', 'length'),
+    [
+        ([0.0, 0.0, 0.0, 0.0], 1.0),  # an exact fit
+        ([1.0, 1.0, 1.0, 1.0], 1.0 + 2.0 * (3.0 + 2.0 + 1.0) / 4.0),
+        ([1.0, -1.0, 1.0, -1.0], 1.0),
+        ([1.0, 1.0, -1.0, -1.0], 1.0 + 2.0 * 1.0 / 4.0),
+    ],
+)
+def test_residuals_count_as_long_as_they_are_alike(residual, length):
+    assert correlation_length(np.array(residual)) == pytest.approx(length)
 
 
 @pytest.mark.parametrize(('recorded', 'chosen'), [(1.01, 1.0), (1.03, -1.0)])
