@@ -41,7 +41,7 @@ from blf_dsc_controller.commissioning.response import (
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import load_loop, read
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError
@@ -909,6 +909,14 @@ def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
     )
     assert main([*common, '--out', str(by_arm)]) == 1  # exists
     assert 'exists already' in capsys.readouterr().err
+
+
+def test_proof_has_the_largest_error_of_its_whole_run_or_the_reason_of_a_stop():
+    loop = load_loop('recommended', {PLANT: {'duration': 0.5}})
+    error = simulate(loop.controller, loop.plant).run().error
+    assert simulated.proof(loop) == (0.5, np.abs(error).max(), '')
+    slow = change(loop.controller, {'safety.velocity_limit': 0.02})
+    assert 'velocity_limit' in simulated.proof(loop._replace(controller=slow)).stop
 
 
 def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
