@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,12 +30,18 @@ from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
 from blf_dsc_controller.commissioning.chosen import kept_stop
 from blf_dsc_controller.commissioning.commissioning import commissioned, plan
 from blf_dsc_controller.commissioning.findings import findings_of
-from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
+from blf_dsc_controller.commissioning.motion import (
+    SETTLING,
+    SLOW_TONES,
+    excitation,
+    lines_in,
+)
 from blf_dsc_controller.commissioning.own_loop import REPEATS
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import (
     Response,
     _noise,
+    _period,
     refined,
     response_of,
 )
@@ -909,6 +916,20 @@ def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
     )
     assert main([*common, '--out', str(by_arm)]) == 1  # exists
     assert 'exists already' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('period', 'T'), [(8.0, 1e-3), (12.0, 1.0 / 600.0)])
+def test_period_of_a_run_has_all_of_its_samples(period, T):
+    """12 s / (1 / 600 s) is a little less than 7200 in floats."""
+    count = round((SETTLING + period + 1.0) / T)
+    stamp = np.rint(1e9 * T * np.arange(count)).astype(np.int64)
+    rows = np.arange(float(count))[:, np.newaxis]
+    run = SimpleNamespace(
+        stamp=stamp, stops=(), torque=rows, position=rows, velocity=rows, duration=0.0
+    )
+    for values in _period(run, period, T):
+        assert len(values) == round(period / T) + 1
+        np.testing.assert_array_equal(np.diff(values[:, 0]), 1.0)
 
 
 def test_proof_has_the_largest_error_of_its_whole_run_or_the_reason_of_a_stop():

@@ -92,14 +92,12 @@ def watched(torque, seconds=0.3):
     return state
 
 
-def test_r_that_shakes_is_found_and_one_that_takes_a_load_or_is_small_is_not():
-    shakes = watched(
-        lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * np.array([1.0, 0.0])
-    )
-    assert (shakes.fault[0], shakes.joint[0]) == (SHAKES, 0)
-    small = watched(
-        lambda t: 0.5 * np.sin(2.0 * np.pi * 30.0 * t) * np.array([1.0, 0.0])
-    )
+@pytest.mark.parametrize('joint', [0, 1])
+def test_r_that_shakes_is_found_and_one_that_takes_a_load_or_is_small_is_not(joint):
+    share = np.eye(2)[joint] * LIMIT / 80.0
+    shakes = watched(lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * share)
+    assert (shakes.fault[0], shakes.joint[0]) == (SHAKES, joint)
+    small = watched(lambda t: 0.5 * np.sin(2.0 * np.pi * 30.0 * t) * share)
     load = watched(lambda t: 20.0 * (1.0 - np.exp(-60.0 * t)) * np.array([1.0, 0.1]))
     assert (small.fault[0], load.fault[0]) == (NONE, NONE)
 
