@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,19 +34,25 @@ from blf_dsc_controller.commissioning.commissioning import (
     plan,
 )
 from blf_dsc_controller.commissioning.findings import findings_of
-from blf_dsc_controller.commissioning.motion import SLOW_TONES, excitation, lines_in
+from blf_dsc_controller.commissioning.motion import (
+    SETTLING,
+    SLOW_TONES,
+    excitation,
+    lines_in,
+)
 from blf_dsc_controller.commissioning.own_loop import REPEATS
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.response import (
     Response,
     _noise,
+    _period,
     refined,
     response_of,
 )
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import load_loop, read
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.errors import BlfDscError
@@ -749,6 +756,16 @@ def test_inertia_that_fits_with_the_longest_lag_alone_is_not_believed():
     assert 'would fit best' not in '\n'.join(sentences(found()))
 
 
+def test_inertia_that_is_not_believed_in_one_posture_is_told_as_such():
+    seen = found()
+    findings = seen.findings._replace(
+        inertia=np.full(2, np.nan), unfit=np.array([[True, False], [False, False]])
+    )
+    told = '\n'.join(sentences(seen._replace(findings=findings)))
+    assert 'joint1: an inertia would fit best with a lag' in told
+    assert 'friction hides the inertia of joint2:' in told
+
+
 def at_the_tool(**given):
     """Return the moving arm with a bound of 5 mm at the end of its second link."""
     moves = flatten(moving())
@@ -993,6 +1010,28 @@ def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
     )
     assert main([*common, '--out', str(by_arm)]) == 1  # exists
     assert 'exists already' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('period', 'T'), [(8.0, 1e-3), (12.0, 1.0 / 600.0)])
+def test_period_of_a_run_has_all_of_its_samples(period, T):
+    """12 s / (1 / 600 s) is a little less than 7200 in floats."""
+    count = round((SETTLING + period + 1.0) / T)
+    stamp = np.rint(1e9 * T * np.arange(count)).astype(np.int64)
+    rows = np.arange(float(count))[:, np.newaxis]
+    run = SimpleNamespace(
+        stamp=stamp, stops=(), torque=rows, position=rows, velocity=rows, duration=0.0
+    )
+    for values in _period(run, period, T):
+        assert len(values) == round(period / T) + 1
+        np.testing.assert_array_equal(np.diff(values[:, 0]), 1.0)
+
+
+def test_proof_has_the_largest_error_of_its_whole_run_or_the_reason_of_a_stop():
+    loop = load_loop('recommended', {PLANT: {'duration': 0.5}})
+    error = simulate(loop.controller, loop.plant).run().error
+    assert simulated.proof(loop) == (0.5, np.abs(error).max(), '')
+    slow = change(loop.controller, {'safety.velocity_limit': 0.02})
+    assert 'velocity_limit' in simulated.proof(loop._replace(controller=slow)).stop
 
 
 def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():

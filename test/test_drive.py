@@ -406,3 +406,18 @@ def test_friction_of_an_estimate_is_that_of_its_columns():
     ]
     found = friction_torque(settings, estimate, dq)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize('bias', [True, False])
+def test_settings_of_friction_are_those_of_its_columns(bias):
+    given = {'viscous': True, 'coulomb': True, 'bias': bias}
+    config = build(ControllerConfig, {f'learning.{k}': on for k, on in given.items()})
+    names = estimate_names(config)
+    settings = settings_of_config(config)
+    found = settings.friction
+    assert names[found.first_viscous] == 'viscous joint1'
+    assert names[found.first_coulomb] == 'coulomb joint1'
+    own = slice(found.first_coulomb, found.first_coulomb + 2)
+    for name in ('variance', 'least', 'most'):
+        of_theta = getattr(settings.adaptation, name)
+        np.testing.assert_array_equal(getattr(found, name), of_theta[own])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import threading
 import time
 from types import SimpleNamespace
 
@@ -237,6 +238,19 @@ def test_messages_arrive_whole_in_order_and_of_any_size():
         ours.flush()
         got += theirs.messages()
     assert got == sent
+
+
+def test_wait_ends_with_a_message_and_not_before():
+    ours, theirs = linked()
+    sender = threading.Timer(0.2, lambda: (ours.put(3, b'late'), ours.flush()))
+    sender.start()
+    theirs.wait(60.0)
+    assert [*theirs.messages()] == [(3, b'late')]
+    sender.join()
+    ours.close()
+    theirs.wait(60.0)
+    assert [*theirs.messages()] == []
+    assert theirs.broken
 
 
 def test_what_is_not_taken_is_dropped_and_counted_and_the_rest_is_whole():

@@ -26,11 +26,12 @@ from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification import signs as signs_module
 from blf_dsc_controller.identification.identify import identify_arm
-from blf_dsc_controller.identification.joint_alone import _Fit, _sign
+from blf_dsc_controller.identification.joint_alone import _Fit, _sign, errors_alone
 from blf_dsc_controller.identification.left_out import transmitted_torques
 from blf_dsc_controller.identification.mounting import gravity_columns
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.problems import is_usable, problems_of
+from blf_dsc_controller.identification.regression import correlation_length
 from blf_dsc_controller.identification.summary import notes_of
 from blf_dsc_controller.identification.values import (
     COULOMB,
@@ -201,6 +202,35 @@ def test_friction_shows_a_sign_only_if_both_of_its_parts_agree(viscous, coulomb,
     z = np.array([viscous, coulomb, 0.0])
     fit = _Fit(np.ones(3), z, 1e3 * np.eye(3), 1.0, 1.0, 1.0)
     assert _sign(fit, [0, 1], 1.0) == sign
+
+
+def test_errors_of_joints_alone_are_what_their_values_and_delays_leave():
+    random = np.random.default_rng(4)
+    X, rate = random.normal(size=(9, 2, 3)), random.normal(size=(9, 2))
+    values, left = random.normal(size=(2, 4)), random.normal(size=(9, 2))
+    u = np.einsum('kia,ia->ki', X, values[:, :3]) - rate * values[:, 3] - left
+    rows = SimpleNamespace(
+        u_and_rate=lambda _: (u, rate),
+        blocks=lambda _: [slice(0, 2), slice(2, 5)],
+        matrix=lambda windows: X[windows],
+        rms=lambda values, _: np.sqrt(np.mean(values**2, axis=0)),
+    )
+    test = np.array([1, 2, 4, 5, 8])
+    found = errors_alone(rows, test, SimpleNamespace(values=values))
+    np.testing.assert_allclose(found, np.sqrt(np.mean(left[test] ** 2, axis=0)))
+
+
+@pytest.mark.parametrize(
+    ('residual', 'length'),
+    [
+        ([0.0, 0.0, 0.0, 0.0], 1.0),  # an exact fit
+        ([1.0, 1.0, 1.0, 1.0], 1.0 + 2.0 * (3.0 + 2.0 + 1.0) / 4.0),
+        ([1.0, -1.0, 1.0, -1.0], 1.0),
+        ([1.0, 1.0, -1.0, -1.0], 1.0 + 2.0 * 1.0 / 4.0),
+    ],
+)
+def test_residuals_count_as_long_as_they_are_alike(residual, length):
+    assert correlation_length(np.array(residual)) == pytest.approx(length)
 
 
 @pytest.mark.parametrize(('recorded', 'chosen'), [(1.01, 1.0), (1.03, -1.0)])

@@ -86,6 +86,11 @@ def test_joints_that_come_in_two_messages_are_one_arm(tmp_path, late):
         read_recording(bag, PANDA_TEXT, commanded=True)
 
 
+def test_joints_of_two_publishers_of_ros1_are_one_arm(tmp_path):
+    parts = messages(PANDA[:4], TIME), messages(PANDA[4:], TIME)
+    is_the_motion(read_recording(ros1_file(tmp_path / 'bag', *parts), PANDA_TEXT), 2e-4)
+
+
 # What is checked of tables is checked of bags.
 
 
@@ -100,13 +105,24 @@ def ros2_folder(path, entries):
     return path
 
 
-def ros1_file(path, entries):
+def ros1_file(path, *parts):
+    """Write a bag of ROS 1 of these parts, each of a publisher of its own."""
     ros1 = get_typestore(Stores.ROS1_NOETIC)
     ros2 = typestore()
     path = path.with_suffix('.bag')
     with Ros1Writer(path) as bag:
-        topic = bag.add_connection('/joint_states', JOINT_STATE, typestore=ros1)
-        for k, (received, raw) in enumerate(entries):
+        topics = [
+            bag.add_connection(
+                '/joint_states', JOINT_STATE, typestore=ros1, callerid=f'/{k}'
+            )
+            for k in range(len(parts))
+        ]
+        entries = sorted(
+            (*entry, topic)
+            for topic, part in zip(topics, parts, strict=True)
+            for entry in part
+        )
+        for k, (received, raw, topic) in enumerate(entries):
             message = ros2.deserialize_cdr(raw, JOINT_STATE)
             header = ros1.types['std_msgs/msg/Header'](
                 seq=k, stamp=message.header.stamp, frame_id=''

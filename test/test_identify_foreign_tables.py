@@ -77,16 +77,16 @@ def refused(path, *entries):
 # What the tools of ROS print.
 
 
-def test_rostopic_echo_p_is_read_with_its_names_and_nanoseconds(tmp_path):
+@pytest.mark.parametrize('measured', [('position', 'velocity'), ('position',)])
+def test_rostopic_echo_p_is_read_with_its_names_and_nanoseconds(tmp_path, measured):
     n = range(len(SHUFFLED))
-    fields = [
-        f'field.{field}{k}' for field in ('position', 'velocity', 'effort') for k in n
-    ]
+    fields = [f'field.{field}{k}' for field in (*measured, 'effort') for k in n]
     head = ['%time', 'field.header.seq', 'field.header.stamp', 'field.header.frame_id']
     lines = [','.join([*head, *(f'field.name{k}' for k in n), *fields])]
     for k, t in enumerate(TIME):
         stamp = EPOCH * 10**9 + round(t * 1e9)
-        values = [*Q[k, ORDER], *np.zeros(6), *TAU[k, ORDER]]
+        velocities = np.zeros(6 * ('velocity' in measured))
+        values = [*Q[k, ORDER], *velocities, *TAU[k, ORDER]]
         cells = [f'{stamp + 999}', f'{k}', f'{stamp}', 'base', *SHUFFLED]
         lines.append(','.join([*cells, *(f'{value:.9g}' for value in values)]))
     path = tmp_path / 'a.csv'
@@ -124,6 +124,14 @@ def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path):
             comments='',
         )
         is_read(path)
+
+
+def test_nanoseconds_of_two_clocks_are_no_part_of_one_time(tmp_path):
+    names = ['sec', 'nanosec', 'received.nanosec', *numbered('q'), *numbered('tau')]
+    nanoseconds = np.round(TIME * 1e9)
+    path = tmp_path / 'a.csv'
+    written(path, names, (0.0 * TIME, nanoseconds, nanoseconds, Q, TAU))
+    assert 'which column is the time is not clear' in refused(path)
 
 
 # Separators, headers, orders.

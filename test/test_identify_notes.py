@@ -28,6 +28,7 @@ from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import inertia_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.identification import summary
 from blf_dsc_controller.identification.foresight import foresee, foresight_lines
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import problems_of
@@ -115,6 +116,21 @@ def test_joint_that_hardly_needs_a_torque_is_named(plain):
 def test_value_that_is_nothing_beside_its_interval_is_zero(value, text):
     """Such as a rotor that the fit puts on its bound."""
     assert interval(value, 0.1 / TWO_SIDED) == text
+
+
+def test_base_parameters_have_intervals_and_say_what_is_not_shown(monkeypatch):
+    monkeypatch.setattr(summary, 'base_matrix', lambda *_: np.eye(2))
+    found = SimpleNamespace(
+        parameters=SimpleNamespace(combinations=('m1', 'm2')),
+        chain=SimpleNamespace(joints=('joint1',)),
+        prior=np.array([1.0, 2.0]),
+        values=np.array([3.0, 2.5]),
+        prior_covariance=np.diag([1.0, 4.0]),
+        covariance=np.diag([0.01, 4.0]),
+    )
+    _, shown, unseen = (' '.join(line.split()) for line in summary.base_table(found))
+    assert shown == '1 -> 3 +- 0.2 m1'
+    assert unseen.startswith('2 -> 2.5 +- 3.9 m2 NOT SHOWN')
 
 
 def test_joints_with_the_same_fault_are_in_one_note(simple):

@@ -15,9 +15,12 @@ from random_arm import (
     truth_of,
 )
 
+from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.identification import zeros
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import is_usable, problems_of
+from blf_dsc_controller.identification.windows import rows_of
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
 QUARTER = 0.5 * np.pi
@@ -57,6 +60,28 @@ def test_zeros_that_are_quarter_turns_off_are_named_and_not_applied(states, offs
     # 1 % of noise, which windows smooth; bodies that no arm has explain much as it is
     assert found.other_zeros.error < 1.0
     assert found.score.total[2] > 5.0
+
+
+def test_friction_explains_the_torques_of_its_own_windows(states, monkeypatch):
+    recording = recording_of(states[::EVERY], period=1e-3 * EVERY)
+    chain = ROBOT.chain(recording.joints)
+    rows = rows_of(recording, base_parameters(chain, ROBOT.gravity).model)
+    seen = []
+    monkeypatch.setattr(zeros, '_POSTURES', 20)  # one in several windows
+
+    def keep(*given):
+        seen.append(given)
+        raise LookupError
+
+    monkeypatch.setattr(zeros, '_Gravity', keep)
+    with pytest.raises(LookupError):
+        zeros.likely_zeros(recording, ROBOT)
+    ((_, _, _, u, friction),) = seen
+    assert len(u) >= 20
+    for own, columns in zip(u, friction, strict=True):
+        (k,) = np.flatnonzero((rows.u(0.0) == own).all(axis=1))
+        for column in columns:
+            assert (rows.friction[k] == column).all(axis=1).any()
 
 
 def test_right_zeros_are_not_doubted(states):

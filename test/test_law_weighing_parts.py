@@ -208,11 +208,14 @@ def test_row_has_columns_of_its_own_for_breakaway_and_lost_torque_of_each_joint(
     load = SETTINGS.columns[:INERTIAL, :LOAD] @ state.solution[K : K + LOAD]
     np.testing.assert_allclose(held, state.solution[:INERTIAL] + load)
     signs = np.array([0.9, -0.4])
-    weighing.extend_row(given, np.array([0.7, -0.2]), signs, held, row)
-    torque = given[:, :INERTIAL] @ held
-    shapes = np.append([0.7, -0.2], np.abs(torque) * signs)
-    (expected,) = with_friction(given[np.newaxis], np.zeros(2 * N), shapes[np.newaxis])
-    np.testing.assert_allclose(row, expected)
+    for carried in (held, -held):  # friction does not drive where the gear pulls
+        weighing.extend_row(given, np.array([0.7, -0.2]), signs, carried, row)
+        torque = given[:, :INERTIAL] @ carried
+        shapes = np.append([0.7, -0.2], np.abs(torque) * signs)
+        (expected,) = with_friction(
+            given[np.newaxis], np.zeros(2 * N), shapes[np.newaxis]
+        )
+        np.testing.assert_allclose(row, expected)
 
 
 def test_share_of_slow_rows_is_that_of_their_weights():

@@ -25,6 +25,7 @@ from blf_dsc_controller.messages.errors import (
     MissingJointError,
     ShortArrayError,
 )
+from blf_dsc_controller.messages.strings import decode_string, encode_string
 
 STAMP = 1_734_000_123_456_789_012
 NAMES = st.lists(st.text('abé/_ ', max_size=9), min_size=1, max_size=8, unique=True)
@@ -76,6 +77,13 @@ def test_encoded_messages_equal_full_serialisation(names, fields, data):
             encode([*numbers, 0.0])
     time = made('builtin_interfaces/Time', *divmod(STAMP, 10**9))
     assert encode_clock(STAMP) == cdr('rosgraph_msgs/Clock', time)
+
+
+@given(st.text(max_size=9))
+def test_encoded_string_equals_full_serialisation(text):
+    raw = encode_string(text)
+    assert raw == cdr('std_msgs/String', text)
+    assert decode_string(raw) == text
 
 
 def test_array_of_another_size_or_label_has_another_layout():

@@ -8,6 +8,7 @@ import re
 import sys
 from collections import deque
 from functools import partial
+from types import SimpleNamespace
 
 import numba
 import numpy as np
@@ -135,6 +136,34 @@ def test_a_load_that_nobody_tells_the_drives_is_warned_of(ros, log):
     fr3 = flatten(load_loop('fr3').controller)
     ros.add(ControllerNode, fr3 | {'load.tell_drive': True}, namespace='told')
     ros.until(lambda: log('told', 'without load.service no load is declared', WARN))
+
+
+def test_findings_of_a_running_law_are_warned_of_once_each():
+    told = []
+    node = SimpleNamespace(_contacts=0, _oscillations=0, _untrusted='')
+    node.get_logger = lambda: SimpleNamespace(warning=told.append)
+    contacts = SimpleNamespace(count=0, last=None)
+    guard = SimpleNamespace(
+        findings=SimpleNamespace(contacts=contacts, untrusted=''),
+        calming=SimpleNamespace(count=0, text='softer'),
+    )
+
+    def warned():
+        told.clear()
+        for _ in range(2):
+            ControllerNode._warn(node, guard)
+        return told
+
+    assert warned() == []
+    contacts.count, contacts.last = 1, SimpleNamespace(text='a contact')
+    assert warned() == ['a contact']
+    guard.calming.count = 1
+    assert warned() == ['softer']
+    guard.findings.untrusted = 'no sensors'
+    assert warned() == ['no sensors']
+    guard.findings.untrusted = ''
+    contacts.count, contacts.last = 2, SimpleNamespace(text='another contact')
+    assert warned() == ['another contact']
 
 
 def test_diagnostics_tell_what_is_held(ros):

@@ -75,6 +75,15 @@ def at(vector, t):
     return sampled(vector, np.array([t]))[0]
 
 
+def test_target_is_checked_beyond_the_longest_blend():
+    """A short blend is over long before the target is too fast."""
+    late = minimum_jerk(T0 + np.array([5.0, 5.5]), np.array([[0.0, 0.0], [3.0, 0.0]]))
+    start = stop(T0, *np.zeros((2, 2)), limits())
+    with pytest.raises(MotionError, match='the reference exceeds the limits'):
+        blend([start], late, T0, limits(), longest=1.0)
+    blend([start], late, T0, limits(longest=2.0), longest=1.0)
+
+
 @pytest.mark.parametrize('main', [PAPER, POINTS], ids=['sinusoids', 'points'])
 @pytest.mark.parametrize('start', [AT_REST, MOVING], ids=['at rest', 'moving'])
 def test_approach_leads_from_the_measured_state_to_the_reference_as_fast_as_allowed(

@@ -374,13 +374,16 @@ def test_point_that_needs_more_time_for_braking_is_still_reached(speed, goal, ti
     )
 
 
-def test_jerk_free_of_zeros_or_not_the_acceleration_is_monotonic_between_turning_times():
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_jerk_free_of_zeros_or_not_the_acceleration_is_monotonic_between_turning_times(
+    sign,
+):
     """With jerk zeros at 0.2 and 0.5 of a piece of 1 s, at 0.75 of one, none, and outside."""
     derivative = np.polynomial.polynomial.polyfromroots
     jerks = derivative([0.2, 0.5]), derivative([0.75]), (3.0,), derivative([-1.0, 2.0])
     pieces = np.zeros((4, 1, 6))
     for piece, jerk in zip(pieces, jerks, strict=True):
-        rise = np.polynomial.Polynomial(jerk).integ(3).coef
+        rise = sign * np.polynomial.Polynomial(jerk).integ(3).coef
         piece[0, : rise.size] = rise
     knots = np.arange(4.0)
     found = turning_times(spline_term(knots, pieces), 1)

@@ -10,6 +10,7 @@ import pytest
 from law_part import part
 
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law import torque_sensors
 from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
 from blf_dsc_controller.messages.journal import EventType
@@ -17,6 +18,7 @@ from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.not_sensors import joint_of, text_of
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from sim_plant.plant import plant_of
 
@@ -90,14 +92,12 @@ def watched(torque, seconds=0.3):
     return state
 
 
-def test_r_that_shakes_is_found_and_one_that_takes_a_load_or_is_small_is_not():
-    shakes = watched(
-        lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * np.array([1.0, 0.0])
-    )
-    assert (shakes.fault[0], shakes.joint[0]) == (SHAKES, 0)
-    small = watched(
-        lambda t: 0.5 * np.sin(2.0 * np.pi * 30.0 * t) * np.array([1.0, 0.0])
-    )
+@pytest.mark.parametrize('joint', [0, 1])
+def test_r_that_shakes_is_found_and_one_that_takes_a_load_or_is_small_is_not(joint):
+    share = np.eye(2)[joint] * LIMIT / 80.0
+    shakes = watched(lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * share)
+    assert (shakes.fault[0], shakes.joint[0]) == (SHAKES, joint)
+    small = watched(lambda t: 0.5 * np.sin(2.0 * np.pi * 30.0 * t) * share)
     load = watched(lambda t: 20.0 * (1.0 - np.exp(-60.0 * t)) * np.array([1.0, 0.1]))
     assert (small.fault[0], load.fault[0]) == (NONE, NONE)
 
@@ -137,6 +137,16 @@ def test_r_fades_out_and_comes_back_smoothly_and_stays_whole_without_doubt():
     state.fault[0] = SHAKES
     torque_sensors.fade(state, faded, is_off=False, dt=0.005)
     assert faded[0] == pytest.approx(1.0 - np.exp(-1.0))
+
+
+def test_joint_that_shows_it_is_named_with_its_own_difference():
+    law = controller_of(load_loop('fr3_direct').controller)
+    law.state.sensors.fault[0] = OFF
+    law.state.sensors.joint[0] = 2
+    law.signals.sensors.differences[0, :3] = [1.0, 2.0, -3.5]
+    joints = [f'j{i}' for i in range(7)]
+    assert "the effort of joint 'j2' is off -3.5 N m" in text_of(law, joints)
+    assert joint_of(law, joints) == 'j2'
 
 
 def loop_of(preset, seconds, **plant):
