@@ -188,7 +188,7 @@ def _simulated(
     loop = load_loop(path)
     planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):
-        print(f'posture {k}: {page.description(each)}')
+        print(f'posture {k}: {page.description(each)}', flush=True)
     names, runs = [], []
     with announced_compilation(print_notice):
         made = simulated.runs_of(commissioning, loop)
