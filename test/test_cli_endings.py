@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import traceback
 import warnings
@@ -16,7 +17,7 @@ from runpy import run_path
 
 import numpy as np
 import pytest
-from command import finished
+from command import finished, wait_for
 from recorded_run import limited_files
 
 from blf_dsc_controller.cli.parser import make_parser
@@ -69,7 +70,7 @@ BEFORE_THEIR_LOOP = {
     'run over ROS': 'run --config arm.yaml --mode lockstep --duration 0.1 --out out',
 }
 """Commands that need processes or real time: they end here before these begin."""
-ELSEWHERE = {'arms', 'precompile'}
+ELSEWHERE = {'arms', 'precompile'}  # which has processes of its own
 
 
 @pytest.fixture(scope='module')
@@ -253,6 +254,40 @@ def is_interrupted(ended, name):
     )
     assert not any('Traceback' in line for line in ended.lines)
     assert not any(file.endswith(PART) for file in ended.files)
+
+
+@pytest.mark.parametrize('moment', ['importing', 'compiling'])
+def test_ctrl_c_ends_the_processes_that_precompile_in_one_line(tmp_path, moment):
+    """A terminal sends it to all of them. What they have left in the cache is whole."""
+    place = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
+    words = ['-m', 'blf_dsc_controller', 'precompile', '--config', 'recommended']
+    started = subprocess.Popen(
+        [sys.executable, *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | place,
+        start_new_session=True,
+    )
+    if moment == 'importing':
+        wait_for(
+            lambda: len(children_of(started.pid)) == 3
+        )  # one is multiprocessing's own
+        lines = []
+    else:
+        lines = [started.stderr.readline()]
+        assert lines[0].startswith(COMPILING)
+    children = children_of(started.pid)
+    os.killpg(started.pid, signal.SIGINT)
+    lines += started.communicate()[1].splitlines()
+    assert started.returncode == 130, lines
+    said = [line for line in lines if COMPILING not in line]
+    assert said == ['blf_dsc precompile: interrupted']
+    wait_for(lambda: not any(Path(f'/proc/{each}').exists() for each in children))
+    assert not [*tmp_path.rglob('*.tmp.*')]
+
+
+def children_of(pid):
+    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
 
 
 @pytest.mark.parametrize('name', ['monte-carlo', 'run over ROS'])

@@ -32,9 +32,11 @@ from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.result_folder import (
-    discard_unrecorded,
+    BAG,
+    discard_unbegun,
+    expect_folder,
+    keep,
     make_folder,
-    make_run_folder,
 )
 
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
@@ -263,14 +265,29 @@ def test_interrupted_before_the_loop_began_a_run_leaves_nothing_and_may_be_repea
 
 def test_folder_of_a_run_without_a_bag_goes_at_an_interrupt(tmp_path):
     """And one that is empty; not that of a recorded run, nor what another command has made."""
-    made = [make_run_folder(tmp_path / name) for name in ('waiting', 'recorded')]
+    made = [make_folder(tmp_path / name, BAG) for name in ('waiting', 'recorded')]
     (made[0] / 'config.yaml').touch()
     (made[1] / 'bag').mkdir()
     others = [make_folder(tmp_path / name) for name in ('empty', 'figures')]
     (others[1] / 'figures.json').touch()
-    assert discard_unrecorded() == [made[0], others[0]]
+    assert discard_unbegun() == [made[0], others[0]]
     assert [made[1], others[1]] == [each for each in (*made, *others) if each.exists()]
-    assert discard_unrecorded() == []
+    assert discard_unbegun() == []
+
+
+def test_folder_that_a_recorder_makes_goes_until_its_run_begins(tmp_path):
+    """Not one that was there before."""
+    before, begun, unbegun = (
+        tmp_path / name for name in ('before', 'begun', 'unbegun')
+    )
+    before.mkdir()
+    for folder in (before, begun, unbegun):
+        expect_folder(folder)
+        folder.mkdir(exist_ok=True)
+        (folder / 'bag_0.mcap').touch()
+    keep(begun)
+    assert discard_unbegun() == [unbegun]
+    assert [before, begun] == sorted(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -400,6 +400,17 @@ def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_s
         assert load_plant(file(section(pattern, of_ros))).seed == 2
 
 
+@pytest.mark.parametrize('name', ['use_sim_time', 'start_type_description_service'])
+def test_switches_of_ros_are_checked_as_a_node_would(file, name):
+    """A word in quotes is a text, with which no node starts. Sections of others are theirs."""
+    expected = 'but a bool is expected: write true or false, without quotes'
+    for pattern in ('sim_plant', '/**'):
+        (problem,) = problems_of(file(section(pattern, f"{name}: 'true'")))
+        assert problem == f'line 2: {name}: got "true", {expected}'
+    others = section('other_node', f"{name}: 'true'") + section('sim_plant', 'seed: 2')
+    assert load_plant(file(others)).seed == 2
+
+
 def test_a_damping_that_damps_nothing_is_told_apart_from_those_that_do(file):
     """The name of d2 was taken for the damping of a joint."""
     path = file(section('blf_dsc_controller', 'feedback.damping: [5.0, 5.0]'))

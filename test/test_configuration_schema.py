@@ -116,6 +116,21 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             'got [1, 2], but a double array is expected, with a dec',
         ),
         (PLANT, {'duration': '1'}, 'got "1", but a double is expected'),
+        (
+            PLANT,
+            {'duration': '1.0'},
+            'got "1.0", but a double is expected: write it without quotes',
+        ),
+        (
+            PLANT,
+            {'load.torque': ['1.0', '2.0']},
+            'got ["1.0", "2.0"], but a double array is expected: write it without quotes',
+        ),
+        (
+            PLANT,
+            {'publish_clock': 'no'},
+            'got "no", but a bool is expected: write it without quotes',
+        ),
         (PLANT, {'duration': True}, 'got true, but a double is expected'),
         (PLANT, {'seed': True}, 'got true, but an integer is expected'),
         (PLANT, {'seed': 2.0}, 'got 2.0, but an integer is expected'),

@@ -21,7 +21,7 @@ from recorded_run import MILLISECOND, START, compared, of
 from blf_dsc_controller.bags import older_parameters
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
+from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL, speed_text
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.earlier_names import RENAMED, chosen_by
 from blf_dsc_controller.configuration.nodes import load_loop
@@ -547,6 +547,20 @@ def test_identical_replay_exits_with_zero_and_a_verdict_on_an_older_processor(ba
     assert run.returncode == 0, run.stderr
     assert '/blf_dsc_controller/commands: 2004 values bit-equal' in run.stdout
     assert 'x real time' in run.stdout
+
+
+@pytest.mark.parametrize(
+    ('times', 'said'),
+    [
+        (0.034, '0.034x real time'),
+        (0.42, '0.42x real time'),
+        (1.26, '1.3x real time'),
+        (9.7, '10x real time'),
+        (123.4, '123x real time'),
+    ],
+)
+def test_speed_of_a_slow_computer_is_not_rounded_to_zero(times, said):
+    assert speed_text(times) == said
 
 
 def test_bag_replays_without_its_urdf_file_and_is_read_with_unknown_parameters(

@@ -301,6 +301,7 @@ def test_driver_that_clips_commands_is_told_by_its_effort():
     )
     assert guard.supervisor.reason is Reason.NO_EFFECT
     assert 'N m of what is commanded' in guard.supervisor.text
+    assert 'its drive gives less than it is sent: correct' in guard.supervisor.text
 
 
 def test_command_has_no_effect_if_it_changed_by_a_fifth_of_its_limit_for_a_while():

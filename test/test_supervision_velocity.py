@@ -59,6 +59,19 @@ def test_wrist_does_not_drift_after_its_wrong_velocity_has_broken_the_bound():
     assert np.abs(dq[-1]).max() < 0.02
 
 
+def test_velocities_that_are_always_0_name_the_remedy_also_of_an_arm_in_motion():
+    """Of a driver that sends zeros from the start; one that sends others has a fault."""
+    texts = []
+    for factor in (0.0, -1.0):
+        rig = Rig()
+        rig.sense = lambda state, by=factor: [state.raw(dq=by * state.dq)]
+        rig.step(500)
+        assert 'its positions change by' in rig.supervisor.text
+        texts.append(rig.supervisor.text)
+    remedy = 'set safety.velocity to estimated'
+    assert [remedy in text for text in texts] == [True, False]
+
+
 def test_velocities_are_those_of_the_positions_after_the_stop_and_a_reset():
     rig = Rig({'safety.torque': 'hold_gravity'})
     rig.step(200)
@@ -95,6 +108,8 @@ def test_wrong_velocity_is_found_before_the_start():
         rig.guard.observe(rig.base + k * MILLISECOND, measurement)
     assert rig.supervisor.reason is Reason.VELOCITY
     assert not rig.guard.commanding
+    remedy = 'if the hardware measures none, set safety.velocity to estimated'
+    assert remedy in rig.supervisor.text
 
 
 @pytest.mark.parametrize('entry', [0, 2])  # a position, a velocity

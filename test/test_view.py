@@ -330,6 +330,22 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     view.close()
 
 
+def test_page_that_is_opened_late_draws_what_it_receives_and_says_from_when(ros):
+    """Topics of curves keep no past, and those of events do."""
+    arm, _ = ros.loop({**EVENT, 'autostart': False})
+    assert configure(ros, arm)
+    assert activate(ros, arm)
+    ros.run(arm, 3000)
+    view = ros.add(ViewNode, port=18380)
+    ros.until(lambda: len(view.past) > 3)
+    first = view.past[0].time
+    assert first >= 3.0
+    (noted,) = events_with(view, 'earlier curves are not sent again')
+    assert noted[:2] == (first, 'view')
+    assert [t for t, *_ in events_with(view, '0.25 kg picked up')] == [1.0]
+    view.close()
+
+
 def test_contact_is_on_the_page_and_in_diagnostics(ros):
     """4 N at 8 s, once the arm has been learned."""
     view = ros.add(ViewNode, port=18280)

@@ -116,12 +116,17 @@ def replay(options: Namespace) -> int:
     result = verify(options.bag, options.namespace, names, options.law)
     seconds = result.duration
     took = time.perf_counter() - begin
-    speed = f'{seconds:.3f} s in {took:.2f} s: {seconds / took:.0f}x real time'
+    speed = f'{seconds:.3f} s in {took:.2f} s: {speed_text(seconds / took)}'
     print(f'{result.samples} samples, {speed}')
     print('\n'.join(_verification(result)))
     if result.difference is not None:
         return DIFFERENT
     return PARTIAL if result.is_partial else 0
+
+
+def speed_text(times: float) -> str:
+    """Return how many times as fast as real time, with two digits below 10."""
+    return f'{times:.0f}x real time' if times >= 9.5 else f'{times:.2g}x real time'
 
 
 def _announce(bags: Sequence[Path], what: str) -> None:

@@ -10,7 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from blf_dsc_controller.cli.main import INTERRUPTED
-from blf_dsc_controller.cli.result_folder import only_if_begun
+from blf_dsc_controller.cli.result_folder import (
+    discard_unbegun,
+    expect_folder,
+    keep,
+)
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.run import STOPPED, print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
@@ -54,7 +58,8 @@ def drive(options: Namespace) -> int:
     if end := end_of_waypoints(config):
         print(end)
     with ExitStack() as ending:
-        begin = ending.enter_context(only_if_begun(options.out))
+        expect_folder(options.out)
+        ending.callback(discard_unbegun)
         with announced_compilation(print_notice):
             controller = ArmController(config, record=options.out, stamps='wall')
         ros = None
@@ -76,7 +81,7 @@ def drive(options: Namespace) -> int:
         )
         with signals_to(loop.request_end):
             print_notice(f'controlling {options.robot}: Ctrl-C ends')
-            begin()
+            keep(options.out)
             outcome = loop.run()
         _print(outcome, loop, controller)
     if ros is not None and ros.problem:

@@ -24,7 +24,7 @@ from blf_dsc_controller.cli.parser import (
     make_parser,
     parse,
 )
-from blf_dsc_controller.cli.result_folder import discard_unrecorded
+from blf_dsc_controller.cli.result_folder import discard_unbegun
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
 
@@ -87,7 +87,7 @@ def _code_of(options: argparse.Namespace) -> int:
         )
         return 1
     except KeyboardInterrupt:
-        discard_unrecorded()
+        discard_unbegun()
         print(f'blf_dsc {options.command}: interrupted', file=sys.stderr)
         return INTERRUPTED
     return code or 0
@@ -150,7 +150,7 @@ def _interrupt(program: str, _number: int, _frame: object) -> None:
     """
     numba = sys.modules.get('numba.core.compiler_lock')
     if numba is not None and numba.global_compiler_lock.is_locked():
-        discard_unrecorded()
+        discard_unbegun()
         os.write(2, f'{program}: interrupted\n'.encode())
         os._exit(INTERRUPTED)
     raise KeyboardInterrupt

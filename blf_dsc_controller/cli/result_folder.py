@@ -1,38 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a command's results: always a new one, and none of a run that never began."""
+"""The folder of a command's results: always a new one, and none of a run that never began.
+
+A command says which folder it makes, and what is in it once its run has begun. Until then,
+`discard_unbegun` removes the folder, so the same command can be given again.
+"""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
 
-_BAG = 'bag'
+BAG = 'bag'
+"""What is in the folder of `blf_dsc run` once its run has begun."""
+
 _ANY = '*'
-_made: list[tuple[Path, str]] = []  # and the result in it
+_unbegun: dict[
+    Path, str | None
+] = {}  # and what is in it then; None: only `keep` says so
 
 
-def make_folder(path: Path) -> Path:
-    """Create a folder, which `discard_unrecorded` may remove again while it is empty.
+def make_folder(path: Path, result: str = _ANY) -> Path:
+    """Create a folder, whose run has begun once `result` is in it.
 
     Raises BlfDscError if it exists already.
     """
-    return _make(path, _ANY)
-
-
-def make_run_folder(path: Path) -> Path:
-    """Create the folder of a run, which `discard_unrecorded` may remove again."""
-    return _make(path, _BAG)
-
-
-def _make(path: Path, result: str) -> Path:
     refuse_existing(path)
-    _made.append((path, result))
+    _unbegun[path] = result
     path.mkdir(parents=True)
     return path
+
+
+def expect_folder(path: Path | None) -> None:
+    """Take a folder that something else makes for one without a run, until `keep` is called.
+
+    One that is there already is left alone; without a path there is none.
+    """
+    if path is not None and not path.exists():
+        _unbegun[path] = None
+
+
+def keep(path: Path | None) -> None:
+    """Never remove this folder: its run has begun."""
+    if path is not None:
+        _unbegun.pop(path, None)
 
 
 def refuse_existing(path: Path) -> None:
@@ -43,38 +55,17 @@ def refuse_existing(path: Path) -> None:
         )
 
 
-@contextmanager
-def only_if_begun(path: Path | None) -> Iterator[Callable[[], None]]:
-    """Remove the folder that is made there meanwhile, unless what this yields was called.
+def discard_unbegun() -> list[Path]:
+    """Remove this process's folders whose run has not begun; return them.
 
-    Whatever ended it, an error or an interrupt, the same command can be given again.
-    """
-    existed = path is None or path.exists()
-    begun = False
-
-    def begin() -> None:
-        nonlocal begun
-        begun = True
-
-    try:
-        yield begin
-    finally:
-        if path is not None and not (begun or existed):
-            shutil.rmtree(path, ignore_errors=True)
-
-
-def discard_unrecorded() -> list[Path]:
-    """Remove this process's folders that are empty, or of a run without a bag; return them.
-
-    It is for an interrupt: the same command can then be given again. After an error
-    they stay, since their logs say why.
+    After an error a command may leave its folder instead, if logs in it say why.
     """
     discarded = [
         folder
-        for folder, result in _made
-        if folder.is_dir() and not any(folder.glob(result))
+        for folder, result in _unbegun.items()
+        if folder.is_dir() and (result is None or not any(folder.glob(result)))
     ]
     for folder in discarded:
-        shutil.rmtree(folder)
-    _made.clear()
+        shutil.rmtree(folder, ignore_errors=True)
+    _unbegun.clear()
     return discarded

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from contextlib import contextmanager
+from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,7 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.domains import check_network
 from blf_dsc_controller.cli.main import INTERRUPTED
-from blf_dsc_controller.cli.result_folder import (
-    make_run_folder,
-    refuse_existing,
-)
+from blf_dsc_controller.cli.result_folder import BAG, make_folder, refuse_existing
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.compiled.kernel_cache import ship
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -76,16 +74,16 @@ def run(options: Namespace) -> int:
         require_viser()
     if not options.offline:
         check_network()
-    out = make_run_folder(options.out)
+    out = make_folder(options.out, BAG)
     clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
-    recorder = {'output': str(out / 'bag'), 'clock': clock}
+    recorder = {'output': str(out / BAG), 'clock': clock}
     config = config._replace(recorder=change(config.recorder, recorder))
     dump(out / 'config.yaml', config.by_node)
     completed = True
     if options.offline:
         with announced_compilation(print_notice):
             simulate_into_bag(
-                out / 'bag',
+                out / BAG,
                 config.controller,
                 config.plant,
                 compression=config.recorder.compression,
@@ -188,7 +186,7 @@ def _report(out: Path) -> bool:
     from blf_dsc_controller.analysis.output import write_json
 
     print_notice('reading the bag and drawing the pictures')
-    content = read_content(out / 'bag')
+    content = read_content(out / BAG)
     recorded = recorded_run(content)
     metrics = measure(recorded)
     write_json(metrics, out / 'summary.json')
@@ -209,8 +207,7 @@ def _report(out: Path) -> bool:
 def precompile(options: Namespace) -> None:
     """Compile the kernels of controller, watchdog and plant, in two parallel processes."""
     config = load_loop(options.config)
-    with ProcessPoolExecutor(2, get_context('spawn')) as pool:
-        list(pool.map(compile_kernels, (config.controller, config.plant)))
+    _compile_side_by_side(config.controller, config.plant)
     if options.package:
         print(
             f'{options.config}: the kernels are in {ship()}, for all who use this copy'
@@ -219,6 +216,47 @@ def precompile(options: Namespace) -> None:
     print(
         f'{options.config}: the kernels are compiled; the nodes of this user now start at once'
     )
+
+
+def _compile_side_by_side(*configs: ControllerConfig | PlantConfig) -> None:
+    """Compile the kernels of each configuration in a process of its own.
+
+    Ctrl-C, which the terminal sends to all, is left to this one, which ends the others.
+    """
+    context = get_context('spawn')
+    processes = [
+        context.Process(target=_compile_aloud, args=(each,)) for each in configs
+    ]
+    resource_tracker.ensure_running()  # its start would unblock the signal again
+    try:
+        with _sigint_blocked():  # as long as they import, too: a mask is inherited
+            for process in processes:
+                process.start()
+        for process in processes:
+            process.join()
+    finally:
+        for process in processes:
+            if process.is_alive():
+                process.kill()
+                process.join()
+    if any(process.exitcode for process in processes):
+        raise BlfDscError('the kernels were not compiled: the lines above say why')
+
+
+@contextmanager
+def _sigint_blocked() -> Iterator[None]:
+    """Let Ctrl-C wait, for this process, and for ever for those that it starts meanwhile."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _compile_aloud(config: ControllerConfig | PlantConfig) -> None:
+    """Compile as `compile_kernels` does, and name each kernel."""
+    with announced_compilation(print_notice):
+        compile_kernels(config)
 
 
 def compile_kernels(config: ControllerConfig | PlantConfig) -> None:

@@ -78,12 +78,23 @@ def ship() -> Path:
                 folder,
                 SHIPPED / folder.name,
                 ignore=shutil.ignore_patterns('*.lock'),
+                copy_function=_copy,
                 dirs_exist_ok=True,
             )
     SHIPPED.mkdir(exist_ok=True)
     for path in (SHIPPED, *SHIPPED.rglob('*')):  # for all to read, whatever the umask
         path.chmod(0o755 if path.is_dir() else 0o644)
     return SHIPPED
+
+
+def _copy(source: str, target: str) -> None:
+    """Copy a file, whole or not at all."""
+    part = Path(f'{target}.unfinished')
+    try:
+        shutil.copy2(source, part)
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _keep(kernel: Any, folder: Path) -> None:

@@ -49,6 +49,8 @@ DRIVE = 'drive'
 STUDY = 'monte_carlo'
 """Name of the section of a study, which is no node."""
 
+_SWITCHES_OF_ROS = ('use_sim_time', 'start_type_description_service')
+_QOS = 'qos_overrides.'
 _ARM = 'robot.urdf'  # a file, which may be beside the one that names it
 _PATH = 4096  # characters; longer ones are texts
 _of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
@@ -178,8 +180,7 @@ def is_gain_of_law(name: str) -> bool:
 
 def is_builtin(name: str) -> bool:
     """Whether ROS itself, not this package, declares the parameter."""
-    builtin = ('use_sim_time', 'start_type_description_service')
-    return name in builtin or name.startswith('qos_overrides.')
+    return name in _SWITCHES_OF_ROS or name.startswith(_QOS)
 
 
 def locate(given: str | Path) -> Path:
@@ -342,6 +343,7 @@ def _load_all(
     problems = [
         *_unknown_in_wildcards(sections),
         *unmatched_sections(sections, nodes),
+        *_wrong_for_ros(sections, nodes),
     ]
     configs: dict[str, Any] = {}
     nodes_with: dict[str, list[str]] = {}
@@ -379,6 +381,24 @@ def _unknown_in_wildcards(sections: Iterable[Section]) -> Iterator[str]:
         }
         for problem in unknown_names(ControllerConfig, given, known):
             yield _located(problem, section.entries, {})
+
+
+def _wrong_for_ros(sections: Iterable[Section], nodes: Iterable[str]) -> Iterator[str]:
+    """Yield a problem for each switch of ROS itself that is neither true nor false.
+
+    None of these nodes would start with it.
+    """
+    full = ['/' + node.removeprefix('/') for node in nodes]
+    for section in sections:
+        if not any(map(section.matches, full)):
+            continue
+        for name in _SWITCHES_OF_ROS:
+            entry = section.entries.get(name)
+            if entry is not None and not isinstance(entry.value, bool):
+                yield (
+                    f'line {entry.line}: {name}: got {format_value(entry.value)}, but a bool is '
+                    f'expected: write true or false, without quotes'
+                )
 
 
 def _entries_of(sections: Iterable[Section], node: str, cls: type) -> dict[str, Entry]:

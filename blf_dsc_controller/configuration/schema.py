@@ -19,12 +19,20 @@ import json
 import math
 import operator
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, TypeVar
 
 import yaml
 
+from blf_dsc_controller.configuration.files import parse_scalar
 from blf_dsc_controller.errors import ArgumentTypeError, BlfDscError, ConfigurationError
 
 Config = TypeVar('Config')
@@ -113,6 +121,8 @@ class Parameter:
             expected += ', with a decimal point' if lacks_point else ''
             if self.type is str and not any(isinstance(each, str) for each in entries):
                 expected += ': write it in quotes'
+            if self.type is not str and any(isinstance(each, str) for each in entries):
+                expected += self._unquoted(entries)
             yield f'{self.name}: got {format_value(given)}, {expected}'
             return
         if not (entries or self.omittable or self.length):
@@ -129,6 +139,15 @@ class Parameter:
                 f' at entry {index} of {format_value(entries)}' if self.is_array else ''
             )
             yield f'{self.name}: got {format_value(entry)}{place}, but {expected}'
+
+    def _unquoted(self, entries: Sequence[Any]) -> str:
+        """Return the remedy if it is quotes that make texts of what would be of this type."""
+        words = [parse_scalar(each) for each in entries if isinstance(each, str)]
+        return (
+            ': write it without quotes'
+            if all(_is(word, self.type) for word in words)
+            else ''
+        )
 
     def spelt(self, given: Any) -> Any:
         """Return a value as it was written.

@@ -313,7 +313,8 @@ def _limits_of_torque(
             f'torque.limit: {joint}',
             _MARGIN * need / limit,
             f'has {limit:g} N m, but with learning.initial_estimate the reference alone needs '
-            f'{need:.3g} N m: give a quarter more than that',
+            f'{need:.3g} N m: let the reference be slower, or give at least '
+            f'{_MARGIN * need:.3g} N m if the drive has that much',
         )
 
 

@@ -184,7 +184,9 @@ class SampleCheck:
         text = (
             f'the effort of joint {self._joints[joint]!r} lacks {lack[joint]:+.4g} N m of '
             'what is commanded: release the brakes, and activate the effort controller; if the '
-            'effort is not a torque in N m, set robot.effort to current or unknown'
+            'effort is not a torque in N m, set robot.effort to current or unknown; if the joint '
+            'moves, its drive gives less than it is sent: correct its torque constant, gear ratio '
+            'or current limit, or give what it can as torque.limit'
         )
         return Fault(Reason.NO_EFFECT, text)
 

@@ -26,6 +26,7 @@ _AVERAGED = 1.0  # s, over which missed states are
 
 SKIP = Fault(Reason.NONE, '')
 """Returned for a state to ignore."""
+_NO_VELOCITY = 'if the hardware measures none, set safety.velocity to estimated'
 
 
 def rate_mismatch(period: float, sample_time: float) -> str:
@@ -141,6 +142,8 @@ class StateCheck:
             'wrong sign, or the velocities are those of other joints; they are differenced from '
             'the positions from now on'
         )
+        if measured[worst] == 0.0:  # a mean: it has always been 0
+            text += f'; {_NO_VELOCITY}'
         return Fault(Reason.VELOCITY, text)
 
     def clock_step(self, gap: float, q_step: Vector, dq: Vector) -> Fault | None:
@@ -169,8 +172,7 @@ class StateCheck:
             return Fault(Reason.NOT_FINITE, f'the positions are not finite: {q}')
         if not np.isfinite(dq).all():
             text = f'velocities are missing or not finite: {dq}'
-            remedy = 'if the hardware measures none, set safety.velocity to estimated'
-            return Fault(Reason.NOT_FINITE, f'{text}; {remedy}')
+            return Fault(Reason.NOT_FINITE, f'{text}; {_NO_VELOCITY}')
         worst = int(np.argmax(np.abs(dq)))
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} rad/s: more '

@@ -55,6 +55,8 @@ _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _LISTED = 12  # events
 _KEPT = 2000  # snapshots of a run
+_LATE = 1.0  # s, after which a first sample is that of a view that was started later
+_MISSED = 'watches from here on: earlier curves are not sent again, only a bag has them'
 _LONGEST = 300  # characters of an event
 _MOST_PLANNED = 1000  # events of a plant
 _NICE = 10  # lower priority than the loop
@@ -334,6 +336,8 @@ class ViewNode(PlainNode):
 
     def _keep(self, time: float) -> None:
         """Keep a snapshot of the newest values, at a time [s]."""
+        if self._taken == 0 and time > _LATE:
+            self._list(time, 'view', _MISSED)
         now = self._snapshot(time)
         self.past.append(now)
         self._keep_for_replay(now)
