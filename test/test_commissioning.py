@@ -26,6 +26,7 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, simulated
+from blf_dsc_controller.commissioning.better_known import as_measured
 from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
 from blf_dsc_controller.commissioning.chosen import kept_stop, with_gains
 from blf_dsc_controller.commissioning.commissioning import (
@@ -858,6 +859,21 @@ def test_arm_that_is_better_known_shows_more_and_its_friction_is_written():
     assert 'more friction than robot.coulomb' not in told
     given = {**GIVEN, 'robot.rotor_inertia': [0.05, 0.02]}
     assert build(ControllerConfig, {**given, **values}) == after.config
+
+
+def test_run_tells_whether_its_arm_was_better_known():
+    """By its friction or its gains; a run with half of the first gains is none."""
+    first, _, second, _ = better_known()
+    config, better = first.config, second.measured_with
+    assert as_measured(config, [config]) is config
+    known = as_measured(config, [config, better])
+    assert known.feedback == better.feedback
+    assert known.robot == better.robot
+    (softer,) = plan(config, POSTURE[None], share=0.5)
+    assert as_measured(config, [softer.config]) is config
+    stiffer = change(better, {'robot.coulomb': []})
+    assert as_measured(config, [stiffer]).feedback == better.feedback
+    assert as_measured(better, [config]) is better  # its gains are given
 
 
 def test_arm_that_is_known_enough_is_not_measured_again():

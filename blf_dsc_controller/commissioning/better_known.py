@@ -12,7 +12,7 @@ Gains that a configuration gives, or that follow from the stiffness of its gears
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,8 +92,21 @@ def as_measured(
     `configs` are those of the runs.
     """
     given = flatten(configs[-1])
-    is_better_known = given['robot.coulomb'] != config.robot.coulomb
-    if not is_unknown(config) or not is_better_known:
+    if not is_unknown(config) or not _is_better_known(config, given):
         return config
     values = {name: given[name] for name in _NAMES if given[name] != ()}
     return with_gains(config, {**values, 'feedback.stiffness': 1.0})
+
+
+def _is_better_known(config: ControllerConfig, given: Mapping[str, Value]) -> bool:
+    """Whether a run's parameters, all that are `given`, are of an arm that was better known.
+
+    Its gains alone may also be softer, where an arm nearly oscillated with the first ones.
+    """
+    if given['robot.coulomb'] != config.robot.coulomb:
+        return True
+    arm, _ = design_of(config)
+    damping = np.asarray(given['feedback.joint_damping'], float)
+    if arm.joints is None or not damping.size:
+        return False
+    return bool((damping >= arm.stiffness * arm.joints.damping).all())
