@@ -349,6 +349,20 @@ def test_robot_without_torques_is_remarked_with_settings_that_its_driver_takes()
     assert not disagreements(FrankaDriver.facts, change(given, values))
 
 
+@pytest.mark.parametrize(('sensors', 'remarked'), [(True, False), (False, True)])
+def test_joint_torque_sensors_that_a_file_does_not_name_are_remarked(sensors, remarked):
+    given = blf.load_loop(
+        'fr3_direct', {'blf_dsc_controller': {'robot.torque_loop': sensors}}
+    )
+    driver = FrankaDriver('', given.controller, build(DriveConfig, {}))
+    driver._robot = ToldRobot()
+    driver._robot.read_once = lambda: SimpleNamespace(
+        m_ee=0.0, m_total=0.0, tau_J=[1.0] * 7
+    )
+    told = '\n'.join(driver._remarks())
+    assert ('robot.torque_loop: true' in told) == remarked
+
+
 @pytest.mark.parametrize(
     ('theta', 'has_motors'),
     [([0.0] * 7, False), ([0.5] * 7, False), ([0.5] * 6 + [0.51], True)],

@@ -131,6 +131,11 @@ class FrankaDriver(Driver):
                 'that reports commands alone. To go on, set safety.first_torque: send and '
                 'disturbance.observer_bandwidth: 0.0'
             )
+        elif not self.controller.robot.torque_loop:
+            yield (
+                'note: this robot has joint torque sensors. With robot.torque_loop: true the law '
+                'takes up loads by them, with a third of the error'
+            )
         known = self.controller.robot.drive_payload
         if self.config.set_load and abs(state.m_ee) > _SAME_MASS:
             yield (
