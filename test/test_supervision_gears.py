@@ -12,6 +12,7 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.expected_errors import expected_errors
 
 UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
 GAINS = {
@@ -51,6 +52,25 @@ def test_default_bound_has_room_for_friction_that_nobody_knows():
     room = 1.5 * 0.05 * np.array([150.0] * 3 + [28.0] * 3) / stiffness
     np.testing.assert_allclose(unknown - compensated, room, atol=1e-4)
     np.testing.assert_allclose(unknown - partly, room * [1, 0, 1, 0, 1, 1], atol=1e-4)
+
+
+def test_errors_to_expect_count_friction_that_nobody_knows():
+    """7.5 N m of 150 in the shoulder, with either sign, over 900 N m/rad."""
+    little, unknown = (
+        built(**GAINS, **given) for given in ({'robot.coulomb': [0.1] * 6}, {})
+    )
+    before, after = (
+        expected_errors(each, settings_of_config(each)).unmodelled
+        for each in (little, unknown)
+    )
+    more = 0.75 * 3.0 * 0.05 * np.array([150.0] * 3 + [28.0] * 3)
+    more /= GAINS['feedback.joint_stiffness']
+    np.testing.assert_allclose(after - before, more, rtol=0.3)
+    tight = built(**GAINS, **{'barrier.bound': [0.01] * 6})
+    told = '\n'.join(config_warnings(tight))
+    assert 'friction (5 % of the rated torque without robot.coulomb) and unmod' in told
+    given = built(**GAINS, **{'barrier.bound': [0.01] * 6, 'robot.coulomb': [9.0] * 6})
+    assert 'friction and unmodelled torque' in '\n'.join(config_warnings(given))
 
 
 def test_an_arm_of_which_nothing_is_known_begins_its_motion():

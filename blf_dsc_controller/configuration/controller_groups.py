@@ -499,7 +499,8 @@ class CommissionedGains:
     )
     friction: PerJoint = _of_joints(
         'friction that each joint showed while it was measured, which the errors to '
-        'expect count; empty: that of robot.coulomb',
+        'expect count; empty: that of robot.coulomb, or 5 % of the rated torque where none '
+        'is known',
         'N m',
     )
     unseen_inertia: PerJoint = _of_joints(

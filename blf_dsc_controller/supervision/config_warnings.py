@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.tuning import SAMPLES, UNKNOWN_EFFORT, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_traits import OWN
-from blf_dsc_controller.configuration.robot import implausible_friction
+from blf_dsc_controller.configuration.robot import (
+    UNKNOWN_FRICTION,
+    implausible_friction,
+)
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.adaptation import NEWTON
@@ -216,10 +219,20 @@ def _of_unmodelled(
             'this bound at the tool'
         )
     yield (
-        f'{parameter}: friction and unmodelled torque '
+        f'{parameter}: friction{_of_unknown(config)} and unmodelled torque '
         f'(learning.residual_floor) alone are expected to move {config.joints[worst]} '
         f'{errors[worst]:.2g} rad from its reference: {remedy}'
     )
+
+
+def _of_unknown(config: ControllerConfig) -> str:
+    """Return of which friction the expected errors are, if that of a joint is not known."""
+    robot = config.robot
+    is_unknown = robot.unknown_friction(robot.chain(config.joints)).any()
+    if config.commissioning.friction or not is_unknown:
+        return ''
+    share = f'{100.0 * UNKNOWN_FRICTION:g} %'
+    return f' ({share} of the rated torque without robot.coulomb)'
 
 
 def _of_pick_up(

@@ -116,12 +116,14 @@ def _unmodelled(config: ControllerConfig, ddq: Floats) -> Floats:
     """Return the torque (k, n) [N m] that the model may lack at accelerations (k, n).
 
     With what commissioning has measured of friction, and not seen of inertia.  The law
-    compensates the friction that it knows; the rest has either sign at a reversal.
+    compensates the friction that it knows; the rest has either sign at a reversal.  Where
+    none is known or measured, some is expected.
     """
     robot, measured = config.robot, config.commissioning
-    known = np.array(robot.friction(robot.chain(config.joints))['coulomb'])
-    floor = np.array(config.learning.residual_floor)
-    floor += at_reversal(known, measured.friction)
+    chain = robot.chain(config.joints)
+    known = np.array(robot.friction(chain)['coulomb'])
+    friction = measured.friction or tuple(robot.unknown_friction(chain))
+    floor = np.array(config.learning.residual_floor) + at_reversal(known, friction)
     return np.asarray(floor + np.abs(ddq) * np.array(measured.unseen_inertia or 0.0))
 
 
