@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -25,7 +26,7 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.commissioning import files, simulated
+from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
 from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
 from blf_dsc_controller.commissioning.chosen import kept_stop, with_gains
@@ -43,6 +44,7 @@ from blf_dsc_controller.commissioning.motion import (
 )
 from blf_dsc_controller.commissioning.own_loop import REPEATS
 from blf_dsc_controller.commissioning.page import sentences
+from blf_dsc_controller.commissioning.postures import PostureByPosture
 from blf_dsc_controller.commissioning.response import (
     Response,
     _noise,
@@ -1082,6 +1084,42 @@ def test_the_second_motion_shows_a_margin_that_noise_had_hidden():
     )
     found = [commissioning.result([each]) for each in runs]
     assert [each.has_margin for each in found] == [False, True]
+
+
+class _Elsewhere(PostureByPosture):
+    """A robot at rest, for which another process computes."""
+
+    def _positions(self):
+        return POSTURE
+
+    def _pause(self, seconds):
+        pass
+
+    def _control(self, _config, _duration, bag, _name):
+        bag.mkdir()
+
+    def _aside(self, compute, *given, **named):
+        return compute(*deepcopy(given), **named)
+
+
+def test_posture_after_one_that_nearly_oscillated_has_softer_gains(
+    tmp_path, monkeypatch
+):
+    """Also if another process has found that it oscillates."""
+    softer = iter([plan(CONFIG, POSTURE[None], share=0.5)[0], None, None])
+    monkeypatch.setattr(postures, 'stronger', lambda *_: next(softer))
+    monkeypatch.setattr(postures, 'better_known', lambda *_: None)
+    robot = _Elsewhere(blf.Commissioning(CONFIG, [POSTURE]), tmp_path)
+    names = [name for name, _ in robot.runs(np.stack((POSTURE, POSTURE)))]
+    assert names == ['posture 1', 'posture 2']
+    assert {bag.name for bag in tmp_path.iterdir()} == {
+        *('move_1', 'weak_posture_1', 'posture_1', 'move_2', 'posture_2')
+    }
+    after = robot._commissioning.motion(POSTURE)
+    assert after.share == 0.5
+    np.testing.assert_allclose(
+        after.config.feedback.gain, 0.5 * np.array(CONFIG.feedback.gain)
+    )
 
 
 def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():

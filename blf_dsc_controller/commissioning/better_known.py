@@ -3,7 +3,7 @@
 
 Of an arm of which only its URDF is known, motors are guessed, friction is unknown, and the
 gains hold any arm, softly.  Joints that stick then show neither their inertia nor how late
-torques are, and gains for the inertia that is guessed are a tenth of what the arm bears.  So
+torques are, and gains for the inertia that is guessed may be a tenth of what the arm bears.  So
 its first posture is measured again, with half of the gains that it bears by the first run, and
 with the friction that this shows compensated: the joints slide, and show more.
 
@@ -71,7 +71,8 @@ def better_known(
     """Return a configuration to measure an arm with that runs with `config` have shown.
 
     `shown` are the parameters that follow from these runs, `start` the gains that they had,
-    and `friction` (n,) [N m] is what they show.
+    and `friction` (n,) [N m] is what they show.  Of the joints (n,) of which one `sticks`, gains
+    at most double.
     """
     chosen = np.array([shown[f'feedback.joint_{each}'] for each in JointGains._fields])
     most = np.where(sticks, _OF_STUCK * np.array(start), np.inf)

@@ -64,6 +64,7 @@ class Commissioning:
         measured_with: the configuration that the motions have: stiffer and with more friction
             compensated, once the arm is better known.
         slides: whether motions have swings from the first on.
+        share: of its gains, that motions have: half, once the arm nearly oscillated.
         times: how often the arm may be better known yet.
     """
 
@@ -94,11 +95,11 @@ class Commissioning:
         self.margin = margin
         self.measured_with = config
         self.slides = False
+        self.share = 1.0
         self.times = TIMES if is_unknown(config) else 0
         self._postures = postures
         self._torque = torque
         self._travel = travel
-        self._share = 1.0  # of the gains, once the arm was found to oscillate nearly
 
     @cached_property
     def motions(self) -> list[Planned]:
@@ -132,7 +133,7 @@ class Commissioning:
             BlfDscError: the posture is not one of this arm, or too near its limits.
         """
         return self._motion(
-            posture, self._torque, sliding=self.slides, share=self._share
+            posture, self._torque, sliding=self.slides, share=self.share
         )
 
     def sliding(self, posture: ArrayLike) -> Planned:
@@ -163,7 +164,7 @@ class Commissioning:
             return None
         around = motion.posture if posture is None else posture
         share = motion.share * (_SOFTER if shown.rings else 1.0)
-        self._share = min(self._share, share)
+        self.share = min(self.share, share)
         torque = shown.factor * self._torque
         again = self._motion(around, torque, sliding=sliding, share=share)
         if sliding != slid or shown.rings:

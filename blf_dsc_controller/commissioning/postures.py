@@ -240,6 +240,7 @@ class PostureByPosture(ABC):
                 return motion, bag
             _set_aside(bag, 'weak')
             motion = again
+            self._commissioning.share = again.share  # also if it was computed elsewhere
             bag = self._run(motion.config, motion.duration, name)
         with _named(name):
             self._aside(check, bag)
