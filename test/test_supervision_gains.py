@@ -236,6 +236,17 @@ def test_expectation_is_a_number_of_two_digits_or_the_reason_why_there_is_none(
     assert 'e+' not in text
 
 
+def test_gains_that_make_errors_grow_are_warned_of_once_and_without_a_figure_of_errors():
+    inside_the_motors = load_loop('yam').controller
+    warnings = config_warnings(inside_the_motors)
+    of_growth = [each for each in warnings if 'grow from sample to sample' in each]
+    assert len(of_growth) == 1
+    assert of_growth[0].startswith('feedback.stiffness: ')
+    assert 'drive.feedback: motor' in of_growth[0]
+    assert not any('e+' in each or 'e-' in each for each in warnings)
+    assert not any(each.startswith('barrier.bound') for each in warnings)
+
+
 URDF = read_urdf('panda.urdf')
 IN_KG_MM2 = re.sub(
     r'\b(i[xyz]{2})="(.+?)"',

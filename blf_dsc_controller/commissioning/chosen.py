@@ -22,7 +22,7 @@ from blf_dsc_controller.configuration.tool_bound import (
 )
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.supervision.expected_errors import ENDLESS, expected_errors
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +42,6 @@ _BOUNDS = 'barrier.bound', 'barrier.initial_bound'  # not of gains, with one at 
 _SOFT = 'noise or friction hide the response: measure again with a larger --torque or --travel'
 
 _ROOM = 1.1  # bound over the errors to expect
-_ENDLESS = 1e3  # rad or m: errors that grow without end are no numbers
 
 
 def with_gains(
@@ -192,7 +191,7 @@ def _check_bound(config: ControllerConfig, least: Floats) -> None:
         if needed > most:
             unit = 'm' if kind == 'prismatic' else 'rad'
             far = f'by up to {needed / _ROOM:.2g} {unit}'
-            if needed > _ENDLESS:
+            if needed > ENDLESS:
                 far = 'without end'
             raise BlfDscError(
                 f'the gains that have the margin are too soft for any bound: {joint} would be off '

@@ -3,9 +3,10 @@
 
 The gains rest on the inertia of each joint, and a geared one's is dominated by the
 reflected rotor inertia, which is rarely specified.  The guess, rated torque over 400
-rad/s^2, is an upper limit.  A joint that is much lighter makes the loop oscillate, and
-this oscillation shows its inertia before it has grown: between the bandwidth of the
-motion and that of the noise,
+rad/s^2, may be wrong either way: the published rotors of an FR3's wrists are 6.9 times it.
+Only one that is too heavy is corrected.  A joint that is much lighter makes the loop
+oscillate, and this oscillation shows its inertia before it has grown: between the
+bandwidth of the motion and that of the noise,
 
     tau = M a = M_0 a + J~ a,        r = tau - M_0 a,        z^T r = z^T a J~,
 

@@ -26,7 +26,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.expected_errors import expected_errors
-from blf_dsc_controller.supervision.gear_warnings import gear_warnings
+from blf_dsc_controller.supervision.gear_warnings import gear_warnings, softer_by
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.retuning import settings_in_loop
 
@@ -191,6 +191,15 @@ def _of_placeholders(config: ControllerConfig) -> Iterator[str]:
 def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     """Check that the errors to expect are within the bound."""
     errors = expected_errors(config, settings)
+    if errors.is_endless:
+        softer = softer_by(config)
+        yield (
+            f'{softer}: with a sample time of {config.sample_time:g} s and a robot.lag of '
+            f'{config.robot.lag:g} s these gains make errors grow from sample to sample, on rigid '
+            f'gears too: lower {softer}. Gains that the motors of an arm close themselves belong '
+            'there: `blf_dsc drive` with drive.feedback: motor'
+        )
+        return
     yield from _of_unmodelled(config, settings.barrier.bound, errors.unmodelled)
     yield from _of_pick_up(config, settings.barrier.bound, errors.pick_up)
 

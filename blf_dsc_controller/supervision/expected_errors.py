@@ -29,7 +29,8 @@ Floats = NDArray[np.float64]
 _RESPONSE = 20.0  # time constants of the damping, for which the response is followed
 _PEAK = 6.0  # of the surface, likewise; the peak comes before the integral acts
 _MOMENTS = 40  # of the reference
-_UNSTABLE = 1e6  # mrad
+ENDLESS = 1e3
+"""Error [rad or m] above which errors grow from sample to sample: the loop is unstable."""
 
 
 def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedback:
@@ -91,6 +92,12 @@ class ExpectedErrors(NamedTuple):
     unmodelled: Floats  # of learning.residual_floor and friction at a reversal
     pick_up: Floats  # when robot.payload is picked up in motion
 
+    @property
+    def is_endless(self) -> bool:
+        """Whether they grow from sample to sample."""
+        largest = max(float(each.max()) for each in self)
+        return not largest < ENDLESS  # or NaN
+
 
 def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErrors:
     """Return the expected errors of an arm from a URDF, by the linear loop."""
@@ -130,9 +137,9 @@ def _unmodelled(config: ControllerConfig, ddq: Floats) -> Floats:
 def expectation(config: ControllerConfig) -> str:
     """Return the largest errors to expect of an arm of a URDF, in a sentence."""
     errors = expected_errors(config, settings_of_config(config))
-    usual, most = (1e3 * float(each.max()) for each in errors)
-    if not max(usual, most) < _UNSTABLE:  # or NaN
+    if errors.is_endless:
         return 'none can be told, since errors grow from sample to sample: give lower gains'
+    usual, most = (1e3 * float(each.max()) for each in errors)
     joint = config.joints[int(errors.pick_up.argmax())]
     sensed = config.disturbance.observer_bandwidth > 0.0
     return (

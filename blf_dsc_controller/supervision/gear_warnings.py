@@ -46,11 +46,7 @@ def _of_margin(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     margin = known.margin(linear_feedback(settings, M0, settings.barrier.weight))
     if margin.value >= LEAST_MARGIN:
         return
-    softer = (
-        'feedback.stiffness'
-        if config.feedback.joint_stiffness or config.feedback.inertia == 'whole'
-        else 'feedback.gain'
-    )
+    softer = softer_by(config)
     oscillates = 'is unstable' if margin.value == 0.0 else 'rings'
     yield (
         f'{softer}: with robot.joint_stiffness the loop {oscillates} near '
@@ -58,3 +54,11 @@ def _of_margin(config: ControllerConfig, settings: Settings) -> Iterator[str]:
         f'{softer}, or '
         'leave the gains out, so that they follow from robot.joint_stiffness'
     )
+
+
+def softer_by(config: ControllerConfig) -> str:
+    """Return the parameter that makes the loop of an arm from a URDF softer."""
+    feedback = config.feedback
+    if feedback.joint_stiffness or feedback.inertia == 'whole':
+        return 'feedback.stiffness'
+    return 'feedback.gain'
