@@ -16,9 +16,8 @@ BAG = 'bag'
 """What is in the folder of `blf_dsc run` once its run has begun."""
 
 _ANY = '*'
-_unbegun: dict[
-    Path, str | None
-] = {}  # and what is in it then; None: only `keep` says so
+# And what is in it once its run has begun; None: only `keep` says that it has.
+_unbegun: dict[Path, str | None] = {}
 
 
 def make_folder(path: Path, result: str = _ANY) -> Path:
