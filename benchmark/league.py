@@ -357,6 +357,11 @@ def _terms(found: Identified) -> str:
     return '; '.join(texts) or '-'
 
 
+def _mass_text(found: Identified) -> str:
+    values, deviations = found.load
+    return f'{values[0]:.3f} +- {1.96 * deviations[0]:.2g} kg'
+
+
 def _weigh_loaded(entry: Entry, bag: Path, mass: float) -> str:
     taken = entry.taken
     loaded = read_recording(bag, taken.robot.text, taken.joints)
@@ -364,7 +369,6 @@ def _weigh_loaded(entry: Entry, bag: Path, mass: float) -> str:
     texts = []
     for given in (boundary, float('nan')):
         found = identify_arm(together, taken.robot, picked_up=given)
-        values, deviations = found.load
-        interval = f'{values[0]:.3f} +- {1.96 * deviations[0]:.2g} kg'
-        texts.append(f'{interval} from {found.picked_up:.1f} s on')
+        if found.carried is not None:
+            texts.append(f'{_mass_text(found)} {found.carried.when}')
     return f'{taken.name} with {mass:.3f} kg: {texts[0]}; as one bag: {texts[1]}'

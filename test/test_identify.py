@@ -539,7 +539,7 @@ def test_load_that_is_picked_up_is_found_and_weighed(
     urdf.write_text(PANDA_TEXT)
     tip = '--tip', AT_TIP.tip
     found = identified_by_command(bag, '--urdf', urdf, *tip, '--payload')
-    assert found.picked_up == pytest.approx(20.0, abs=1.0)
+    assert found.carried.begin == pytest.approx(20.0, abs=1.0)
     is_the_load(found)
     assert 'load from' in capsys.readouterr().out
 

@@ -40,6 +40,7 @@ from blf_dsc_controller.identification.summary import (
 )
 from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.identification.wider_model import _deviation_of_mean
+from blf_dsc_controller.identification.windows import Carried
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
@@ -279,7 +280,9 @@ def test_plan_without_torques_is_foreseen_and_nothing_written(tmp_path, capsys):
 
 def test_load_is_in_kilograms_and_its_centre_in_millimetres():
     load = np.array([1.5, 0.01, -0.02, 0.1]), np.full(4, 0.001)  # kg, m
-    found = SimpleNamespace(picked_up=2.0, load=load, chain=SimpleNamespace(tip='hand'))
+    found = SimpleNamespace(
+        carried=Carried(2.0), load=load, chain=SimpleNamespace(tip='hand')
+    )
     (text,) = load_table(found)
     assert re.fullmatch(
         r'load from 2\.0 s on: 1\.500 \+- 0\.002 kg, its centre at 10\.0 \+- 2, '

@@ -11,6 +11,7 @@ from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.identification.stiffness import Compliance
 from blf_dsc_controller.identification.values import Parts, indices, parts
+from blf_dsc_controller.identification.windows import Carried
 from blf_dsc_controller.run import Floats
 
 
@@ -39,6 +40,14 @@ class OtherZeros(NamedTuple):
 
     offsets: Floats  # (n,) to be added to the positions, rad
     error: float  # of the torques held back with them, % of their rms
+
+
+class OtherLoad(NamedTuple):
+    """A load that is not always carried, with which the torques are explained far better."""
+
+    carried: Carried
+    mass: float  # kg
+    error: float  # of the torques held back with it, % of their rms
 
 
 class Identified(NamedTuple):
@@ -70,7 +79,10 @@ class Identified(NamedTuple):
     # (3,) gravity that explains the torques far better than the given one, m/s^2
     other_gravity: Floats | None
     other_zeros: OtherZeros | None  # that explain the torques, if the given ones do not
-    picked_up: float | None  # s, when the load was picked up
+    other_load: (
+        OtherLoad | None
+    )  # that explains the torques, if a constant one does not
+    carried: Carried | None  # when the arm carried the load that was weighed
     compliance: (
         Compliance | None
     )  # of gears, if positions of motors and links are known

@@ -18,7 +18,11 @@ from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.foresight import Foresight, foresee
-from blf_dsc_controller.identification.identified import Identified, OtherZeros
+from blf_dsc_controller.identification.identified import (
+    Identified,
+    OtherLoad,
+    OtherZeros,
+)
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.plausibility import shares
@@ -42,12 +46,15 @@ STAGES = (
     'selecting terms',
     'fitting',
     'intervals',
-    'trying other zeros',
+    'trying other loads and zeros',
 )
 """What takes time, in this order."""
 
 _GOOD = 2.0  # % of the torque, error with which other zeros are not looked for
-_BETTER = 0.5  # times the error, at most, with zeros that are not the given ones
+_BETTER = (
+    0.5  # times the error, at most, with zeros or loads that are not the given ones
+)
+_SHOWN = 2.0  # deviations of its mass, least mass of such a load
 _AS_GOOD = 1.1  # times that error, at most, without an offset that is not needed
 
 
@@ -161,12 +168,22 @@ def identify_arm(
 ) -> Identified:
     """Identify the arm of a recording, and the load picked up at that time [s]; NaN: find it.
 
+    One that is found may be put down again, or be carried at the start only.
+
     Raises:
         BlfDscError: the recording is too short or has no motion.
     """
     found = _identified(recording, robot, effort, picked_up, find_signs, begin)
     begin(STAGES[5])
-    if found.score.total[2] < _GOOD or effort == 'without-gravity':
+    if found.score.total[2] < _GOOD:
+        return found
+    if picked_up is None:
+        changing = _identified(
+            recording, robot, effort, np.nan, find_signs, _tell_nobody
+        )
+        if (load := _better_load(found, changing)) is not None:
+            return found._replace(other_load=load)
+    if effort == 'without-gravity':
         return found
 
     def identified_at(offsets: Floats) -> Identified:
@@ -175,6 +192,17 @@ def identify_arm(
 
     zeros = _better_zeros(found, likely_zeros(recording, robot), identified_at)
     return found._replace(other_zeros=zeros)
+
+
+def _better_load(found: Identified, changing: Identified) -> OtherLoad | None:
+    """Return the load of `changing` if that explains the torques far better, or None."""
+    error = float(changing.score.total[2])
+    if changing.carried is None or not error < _BETTER * found.score.total[2]:
+        return None
+    mass, deviation = (float(each[0]) for each in changing.load)
+    if mass < _SHOWN * deviation or not is_usable(changing):
+        return None
+    return OtherLoad(changing.carried, mass, error)
 
 
 def _better_zeros(
@@ -253,7 +281,8 @@ def _identified(
         inertia=size.inertia,
         other_gravity=problem.other_gravity,
         other_zeros=None,
-        picked_up=problem.picked_up,
+        other_load=None,
+        carried=problem.carried,
         compliance=compliance,
     )
 

@@ -166,7 +166,8 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
         )
         starts = np.minimum(starts, len(q) - g.size).astype(np.intp)
 
-        P_of = np.where(rows.time[block, None] < rows.loaded, P, P_loaded)
+        carries = rows.carried.at(rows.time[block, None])
+        P_of = np.where(carries, P_loaded, P)
 
         def torque(
             q: Floats, dq: Floats, starts: Indices = starts, P_of: Floats = P_of

@@ -1,34 +1,100 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time at which a load is picked up."""
+"""When a load is picked up within a recording, and put down again."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import combinations
 
 import numpy as np
 
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.regression import regression, successive
 from blf_dsc_controller.identification.values import indices
-from blf_dsc_controller.identification.windows import Indices, Rows
+from blf_dsc_controller.identification.windows import Carried, Indices, Rows, Split
 from blf_dsc_controller.run import Floats
 
-_PER_STEP = 10  # windows from one time to the next at which a load may be picked up
+_PER_STEP = 10  # windows from one time to the next at which a load may change, at least
+_MOST_STEPS = 400
+_COARSE = 24  # parts, of which all intervals are tried
 
 
-def pick_up_time(rows: Rows, fit: Indices, G: Floats, prior: Prior) -> float:
-    """Return the time [s] from which a load explains the torques best."""
-    steps = len(fit) // _PER_STEP
-    found = regression(rows, fit, G, prior)
+def carried_load(rows: Rows, windows: Split, G: Floats, prior: Prior) -> Carried:
+    """Return when a load is carried, so that the torques are explained best.
+
+    Of a recording in parts all intervals are tried, then all steps around both ends of the best.
+    """
+    moving = windows.moving
+    steps = max(moving.size // _per_step(moving), 2)
+    found = regression(rows, moving, G, prior)
     load = indices(prior.joints).load
-    Q = found.folds.sum(axis=(0, 1))
-    costs = []
-    for products in successive(rows, fit, G, prior, found, steps):
-        b = Q[:-1, -1]
-        z = np.linalg.solve(Q[:-1, :-1] + np.eye(b.size), b)
-        costs.append(Q[-1, -1] - b @ z)
-        loaded = products.sum(axis=0)
-        empty = loaded.copy()
-        empty[load] = 0.0
-        empty[:, load] = 0.0
-        Q += empty - loaded
-    first = np.array_split(fit, steps)[int(np.argmin(costs))][0]
-    return float(rows.time[first])
+    with_load, empty = [], found.folds.sum(axis=(0, 1))
+    for products in successive(rows, moving, G, prior, found, steps):
+        added = _columns(products.sum(axis=0), load)
+        with_load.append(added)
+        empty -= added
+    # of the load in all steps before each
+    before = np.concatenate((np.zeros((1, *empty.shape)), np.cumsum(with_load, axis=0)))
+
+    def cost(begin: int, end: int) -> float:
+        least, z = _solved(empty + before[end] - before[begin])
+        mass = (prior.mean + prior.D @ z)[load[0]]
+        return least if mass >= 0.0 else np.inf
+
+    begin, end = _best_interval(cost, steps)
+    first = rows.time[[part[0] for part in np.array_split(moving, steps)]]
+    return Carried(
+        float(first[begin]) if begin else -np.inf,
+        float(first[end]) if end < steps else np.inf,
+    )
+
+
+def without_changes(windows: Split, rows: Rows, carried: Carried) -> Split:
+    """Return the windows but those a step around a pick-up or put-down."""
+    per_step = _per_step(windows.moving)
+    time = rows.time[windows.moving]
+    changing = np.zeros(time.size, dtype=bool)
+    for at in carried:
+        if np.isfinite(at):
+            k = int(np.searchsorted(time, at))
+            changing[max(k - per_step, 0) : k + per_step] = True
+    left_out = windows.moving[changing]
+    return Split(*(each[~np.isin(each, left_out)] for each in windows))
+
+
+def _per_step(moving: Indices) -> int:
+    return max(_PER_STEP, -(-moving.size // _MOST_STEPS))
+
+
+def _best_interval(cost: Callable[[int, int], float], steps: int) -> tuple[int, int]:
+    """Return begin and end of the interval of least cost, within so many steps."""
+
+    def best(intervals: Iterable[tuple[int, int]]) -> tuple[int, int]:
+        return min(intervals, key=lambda each: cost(*each))
+
+    part = -(-steps // _COARSE)
+    edges = [*range(0, steps, part), steps]
+    begin, end = best(each for each in combinations(edges, 2) if each != (0, steps))
+
+    def around(k: int) -> range:
+        return range(max(k - part, 0), min(k + part, steps) + 1)
+
+    for _ in range(2):
+        begin, _ = best((k, end) for k in around(begin) if k < end)
+        _, end = best((begin, k) for k in around(end) if k > begin)
+    return begin, end
+
+
+def _columns(products: Floats, load: Floats) -> Floats:
+    """Return the part of [A | b]^T [A | b] that has columns of the load."""
+    others = products.copy()
+    others[load] = 0.0
+    others[:, load] = 0.0
+    return np.asarray(products - others)
+
+
+def _solved(Q: Floats) -> tuple[float, Floats]:
+    """Return the least cost |A z - b|^2 + |z|^2, and z, for Q = [A | b]^T [A | b]."""
+    b = Q[:-1, -1]
+    z = np.asarray(np.linalg.solve(Q[:-1, :-1] + np.eye(b.size), b), dtype=np.float64)
+    return float(Q[-1, -1] - b @ z), z

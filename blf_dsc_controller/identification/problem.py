@@ -17,12 +17,19 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.clipping import without_clipped
 from blf_dsc_controller.identification.joint_alone import Alone, fit_alone
 from blf_dsc_controller.identification.mounting import other_mounting
-from blf_dsc_controller.identification.pick_up import pick_up_time
+from blf_dsc_controller.identification.pick_up import carried_load, without_changes
 from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.signs import Signs, likely_signs
 from blf_dsc_controller.identification.values import base_matrix
-from blf_dsc_controller.identification.windows import STILL, Rows, Split, rows_of, split
+from blf_dsc_controller.identification.windows import (
+    STILL,
+    Carried,
+    Rows,
+    Split,
+    rows_of,
+    split,
+)
 from blf_dsc_controller.run import Floats
 
 Effort = Literal['torque', 'without-gravity', 'command']
@@ -46,7 +53,7 @@ class Problem(NamedTuple):
     reversed: NDArray[np.bool_]  # (n,) joints whose efforts had the opposite sign
     # (3,) m/s^2 in the base, that explains the torques far better than the given one
     other_gravity: Floats | None
-    picked_up: float | None  # s, when the load is picked up
+    carried: Carried | None  # when there is a load; None: it is none of the unknowns
 
 
 def problem_of(
@@ -93,7 +100,7 @@ def _as_recorded(
         P=P,
         reversed=np.zeros(n, dtype=bool),
         other_gravity=None,
-        picked_up=None,
+        carried=None,
     )
 
 
@@ -154,6 +161,10 @@ def _with_load(problem: Problem, picked_up: float) -> Problem:
     """Return the problem with a load that is picked up at that time [s]; NaN: find it."""
     last_body = problem.parameters.K[:, -(ROTOR + 1) : -1]
     rows = problem.rows._replace(load=last_body)
+    carried = Carried(picked_up)
+    windows = problem.windows
     if np.isnan(picked_up):
-        picked_up = pick_up_time(rows, problem.windows.fit, problem.G, problem.prior)
-    return problem._replace(rows=rows._replace(loaded=picked_up), picked_up=picked_up)
+        carried = carried_load(rows, windows, problem.G, problem.prior)
+        windows = without_changes(windows, rows, carried)
+    rows = rows._replace(carried=carried)
+    return problem._replace(rows=rows, windows=windows, carried=carried)

@@ -7,7 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from blf_dsc_controller.identification.identified import Identified, OtherZeros
+from blf_dsc_controller.identification.identified import (
+    Identified,
+    OtherLoad,
+    OtherZeros,
+)
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
 
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
@@ -19,6 +23,9 @@ _RELEVANT = 0.02  # ... if it is so much of the largest torque
 
 def problems_of(found: Identified, effort: str) -> Iterator[str]:
     """Yield why the efforts or the result are doubtful."""
+    if found.other_load is not None:
+        yield _load_problem(found, found.other_load)
+        return
     if found.other_zeros is not None:
         yield _zeros_problem(found, found.other_zeros)
         return
@@ -37,6 +44,15 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
             'directions of the joints those of the URDF, and was the load the same throughout?'
         )
     yield from _joint_problems(found)
+
+
+def _load_problem(found: Identified, load: OtherLoad) -> str:
+    """Return which load, carried for a part of the recording, would explain the torques."""
+    return (
+        f'THE LOAD CHANGES: the torque error is {load.error:.3g} instead of '
+        f'{found.score.total[2]:.3g} % with {load.mass:.2g} kg {load.carried.when}. Give '
+        '--payload, which weighs them, or a recording in which the load stays the same'
+    )
 
 
 def _zeros_problem(found: Identified, zeros: OtherZeros) -> str:

@@ -82,16 +82,19 @@ def header_of(found: Identified) -> str:
 
 def load_table(found: Identified) -> Iterator[str]:
     """Yield the load that was picked up, if any."""
-    if found.picked_up is None:
+    if found.carried is None:
         return
     values, deviations = found.load
     mass = interval(values[0], deviations[0], '.3f')
+    if values[0] < TWO_SIDED * deviations[0]:
+        yield f'load: none that shows ({mass} kg)'
+        return
     centre = [
         interval(1e3 * c, 1e3 * s, '.1f')
         for c, s in zip(values[1:], deviations[1:], strict=True)
     ]
     yield (
-        f'load from {found.picked_up:.1f} s on: {mass} kg, its centre at {", ".join(centre)} mm '
+        f'load {found.carried.when}: {mass} kg, its centre at {", ".join(centre)} mm '
         f'in {found.chain.tip}'
     )
 

@@ -71,6 +71,26 @@ _HELD_BACK = 0.2  # fraction of the moving windows, at the end
 _WINDOWS_OF_JOINT = 10  # least number
 
 
+class Carried(NamedTuple):
+    """When a load is carried [s]."""
+
+    begin: float = -np.inf
+    end: float = np.inf
+
+    def at(self, time: Floats) -> NDArray[np.bool_]:
+        """Return at which of the times [s] it is carried."""
+        return np.asarray((time >= self.begin) & (time < self.end))
+
+    @property
+    def when(self) -> str:
+        """The times, in words."""
+        if np.isinf(self.begin):
+            return f'until {self.end:.1f} s'
+        if np.isinf(self.end):
+            return f'from {self.begin:.1f} s on'
+        return f'from {self.begin:.1f} to {self.end:.1f} s'
+
+
 class Rows(NamedTuple):
     """R windows of n joints and m unknowns [P; COLUMNS of all joints; COUPLING; LOAD].
 
@@ -82,8 +102,8 @@ class Rows(NamedTuple):
     inertial: OnDisk  # (R, n p) columns of P
     friction: Floats  # (R, c, n) COLUMNS of each joint, which are zero for the others
     coupling: Floats  # (R, 2, 3) columns of COUPLING for the last two joints
-    load: Floats  # (p, 10) columns of P that are those of a load, from `loaded` on
-    loaded: float  # s
+    load: Floats  # (p, 10) columns of P that are those of a load
+    carried: Carried
     weight: Floats  # (R, n) of each row, at most 1
     clipped: NDArray[np.bool_]  # (R, n) whether a torque in the window is clipped
     speeds: Floats  # (R, n) mean speed in each window, rad/s or m/s
@@ -133,7 +153,7 @@ class Rows(NamedTuple):
         at = X.shape[2] - LOAD - COUPLING
         if n > 1:
             X[:, -2:, at : at + COUPLING] = self.coupling[windows]
-        with_load = self.time[windows] >= self.loaded
+        with_load = self.carried.at(self.time[windows])
         X[with_load, :, -LOAD:] = inertial[with_load] @ self.load
         return X
 
@@ -279,7 +299,7 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         friction=np.zeros((starts.size, len(COLUMNS), n)),
         coupling=np.zeros((starts.size, min(n, 2), COUPLING)),
         load=np.zeros((model.p, LOAD)),
-        loaded=-np.inf,
+        carried=Carried(),
         weight=np.empty(0),
         clipped=np.zeros((starts.size, n), dtype=bool),
         speeds=np.empty(0),
