@@ -29,7 +29,7 @@ class Readings:
 
     Attributes:
         gap: time [s] between the last state, used or not, and the one before.
-        is_after_gap: whether this time is too long for a difference of the two to be meant.
+        is_after_gap: whether this time is too long to compare the two.
     """
 
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:
