@@ -29,7 +29,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
 from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
-from blf_dsc_controller.commissioning.chosen import kept_stop, with_gains
+from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
 from blf_dsc_controller.commissioning.commissioning import (
     commissioned,
     measuring_gains,
@@ -590,9 +590,9 @@ def test_stop_damps_as_before_but_no_more_than_the_gains_with_the_margin():
     usual = CONFIG.safety.damping
     damping = np.array([0.5 * usual[0], 2.0 * usual[1]])
     expected = {'safety.damping': (damping[0], usual[1])}
-    assert kept_stop(CONFIG, damping) == expected
+    assert capped_stop_damping(CONFIG, damping) == expected
     given = change(CONFIG, {'safety.damping': [9.0, 9.0]})
-    assert kept_stop(given, damping) == {}
+    assert capped_stop_damping(given, damping) == {}
     chosen = found().config
     assert (np.array(chosen.safety.damping) <= chosen.feedback.joint_damping).all()
 
@@ -795,9 +795,9 @@ def stiff(before, friction=None):
 
 @cache
 def better_known():
-    """Return a commissioning of an arm of which its file has too light motors and no friction.
+    """Return a commissioning, its first motion and run, the one anew, and its last ones.
 
-    With the first run, and with one that was made with what this one shows.
+    The file of the arm has motors that are too light, and no friction.
     """
     first = blf.Commissioning(
         build(ControllerConfig, {**GIVEN, 'robot.rotor_inertia': [0.05, 0.02]}),
@@ -835,14 +835,14 @@ def test_unknown_arm_is_measured_again_with_better_gains_and_its_friction():
     for name in ('stiffness', 'damping'):
         gains = np.array(getattr(used.feedback, f'joint_{name}'))
         start = getattr(shown.start, name)
-        bears = np.array(shown.shown()[f'feedback.joint_{name}'])
+        bears = np.array(shown.parameters_but_bounds()[f'feedback.joint_{name}'])
         # of a joint that sticks, not more than twice of what it was measured with
         most = np.where(hidden, 2.0 * start, np.inf)
         expected = np.maximum(np.minimum(0.5 * bears, most), start)
         np.testing.assert_allclose(gains, expected)
     assert before == first.config
     assert used.robot.lag == shown.parameters()['robot.lag']
-    assert second.times == first.times - 1
+    assert second.anew_left == first.anew_left - 1
     assert second.motion(POSTURE).excitation.sliding  # as the last motion
 
 
@@ -852,7 +852,7 @@ def test_arm_that_is_better_known_shows_more_and_its_friction_is_written():
     hidden = [int(np.isnan(e.findings.inertia).sum()) for e in (before, after)]
     assert hidden[1] < hidden[0]
     values = after.parameters()
-    assert 'robot.coulomb' not in before.shown()
+    assert 'robot.coulomb' not in before.parameters_but_bounds()
     share = np.array(values['robot.coulomb']) / [1.0, 0.5]
     assert (share > 0.8).all()
     assert (share < 2.0).all()  # half as much more near rest
@@ -892,9 +892,9 @@ def test_arm_that_is_known_enough_is_not_measured_again():
     }
     given = blf.Commissioning(build(ControllerConfig, {**GIVEN, **gains}), [POSTURE])
     assert given.better_known(*soft) is None
-    second.times, times = 0, second.times
+    second.anew_left, times = 0, second.anew_left
     assert second.better_known(*soft) is None
-    second.times = times
+    second.anew_left = times
     assert second.better_known(*soft) is not None
 
 
@@ -1107,8 +1107,8 @@ def test_posture_after_one_that_nearly_oscillated_has_softer_gains(
 ):
     """Also if another process has found that it oscillates."""
     softer = iter([plan(CONFIG, POSTURE[None], share=0.5)[0], None, None])
-    monkeypatch.setattr(postures, 'stronger', lambda *_: next(softer))
-    monkeypatch.setattr(postures, 'better_known', lambda *_: None)
+    monkeypatch.setattr(postures, 'stronger_by_bag', lambda *_: next(softer))
+    monkeypatch.setattr(postures, 'better_known_by_bag', lambda *_: None)
     robot = _Elsewhere(blf.Commissioning(CONFIG, [POSTURE]), tmp_path)
     names = [name for name, _ in robot.runs(np.stack((POSTURE, POSTURE)))]
     assert names == ['posture 1', 'posture 2']

@@ -130,10 +130,6 @@ def drawn(seed):
     the inverse iteration, so every window counts as excited.
     """
     random = np.random.default_rng(seed)
-
-    def each(low, high, n=2):
-        return random.uniform(low, high, n)
-
     newton = bool(random.integers(3))
     linear = not random.integers(4)
     columns = {
@@ -142,9 +138,24 @@ def drawn(seed):
         'frequencies': [(), (2.0,)][random.integers(2)],
     }
     m = quick(**columns).m
+    gains = drawn_learning(random, m, newton) | drawn_feedback(random, m, linear)
+    start = (2.297, 1.692) if random.integers(2) else (2.293, 1.696)
+    arm = {'start': start, 'delay': int(random.integers(3)), 'position_noise': 1e-6}
+    arm |= {'sample_time': random.choice([1e-3, 2e-3])}
+    gains |= {
+        'follows_inertia': int(random.integers(2)),
+        'joint_inertia': random.uniform(0.2, 0.5, 2),
+        'known_rate': int(random.integers(2)),
+    }
+    gains['decoupled'] = int(random.integers(2)) * (1 - gains['follows_inertia'])
+    return quick(**columns | gains), arm
+
+
+def drawn_learning(random, m, newton):
+    """Random options and gains of learning m parameters."""
     A = random.normal(size=(m, 2 * m))
     information = A @ A.T / (2 * m) + 0.2 * np.eye(m)
-    gains = {
+    return {
         'window': int(random.choice([150, 497, 2000])),
         'row_interval': int(random.integers(1, 4)),
         'interval': int(random.integers(3, 12)),
@@ -159,7 +170,17 @@ def drawn(seed):
         'variance': np.diag(np.linalg.inv(information)).copy(),
         'prior_weight': random.choice([0.0, 0.1]),
         'motion_scale': random.choice([0.0, 0.05]),
-        'row_weight': each(0.3, 1.0),
+        'row_weight': random.uniform(0.3, 1.0, 2),
+    }
+
+
+def drawn_feedback(random, m, linear):
+    """Random gains and limits of the feedback, without a barrier if it is linear."""
+
+    def each(low, high, n=2):
+        return random.uniform(low, high, n)
+
+    return {
         'damping_rate': random.uniform(0.0, 20.0),
         'd2': each(0.0, 300.0) * (not linear),
         'mu_bar': each(0.0, 0.4) * linear,
@@ -185,16 +206,6 @@ def drawn(seed):
         'torque_limit': each(9.5, 20.0),
         'rate_limit': random.choice([0.0, 300.0], 2),
     }
-    start = (2.297, 1.692) if random.integers(2) else (2.293, 1.696)
-    arm = {'start': start, 'delay': int(random.integers(3)), 'position_noise': 1e-6}
-    arm |= {'sample_time': random.choice([1e-3, 2e-3])}
-    gains |= {
-        'follows_inertia': int(random.integers(2)),
-        'joint_inertia': each(0.2, 0.5),
-        'known_rate': int(random.integers(2)),
-    }
-    gains['decoupled'] = int(random.integers(2)) * (1 - gains['follows_inertia'])
-    return quick(**columns | gains), arm
 
 
 def test_law_matches_the_plain_one_in_closed_loop():

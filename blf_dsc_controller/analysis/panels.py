@@ -68,7 +68,7 @@ PIECES = 1500
 
 
 class Line(NamedTuple):
-    """A line of a panel; without a colour of its own it has that of its run."""
+    """A line of a panel, in the colour of its run if `colour` is empty."""
 
     name: str  # in the legend
     time: Floats  # s

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules by which parameters recorded by an earlier release are those of this one.
+"""Rules that turn parameters recorded by an earlier release into those of this one.
 
 A parameter that goes away leaves its last default in `REMOVED`: a bag that has this
-value replays without it. A parameter that arrives leaves in `ADDED` the value that
-repeats what the law did before, unless that is its default.
+value replays without it. `ADDED` has, for a new parameter, the value with which the law
+does what it did before, unless that is its default.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def renamed(recorded: Mapping[str, Any], law: str = '') -> dict[str, Any]:
 def _with_law_of_choices(recorded: Mapping[str, Any], law: str) -> dict[str, Any]:
     """Return recorded parameters with the law and the gains that `SWITCHES` ask for.
 
-    Left out are those that say what the law does anyhow, or that had no effect on it.
+    Switches are left out that ask for what the law does anyhow, or that had no effect on it.
     """
     choices = {name: recorded[name] for name in SWITCHES if name in recorded}
     values = {name: value for name, value in recorded.items() if name not in choices}

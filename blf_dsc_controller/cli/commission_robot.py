@@ -79,7 +79,7 @@ def measured_on(
         duration = here.duration(planned)
         ask(options, _limits(options, commissioning, planned, duration))
         bags = list(_followed(here, planned))
-        here.leave()
+        here.hold_after()
     return [(name, measured_in(bag)) for name, bag in bags]
 
 
@@ -100,7 +100,7 @@ def proven_on(
             worst = 1e3 * float(errors.measured.max())
             print(f'{step.name}: calm, errors of {worst:.2g} mrad at most', flush=True)
             found.append(errors)
-        here.leave()
+        here.hold_after()
     return found
 
 
@@ -206,11 +206,11 @@ def _limits(
         'rest and ends'
     )
     again = REPEATS * sum(each.duration for each in slid)
-    if commissioning.times:
-        again += commissioning.times * (1 + REPEATS) * slid[0].duration
+    if commissioning.anew_left:
+        again += commissioning.anew_left * (1 + REPEATS) * slid[0].duration
         yield (
             'of this arm only the URDF is known: where friction hides an inertia, posture 1 is '
-            f'measured anew, up to {commissioning.times} times, with half of the gains that it '
+            f'measured anew, up to {commissioning.anew_left} times, with half of the gains that it '
             'bears by then and the friction that it showed'
         )
     yield (

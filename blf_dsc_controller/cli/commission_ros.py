@@ -105,7 +105,7 @@ def robot_over_ros(
 
 def made(config: ControllerConfig, **options: object) -> RunByRunNode:
     """Return the node for a configuration, which commands nothing yet."""
-    values = flatten(change(config, motion.watched(config)))
+    values = flatten(change(config, motion.undisturbed_parameters(config)))
     overrides = [
         Parameter(name, value=list(value) if isinstance(value, tuple) else value)
         for name, value in values.items()

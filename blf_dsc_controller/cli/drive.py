@@ -22,6 +22,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
+from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
 from blf_dsc_controller.drive.motor_feedback import as_in_motors
@@ -48,15 +49,7 @@ def drive(options: Namespace) -> int:
     path = locate(options.config)
     config = load(path, CONTROLLER, ControllerConfig)
     driver = driver_of(options.robot, path, config)
-    unmeasured = not_commissioned(config)
-    in_motors = driver.config.feedback == 'motor'
-    judged = as_in_motors(config) if in_motors else config
-    for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
-        print_notice(f'warning: {warning}')
-    if config.model == 'urdf':
-        print(f'errors to expect: {expectation(judged)}')
-    if end := end_of_waypoints(config):
-        print(end)
+    _say_before(config, driver)
     with ExitStack() as ending:
         expect_folder(options.out)
         ending.callback(discard_unbegun)
@@ -93,6 +86,19 @@ def drive(options: Namespace) -> int:
             f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
         )
     return CODES[outcome.end] or int(bool(controller.output_problem))
+
+
+def _say_before(config: ControllerConfig, driver: Driver) -> None:
+    """Print the warnings, the errors to expect, and where waypoints end."""
+    unmeasured = not_commissioned(config)
+    in_motors = driver.config.feedback == 'motor'
+    judged = as_in_motors(config) if in_motors else config
+    for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
+        print_notice(f'warning: {warning}')
+    if config.model == 'urdf':
+        print(f'errors to expect: {expectation(judged)}')
+    if end := end_of_waypoints(config):
+        print(end)
 
 
 def _check(options: Namespace) -> None:

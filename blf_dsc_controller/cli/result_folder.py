@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a command's results: always a new one, and none of a run that never began.
+"""The folder of a command's results: always a new one, and removed if the run never began.
 
-A command says which folder it makes, and what is in it once its run has begun. Until then,
+A command names the folder, and the file that is in it once the run has begun. Until then,
 `discard_unbegun` removes the folder, so the same command can be given again.
 """
 
@@ -16,8 +16,8 @@ BAG = 'bag'
 """What is in the folder of `blf_dsc run` once its run has begun."""
 
 _ANY = '*'
-# And what is in it once its run has begun; None: only `keep` says that it has.
 _unbegun: dict[Path, str | None] = {}
+"""Folders, and what is in them once their run has begun; None: only `keep` says that it has."""
 
 
 def make_folder(path: Path, result: str = _ANY) -> Path:
@@ -32,9 +32,9 @@ def make_folder(path: Path, result: str = _ANY) -> Path:
 
 
 def expect_folder(path: Path | None) -> None:
-    """Take a folder that something else makes for one without a run, until `keep` is called.
+    """Remember a folder that something else makes, whose run begins when `keep` is called.
 
-    One that is there already is left alone; without a path there is none.
+    A folder that exists already is left alone. None: there is no folder.
     """
     if path is not None and not path.exists():
         _unbegun[path] = None

@@ -221,7 +221,7 @@ def precompile(options: Namespace) -> None:
 def _compile_side_by_side(*configs: ControllerConfig | PlantConfig) -> None:
     """Compile the kernels of each configuration in a process of its own.
 
-    Ctrl-C, which the terminal sends to all, is left to this one, which ends the others.
+    The terminal sends Ctrl-C to all of them: only this process acts on it, and ends the others.
     """
     context = get_context('spawn')
     processes = [
@@ -245,7 +245,7 @@ def _compile_side_by_side(*configs: ControllerConfig | PlantConfig) -> None:
 
 @contextmanager
 def _sigint_blocked() -> Iterator[None]:
-    """Let Ctrl-C wait, for this process, and for ever for those that it starts meanwhile."""
+    """Delay Ctrl-C for this process; processes that it starts meanwhile never get it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield

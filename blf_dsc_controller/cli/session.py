@@ -248,8 +248,7 @@ def _show_notices(nodes: Iterable[NodeProcess]) -> None:
 def _hurry_without_recorder(recorder: NodeProcess, *others: NodeProcess) -> None:
     """Do not wait long for the others if the recorder has ended.
 
-    To them it looks alive for some time, in which they would wait for it to take their
-    last messages.
+    They notice its end late, and until then wait for it to take their last messages.
     """
     if recorder.is_running:
         return

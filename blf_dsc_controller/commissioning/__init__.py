@@ -9,6 +9,9 @@ joints, and these the stiffest gains with a margin.
     motion          the reference that shakes all joints at once
     response        the responses (f, n, n) from a run of it, with their uncertainty
     choice          gains by the modulus margin, at all postures measured
+    better_known    the stiffer configuration with which a hardly known arm is measured again
+    strength        whether a run shows enough, and the torque of the next one
+    chosen          the configuration with the chosen gains, and bounds that they keep
     findings        inertias, lags and resonances of the arm, beside those assumed
     commissioning   the three steps in a row
     own_loop        all of it for a loop of your own: `blf.Commissioning`

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm that is measured again, better known by then.
+"""The configuration with which an arm is measured again, by what its first run shows.
 
-Of an arm of which only its URDF is known, motors are guessed, friction is unknown, and the
-gains hold any arm, softly.  Joints that stick then show neither their inertia nor how late
-torques are, and gains for the inertia that is guessed may be a tenth of what the arm bears.  So
-its first posture is measured again, with half of the gains that it bears by the first run, and
-with the friction that this shows compensated: the joints slide, and show more.
+If only the URDF is known, motors are guessed, friction is unknown, and the gains are soft enough
+for any arm.  Joints then stick, and show neither their inertia nor how late torques are; gains for
+the guessed inertia may be a tenth of what the arm bears.  So the first posture is measured again:
+with half of the gains that the arm bears by the first run, and with the friction of that run
+compensated.  The joints slide, and show more.
 
 Gains that a configuration gives, or that follow from the stiffness of its gears, stay.
 """
@@ -24,14 +24,14 @@ from blf_dsc_controller.configuration.schema import Value, flatten
 
 Floats = NDArray[np.float64]
 
-TIMES = 2
-"""Times that the first posture is measured anew, better known, at most."""
+MOST_ANEW = 2
+"""How often the first posture is measured again with a better configuration, at most."""
 
-FAR = 5.0
-"""Times the gains of a measurement: friction may act otherwise on gains beyond."""
+FAR_ABOVE = 5.0
+"""Times the gains of a measurement, above which friction may act otherwise on the chosen ones."""
 
-WORTH = 2.5
-"""Times the gains of a measurement, from which half of them are worth another one."""
+ABOVE_IF_HIDDEN = 2.5
+"""The same, where friction hides an inertia: half of such gains may show it."""
 
 _SHARE = 0.5  # of the gains that an arm bears, to measure it with
 _OF_STUCK = 2.0  # times those of the measurement: friction damps what is measured
@@ -44,8 +44,8 @@ _NAMES = (
 )
 
 
-def is_unknown(config: ControllerConfig) -> bool:
-    """Whether the gains are those of an arm of which only motors are guessed."""
+def is_known_by_urdf_only(config: ControllerConfig) -> bool:
+    """Whether gains are neither given nor follow from gears: they suit guessed motors only."""
     given = config.feedback
     return (
         config.model == 'urdf'
@@ -61,24 +61,23 @@ def known_friction(config: ControllerConfig) -> Floats:
     return np.array(robot.friction(robot.chain(config.joints))['coulomb'])
 
 
-def better_known(
+def better_configuration(
     config: ControllerConfig,
-    shown: dict[str, Value],
+    found: dict[str, Value],
     start: JointGains,
     friction: Floats,
     sticks: NDArray[np.bool_],
 ) -> ControllerConfig:
-    """Return a configuration to measure an arm with that runs with `config` have shown.
+    """Return the configuration with which to measure an arm again.
 
-    `shown` are the parameters that follow from these runs, `start` the gains that they had,
-    and `friction` (n,) [N m] is what they show.  Of the joints (n,) of which one `sticks`, gains
-    at most double.
+    By runs with `config` the parameters `found` and the `friction` (n,) [N m] are known; `start`
+    are the gains of these runs.  Those of a joint that `sticks` (n,) at most double.
     """
-    chosen = np.array([shown[f'feedback.joint_{each}'] for each in JointGains._fields])
+    chosen = np.array([found[f'feedback.joint_{each}'] for each in JointGains._fields])
     most = np.where(sticks, _OF_STUCK * np.array(start), np.inf)
     stiffer = np.maximum(np.minimum(_SHARE * chosen, most), np.array(start))
     gains = dict(zip(JointGains._fields, stiffer.tolist(), strict=True))
-    values = {name: value for name, value in shown.items() if name in _NAMES}
+    values = {name: value for name, value in found.items() if name in _NAMES}
     values |= {f'feedback.joint_{each}': tuple(gains[each]) for each in gains}
     values['feedback.stiffness'] = 1.0
     values['robot.coulomb'] = tuple(np.maximum(known_friction(config), friction))
@@ -88,21 +87,21 @@ def better_known(
 def as_measured(
     config: ControllerConfig, configs: Sequence[ControllerConfig]
 ) -> ControllerConfig:
-    """Return an unknown arm's configuration with what was known of it in the last of its runs.
+    """Return the configuration with what the last run knew of an arm with guessed motors.
 
     `configs` are those of the runs.
     """
     given = flatten(configs[-1])
-    if not is_unknown(config) or not _is_better_known(config, given):
+    if not is_known_by_urdf_only(config) or not _is_better_known(config, given):
         return config
     values = {name: given[name] for name in _NAMES if given[name] != ()}
     return with_gains(config, {**values, 'feedback.stiffness': 1.0})
 
 
 def _is_better_known(config: ControllerConfig, given: Mapping[str, Value]) -> bool:
-    """Whether a run's parameters, all that are `given`, are of an arm that was better known.
+    """Whether a run with the parameters `given` had a better configuration than the first one.
 
-    Its gains alone may also be softer, where an arm nearly oscillated with the first ones.
+    Softer gains do not count: an arm that nearly oscillates gets those.
     """
     if given['robot.coulomb'] != config.robot.coulomb:
         return True

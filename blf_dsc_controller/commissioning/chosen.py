@@ -41,7 +41,7 @@ _BOUNDS = 'barrier.bound', 'barrier.initial_bound'  # not of gains, with one at 
 
 _SOFT = 'noise or friction hide the response: measure again with a larger --torque or --travel'
 
-_ROOM = 1.1  # bound over the errors to expect
+_EXCESS = 1.1  # of a bound over the errors to expect
 
 
 def with_gains(
@@ -106,11 +106,11 @@ def _bounds_of_tool(config: ControllerConfig) -> tuple[float, ...]:
     return config.barrier.bound if bounds is None else bounds
 
 
-def kept_stop(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
-    """Return the damping of a stop by dotted name: as it is, but no more than `damping` (n,).
+def capped_stop_damping(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
+    """Return the damping of a stop, by dotted name: as usual, but at most `damping` (n,).
 
-    Gains have a margin with that of the joints.  By the measured inertia it could be more.
-    None, if the damping of a stop is given.
+    That is the damping of the joints, which has the margin; the usual one may exceed it, by the
+    measured inertia.  Empty, if the configuration gives the damping of a stop.
     """
     arm, _ = design_of(config)
     usual = gains_of(arm, np.array(config.barrier.bound))['safety.damping']
@@ -119,22 +119,24 @@ def kept_stop(config: ControllerConfig, damping: Floats) -> dict[str, Value]:
     return {'safety.damping': tuple(np.minimum(usual, damping).tolist())}
 
 
-def kept_bound(config: ControllerConfig) -> dict[str, Value]:
-    """Return the bounds wide enough for the errors to expect, by dotted name.
+def widened_bounds(config: ControllerConfig) -> dict[str, Value]:
+    """Return bounds that are wide enough for the errors to expect, by dotted name; empty: all are.
 
     Friction may act while a load is picked up, so the errors of both add.  Where the bounds of
-    the joints follow from one at the tool, it is that one.  Funnels that are given begin at
-    these bounds at least; others follow.  Raises BlfDscError if a joint or the tool needs one
-    that bounds nothing, or joints one beside a bound at the tool from which it does not follow.
+    the joints follow from a bound at the tool, that one is widened.  A funnel that is given begins
+    at these bounds at least; others follow.
+
+    Raises BlfDscError if a joint or the tool would need a bound so wide that it bounds nothing, or
+    if the bounds of the joints are given beside one at the tool, and are too narrow.
     """
     barrier = config.barrier
     errors = expected_errors(config, settings_of_config(config))
-    least = _ROOM * (errors.unmodelled + errors.pick_up)
+    least = _EXCESS * (errors.unmodelled + errors.pick_up)
     if (least <= barrier.bound).all():
         return {}
     _check_bound(config, least)
     if barrier.bounds_tool:
-        return _kept_at_tool(config, least)
+        return _widened_at_tool(config, least)
     wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
     values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
     arm, _ = design_of(config)
@@ -146,14 +148,14 @@ def kept_bound(config: ControllerConfig) -> dict[str, Value]:
     return values
 
 
-def _kept_at_tool(config: ControllerConfig, least: Floats) -> dict[str, Value]:
+def _widened_at_tool(config: ControllerConfig, least: Floats) -> dict[str, Value]:
     """Return the bound at the tool from which bounds of the joints of `least` (n,) follow."""
     barrier = config.barrier
     over = least / barrier.bound
     if not _follow_from_tool(config):
         j = int(over.argmax())
         raise BlfDscError(
-            f'barrier.bound: {config.joints[j]} would be off by up to {least[j] / _ROOM:.2g} rad '
+            f'barrier.bound: {config.joints[j]} would be off by up to {least[j] / _EXCESS:.2g} rad '
             f'with the gains that have the margin, past its bound of {barrier.bound[j]:g} rad: '
             'drop barrier.bound, which then follows from that at the tool and is widened with it'
         )
@@ -178,9 +180,9 @@ def _kept_at_tool(config: ControllerConfig, least: Floats) -> dict[str, Value]:
 
 
 def _check_bound(config: ControllerConfig, least: Floats) -> None:
-    """Refuse errors to expect (n,) [rad or m] of half of a joint's range, or a quarter turn.
+    """Raise BlfDscError if a joint needs a bound `least` (n,) [rad or m] that bounds nothing.
 
-    One within a bound that the file gives and insists on may be so large.
+    That is half of its range or a quarter turn, unless the file gives a wider one.
     """
     limits, kinds = config.limits, config.robot.kinds(config.joints)
     widest = map(widest_bound, kinds, limits.position_lower, limits.position_upper)
@@ -190,7 +192,7 @@ def _check_bound(config: ControllerConfig, least: Floats) -> None:
     ):
         if needed > most:
             unit = 'm' if kind == 'prismatic' else 'rad'
-            far = f'by up to {needed / _ROOM:.2g} {unit}'
+            far = f'by up to {needed / _EXCESS:.2g} {unit}'
             if needed > ENDLESS:
                 far = 'without end'
             raise BlfDscError(

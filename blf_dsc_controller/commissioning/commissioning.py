@@ -25,8 +25,8 @@ from blf_dsc_controller.commissioning.choice import (
     choose,
 )
 from blf_dsc_controller.commissioning.chosen import (
-    kept_bound,
-    kept_stop,
+    capped_stop_damping,
+    widened_bounds,
     with_gains,
 )
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
@@ -49,8 +49,8 @@ POSTURES = 3
 CREEPING = 1.5
 """Times the measured friction, to expect of a joint that hardly slid while it was measured.
 
-One whose friction damps it more than its gains follows less than half of its swings, and shows
-less than its friction.  It is as much more as is taken for breakaway.
+A joint that friction damps more than its gains do follows less than half of its swings, and shows
+only a part of its friction.  The factor is the one that is taken for breakaway.
 """
 
 
@@ -58,7 +58,9 @@ class Planned(NamedTuple):
     """A motion to run, and how far it goes."""
 
     config: ControllerConfig
-    values: dict[str, object]  # of it, that differ from those of the arm in use
+    values: dict[
+        str, object
+    ]  # parameters of `config` that differ from those of the arm in use
     posture: Floats  # (n,) rad
     excitation: motion.Excitation
     share: float = 1.0  # of the gains of the arm in use
@@ -90,8 +92,7 @@ class Commissioned(NamedTuple):
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
-    # (n,) N m, robot.coulomb: measured, of an arm of which nothing was known; else None
-    coulomb: Floats | None
+    coulomb: Floats | None  # (n,) N m, robot.coulomb, if the last runs compensated it
 
     @property
     def has_margin(self) -> bool:
@@ -99,8 +100,8 @@ class Commissioned(NamedTuple):
         return self.choice.margin.value >= self.aim
 
     @property
-    def what_hides(self) -> str:
-        """What may hide the response of an arm whose gains have no margin, and what to do."""
+    def why_no_margin(self) -> str:
+        """Why no gains may have the margin, and what to do."""
         own = self.loops.margin(self.start, noise=False)
         if own.value >= BARELY:
             return (
@@ -121,10 +122,10 @@ class Commissioned(NamedTuple):
         """
         if not self.has_margin:
             raise BlfDscError(
-                f'no gains have the modulus margin of {self.aim:g}: {self.what_hides}'
+                f'no gains have the modulus margin of {self.aim:g}: {self.why_no_margin}'
             )
-        values = self.shown()
-        return values | kept_bound(with_gains(self.before, values))
+        values = self.parameters_but_bounds()
+        return values | widened_bounds(with_gains(self.before, values))
 
     @property
     def config(self) -> ControllerConfig:
@@ -134,13 +135,13 @@ class Commissioned(NamedTuple):
         """
         return with_gains(self.before, self.parameters())
 
-    def shown(self) -> dict[str, Value]:
-        """Return the parameters that follow but for bounds, whether there is a margin or not."""
+    def parameters_but_bounds(self) -> dict[str, Value]:
+        """Return the parameters that follow, without bounds, also of gains without the margin."""
         gains = self.choice.gains
         damping = _rounded(gains.damping)
         of_arm: dict[str, Value] = {}
         if not self.before.robot.torque_loop:
-            of_arm = kept_stop(self.before, np.array(damping))
+            of_arm = capped_stop_damping(self.before, np.array(damping))
             of_arm['robot.rotor_inertia'] = _rounded(self.rotors)
         if self.coulomb is not None:
             of_arm['robot.coulomb'] = _rounded(self.coulomb)
@@ -189,7 +190,7 @@ def plan(
 ) -> list[Planned]:
     """Return the motions around postures (k, n) [rad] by which an arm is measured.
 
-    `sliding` adds swings that keep joints sliding which would stick without.  They have a
+    `sliding` adds swings that keep joints sliding which would stick without.  The arm has a
     `share` of the gains of the configuration.
 
     Raises BlfDscError if the arm is not from a URDF; if its feedback acts through the
@@ -216,7 +217,7 @@ def plan(
     for posture in postures:
         _check_posture(config, posture)
         excitation = motion.excitation(arm, posture, torque, travel, sliding=sliding)
-        values = {**gains, **motion.shaken(arm, excitation, posture)}
+        values = {**gains, **motion.shaking_parameters(arm, excitation, posture)}
         planned.append(Planned(change(arm, values), values, posture, excitation, share))
     return planned
 
@@ -256,13 +257,13 @@ def commissioned(
     loops = Loops(responses, inertia, T)
     start = measuring_gains(arm)
     rigid = RigidArm(_least(found.inertias, assumed), found.timing(T, arm.lag))
-    gains_of = _gains_by_factors(config, start, inertia)
+    by_factors = _gains_by_factors(config, start, inertia)
     return Commissioned(
         joints=config.joints,
         responses=responses,
         loops=loops,
         start=start,
-        choice=choose(loops, start, gains_of, rigid, margin),
+        choice=choose(loops, start, by_factors, rigid, margin),
         findings=found,
         assumed=assumed.max(axis=0),
         rotors=_rotors(config, arm, found, assumed),
@@ -303,8 +304,8 @@ def _assumed_inertia(arm: Design, responses: Sequence[Response]) -> Floats:
 def _largest_inertia(arm: Design, found: Findings, assumed: Floats) -> Floats:
     """Return the largest inertia (n,) [kg m^2] of each joint over all postures.
 
-    It was measured, or is `assumed` (k, n) where it was not seen, in the postures of the
-    runs.  In others the model says how much larger it is.
+    In the postures of the runs it is the measured one, or that `assumed` (k, n) where none was
+    seen.  The model says how much larger it is in other postures.
     """
     here = assumed.max(axis=0)
     elsewhere = arm.over_postures().inertia - here
@@ -315,10 +316,10 @@ def _largest_inertia(arm: Design, found: Findings, assumed: Floats) -> Floats:
 def _rotors(
     config: ControllerConfig, arm: Design, found: Findings, assumed: Floats
 ) -> Floats:
-    """Return the inertias of the rotors (n,) [kg m^2]: what is missing in the `assumed` (k, n).
+    """Return the inertias of the rotors (n,) [kg m^2], by what the `assumed` (k, n) lack.
 
-    Of k runs the least counts, since a load is no rotor.  Drives with torque loops hide
-    their rotors: those of the arm are returned.
+    The run that lacks least counts, since a load is no rotor.  Drives with torque loops hide
+    their rotors: those of the configuration are returned.
     """
     if config.robot.torque_loop:
         return arm.rotors
@@ -386,21 +387,21 @@ def _check_posture(config: ControllerConfig, posture: Floats) -> None:
         strict=True,
     )
     for joint, at, lower, upper in limits:
-        if not lower + _ROOM <= at <= upper - _ROOM:
+        if not lower + _FROM_LIMITS <= at <= upper - _FROM_LIMITS:
             raise BlfDscError(
                 f'posture: {joint} would be at {at:.4g} rad, '
                 f'{_beyond(float(at), lower, upper)}'
             )
 
 
-_ROOM = 0.05  # rad
+_FROM_LIMITS = 0.05  # rad
 
 
 def _beyond(at: float, lower: float, upper: float) -> str:
-    """Return how an angle [rad] is to the limits of its joint, and what may be meant."""
+    """Return how an angle [rad] is past or near the limits of its joint, with a hint at degrees."""
     limits = f'its limits, {lower:g} to {upper:g} rad'
     if lower <= at <= upper:
-        return f'less than {_ROOM:g} rad from {limits}'
+        return f'less than {_FROM_LIMITS:g} rad from {limits}'
     return f'beyond {limits}{hint_at_degrees(at, lower, upper)}'
 
 

@@ -56,7 +56,7 @@ _SLOWEST, _FASTEST = 2.0, 120.0  # Hz
 _OF_RATE = 0.35  # of the sample rate, the fastest line at most
 _SECONDS = 4.0  # of the period, for each joint
 _SLOW, _SWING = 1.0, 4.0  # Hz, of slow tones and of swings
-_LEAST_SWING = 0.05  # times that, before the lines shrink, too
+_LEAST_SWING = 0.05  # of slow tones, below which the lines shrink, too
 _SHRINKS = 40  # until travel and speeds are within their limits
 _SPEED = 0.25  # of the limit of velocity
 _SEED = 0
@@ -78,15 +78,10 @@ class Excitation(NamedTuple):
     swing: Floats  # (n,) N m, torque of slow tones or swings at most, without friction
     sliding: bool  # with swings
 
-    @property
-    def frequencies(self) -> Floats:
-        """Frequencies (K,) [Hz]: the middle of the lines of all joints."""
-        return np.asarray(self.bins.mean(axis=0) / self.period)
-
     def reference(self, posture: Floats) -> dict[str, object]:
         """Return the parameters of the reference around a posture (n,) [rad].
 
-        The first tone moves nothing; its period is that of the motion (`excitation_in`).
+        The first tone moves nothing: from its frequency `lines_in` takes the period.
         """
         n, lines = self.amplitude.shape
         bins = np.column_stack((self.bins, self.slow))
@@ -119,7 +114,7 @@ class Lines(NamedTuple):
 def lines_in(config: ControllerConfig) -> Lines:
     """Return the lines of the motion that a configuration has.
 
-    Raises BlfDscError if it is none of those that `shaken` makes.
+    Raises BlfDscError if it is none of those of a commissioning.
     """
     reference = config.reference
     n = len(config.joints)
@@ -150,10 +145,10 @@ def excitation(
 ) -> Excitation:
     """Return the motion around a posture (n,) [rad] of an arm from a URDF.
 
-    Its torques are `share` of the rated ones (rms), by the inertias that the URDF and
-    `robot.rotor_inertia` have; less, where its tool would travel farther than `travel`
-    [m] or a joint would move faster than a quarter of its limit.  Joints with swings
-    (`sliding`) shrink each on its own where they are too fast, swing and lines alike.
+    Its torques are `share` of the rated ones (rms), by the inertias of the URDF and
+    `robot.rotor_inertia`.  They are less where the tool would travel farther than `travel` [m],
+    or a joint would be faster than a quarter of its limit.  With swings (`sliding`), the motion
+    of each joint is made smaller by itself, swings and lines alike.
     """
     n = len(config.joints)
     period = _SECONDS * n
@@ -165,7 +160,8 @@ def excitation(
     lines = _by_torque(share, rated, inertia, bins, period)
     rates = 2.0 * np.pi / period * slow if sliding else 2.0 * np.pi * _SLOW
     swing = np.full(slow.shape, SLIDING / rates / SLOW_TONES)
-    shape = _Shape(np.column_stack((bins, slow)), period, SLOW_TONES * sliding)
+    held = SLOW_TONES if sliding else 0
+    shape = _Shape(np.column_stack((bins, slow)), period, held)
     room = _Room(chain, posture, travel, _SPEED * np.array(config.limits.velocity))
     shrink = _shrink_each if sliding else _shrink_all
     amplitude, moves = _shrunk(lines, swing, shape, room, shrink)
@@ -194,9 +190,9 @@ def _inertias(config: ControllerConfig, chain: Chain, posture: Floats) -> Floats
 def _by_torque(
     share: float, rated: Floats, inertia: Floats, bins: Ints, period: float
 ) -> Floats:
-    """Return amplitudes (n, K) [rad] of lines (n, K) whose torques are `share` of the rated ones.
+    """Return amplitudes (n, K) [rad] of lines `bins` (n, K) by their torques.
 
-    These are (n,) [N m], the inertias that they move (n,) [kg m^2].
+    These are a `share` of `rated` (n,) [N m], and move `inertia` (n,) [kg m^2].
     """
     rate = 2.0 * np.pi / period * bins
     torque = share * rated / math.sqrt(0.5 * bins.shape[1])
@@ -267,7 +263,7 @@ class _Shape:
         self._held = held
         random = np.random.default_rng(_SEED)
         self._phase = random.uniform(0.0, 2.0 * np.pi, bins.shape)
-        # against each other at the start
+        # the last two tones cancel each other at the start
         self._phase[:, -1] = self._phase[:, -2] + np.pi
 
     def motion(self, amplitude: Floats) -> _Moves:
@@ -279,18 +275,18 @@ class _Shape:
         return _Moves(phase, moved, np.abs(rate).max(axis=0))
 
 
-def shaken(
+def shaking_parameters(
     config: ControllerConfig, excitation: Excitation, posture: Floats
 ) -> dict[str, object]:
     """Return the parameters that hold an arm by its own gains and shake it.
 
-    It learns nothing, so that it is the same at the end as at the beginning.  Torques bound
-    the motion, not accelerations: fast tones have high ones that hardly move a light wrist.
+    The law learns nothing, so that it is the same at the end as at the beginning.  Torques limit
+    the motion, not accelerations: those of fast tones are high, but hardly move a light wrist.
     """
     count = len(config.learning.initial_estimate)
     limit = np.maximum(config.limits.acceleration, excitation.acceleration)
     return (
-        watched(config)
+        undisturbed_parameters(config)
         | excitation.reference(posture)
         | {
             'learning.weight': 0.0,
@@ -301,14 +297,13 @@ def shaken(
     )
 
 
-def watched(config: ControllerConfig) -> dict[str, object]:
-    """Return the parameters of an arm with soft gains that nothing but a stop may change.
+def undisturbed_parameters(config: ControllerConfig) -> dict[str, object]:
+    """Return the parameters of a run with soft gains that goes on as planned, or stops.
 
-    Errors may be wide, loads are not declared, and a contact ends the motion if it would
-    change it.
+    The bounds are wide, loads are not declared, and a contact stops an arm that would react to it.
     """
     barrier = config.barrier
-    wide = np.maximum(np.maximum(barrier.bound, barrier.initial_bound), _ROOM)
+    wide = np.maximum(np.maximum(barrier.bound, barrier.initial_bound), _WIDE_BOUND)
     values: dict[str, object] = {
         'barrier.bound': _listed(wide),
         'barrier.initial_bound': [0.0] * len(wide),
@@ -322,7 +317,7 @@ def watched(config: ControllerConfig) -> dict[str, object]:
     return values
 
 
-_ROOM = 0.1  # rad, bound of the errors
+_WIDE_BOUND = 0.1  # rad, bound of the errors
 
 
 def _bins(n: int, period: float, sample_time: float) -> Ints:
@@ -342,8 +337,8 @@ def _slow(n: int, period: float) -> Ints:
 def _swings(n: int, period: float) -> Ints:
     """Return two tones, of all joints alike (n, 2), that are `BEAT` apart.
 
-    They are odd multiples of n: so are those that friction, odd, makes of them, and lines
-    are none of these.
+    They are odd multiples of n.  So are the tones that friction makes of them, since it is an odd
+    function of speed; lines are none of these.
     """
     below = 2 * n * round(_SWING * period / (2 * n))
     return np.tile([below - n, below + n], (n, 1))

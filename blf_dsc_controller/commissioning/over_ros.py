@@ -109,7 +109,7 @@ class OverRos(PostureByPosture):
                 '--states'
             )
 
-    def leave(self) -> None:
+    def hold_after(self) -> None:
         """Hold an arm whose drives do not until an end is requested."""
         if self._config.robot.drive_compensates != 'none':
             return
@@ -190,7 +190,7 @@ class OverRos(PostureByPosture):
         return (End.LOST if is_lost else End.STOPPED), supervisor.text
 
     def _lost(self, began: float) -> tuple[End, str] | None:
-        """Return what is missing of a run that began then [s]: states, or who takes torques."""
+        """Return what a run that began at `began` [s] lacks: joint states, or who takes torques."""
         node = self._node
         now = time.monotonic()
         silent = now - max(node.heard, began)

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.commissioning.better_known import (
-    FAR,
-    TIMES,
-    WORTH,
-    better_known,
-    is_unknown,
+    ABOVE_IF_HIDDEN,
+    FAR_ABOVE,
+    MOST_ANEW,
+    better_configuration,
+    is_known_by_urdf_only,
 )
 from blf_dsc_controller.commissioning.choice import MARGIN
 from blf_dsc_controller.commissioning.commissioning import (
@@ -37,10 +37,10 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.run import Run
 
 REPEATS = 2
-"""Times that a posture is measured again, at most: softer, with swings, and with more torque."""
+"""How often a posture is measured again at most: softer, with swings, or with more torque."""
 
 _SOFTER = 0.5  # of the gains, with which an arm is measured that nearly oscillates
-_WORTH = 1.2  # times the amplitude, for which a posture is measured again
+_WORTHWHILE = 1.2  # times the amplitude, from which a posture is measured again
 
 Measured = tuple[Run, ControllerConfig]
 """The run of a motion, with its parameters."""
@@ -61,11 +61,12 @@ class Commissioning:
     Attributes:
         config: the configuration that the arm is measured for.
         margin: modulus margin of the gains to choose.
-        measured_with: the configuration that the motions have: stiffer and with more friction
-            compensated, once the arm is better known.
-        slides: whether motions have swings from the first on.
-        share: of its gains, that motions have: half, once the arm nearly oscillated.
-        times: how often the arm may be better known yet.
+        measured_with: the configuration of the motions: `config`, or the stiffer one by which
+            `better_known` measures the arm anew.
+        slides: whether the first motion in a posture has swings already.
+        share: of the gains of `measured_with` that motions have; `stronger` halves it if the arm
+            nearly oscillates.
+        anew_left: how many times `better_known` may still measure the arm anew.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Commissioning:
         self.measured_with = config
         self.slides = False
         self.share = 1.0
-        self.times = TIMES if is_unknown(config) else 0
+        self.anew_left = MOST_ANEW if is_known_by_urdf_only(config) else 0
         self._postures = postures
         self._torque = torque
         self._travel = travel
@@ -113,7 +114,7 @@ class Commissioning:
         return self.motions_from(None)
 
     def motions_from(self, here: ArrayLike | None) -> list[Planned]:
-        """Return the motions of an arm at `here` (n,) [rad]: all that a reference to hold visits.
+        """Return the motions of an arm at `here` (n,) [rad], where it stays if it is to hold.
 
         Raises:
             BlfDscError: as for `motions`.
@@ -147,12 +148,12 @@ class Commissioning:
     def stronger(
         self, motion: Planned, run: Run, posture: ArrayLike | None = None
     ) -> Planned | None:
-        """Return a motion to repeat one with: with more torque, if noise hides much in its run.
+        """Return the motion to measure a posture with again; None: the run shows enough.
 
-        With swings, if friction damps a joint more than its gains do; with half of the gains,
-        if the arm nearly oscillates with them, and then all later motions have these.  It is
-        around a posture (n,) [rad], or that of the motion.  None: enough is seen, or the travel
-        of the tool and the speeds permit no more.
+        It has more torque, if noise hides much; swings, if friction damps a joint more than its
+        gains do; half of the gains, if the arm nearly oscillates with them.  Later motions then
+        have these gains, too.  It is around `posture` (n,) [rad], or that of the motion.  None
+        also if the travel of the tool and the speeds permit no larger motion.
 
         Raises:
             BlfDscError: the run does not show the response.
@@ -171,32 +172,38 @@ class Commissioning:
             return again
         before, after = (each.excitation.amplitude for each in (motion, again))
         gained = float((after[:, :-SLOW_TONES] / before[:, :-SLOW_TONES]).max())
-        return again if gained > _WORTH else None
+        return again if gained > _WORTHWHILE else None
 
     def better_known(self, motion: Planned, run: Run) -> Commissioning | None:
-        """Return what measures this arm anew, better known by the run of a motion.
+        """Return what measures this arm anew, by what a run shows; None: the run is good enough.
 
-        For an arm of which only the URDF is known it has stiffer gains, and compensates the
-        friction that the run shows: at most twice, and while the arm bears 5 times the gains
-        that it is measured with, or 2.5 times and friction hides an inertia.  Its runs belong
-        to the result of this one.  None: the run is good enough.
+        It has stiffer gains, and compensates the friction that the run shows.  That is for arms
+        of which only the URDF is known, at most twice, and while the arm bears more than 5 times
+        the gains of the run, or 2.5 times if friction hides an inertia.  Its runs belong to the
+        result of this one.
 
         Raises:
             BlfDscError: the run does not show the response.
         """
-        if not self.times:
+        if not self.anew_left:
             return None
         found = commissioned(self.config, [(run, motion.config)], self.margin)
         hidden = np.isnan(found.findings.inertia)
-        if found.choice.factors.max() <= (WORTH if hidden.any() else FAR):
+        if found.choice.factors.max() <= (
+            ABOVE_IF_HIDDEN if hidden.any() else FAR_ABOVE
+        ):
             return None
         better = copy(self)
         vars(better).pop('motions', None)  # of gains that are softer
-        better.measured_with = better_known(
-            self.config, found.shown(), found.start, found.findings.friction, hidden
+        better.measured_with = better_configuration(
+            self.config,
+            found.parameters_but_bounds(),
+            found.start,
+            found.findings.friction,
+            hidden,
         )
         better.slides = motion.excitation.sliding
-        better.times -= 1
+        better.anew_left -= 1
         return better
 
     def _motion(

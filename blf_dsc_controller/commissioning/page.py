@@ -15,7 +15,7 @@ from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST
-from blf_dsc_controller.commissioning.better_known import FAR, known_friction
+from blf_dsc_controller.commissioning.better_known import FAR_ABOVE, known_friction
 from blf_dsc_controller.commissioning.commissioning import (
     CREEPING,
     Commissioned,
@@ -130,7 +130,7 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
         f'{two_digits(choice.measured.frequency)} Hz'
     )
     if not found.has_margin:
-        yield (f'NO GAINS HAVE THE MARGIN of {found.aim:g}: {found.what_hides}')
+        yield (f'NO GAINS HAVE THE MARGIN of {found.aim:g}: {found.why_no_margin}')
     if choice.by_inertia.any():
         names = ', '.join(np.array(found.joints)[choice.by_inertia])
         yield (
@@ -145,9 +145,9 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
 
 
 def _of_factors(found: Commissioned) -> Iterator[str]:
-    """Yield how to go to gains that are far above those of the measurement."""
+    """Yield how to raise gains that are far above those of the measurement."""
     most = float(found.choice.factors.max())
-    if most > FAR:
+    if most > FAR_ABOVE:
         joint = found.joints[int(found.choice.factors.argmax())]
         yield (
             f'{joint} gets {two_digits(most)} times the gains it was measured with: raise '

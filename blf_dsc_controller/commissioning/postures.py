@@ -76,7 +76,7 @@ def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
     speed = np.minimum(SPEED, 0.5 * np.array(config.limits.velocity))
     acceleration = np.minimum(_ACCELERATION, 0.5 * np.array(config.limits.acceleration))
     duration = max(_SHORTEST, duration_of(far, speed, acceleration))
-    values = motion.watched(config) | {
+    values = motion.undisturbed_parameters(config) | {
         'reference.type': 'waypoints',
         'reference.times': [0.0, duration],
         'reference.waypoints': [*here.tolist(), *target.tolist()],
@@ -84,28 +84,27 @@ def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
     return Move(change(config, values), duration + _REST)
 
 
-def stronger(
+def stronger_by_bag(
     commissioning: Commissioning, planned: Planned, bag: Path, posture: Floats
 ) -> Planned | None:
-    """Return the motion to repeat the one of a bag with, around a posture (n,) [rad].
+    """Return `Commissioning.stronger` for the bag of a motion, around a posture (n,) [rad].
 
-    None: it shows enough.  Raises BlfDscError if it does not show the response.
+    Raises BlfDscError if it is None, and the bag does not show the response.
     """
-    run, config = measured_in(bag)
-    again = commissioning.stronger(planned, run, posture)
+    again = commissioning.stronger(planned, measured_in(bag)[0], posture)
     if again is None:
-        response_of(run, motion.lines_in(config), config.sample_time)
+        check(bag)
     return again
 
 
-def better_known(
-    commissioning: Commissioning, motion: Planned, bag: Path
+def better_known_by_bag(
+    commissioning: Commissioning, planned: Planned, bag: Path
 ) -> Commissioning | None:
-    """Return what measures the arm anew, better known by the motion of a bag; None: not worth it.
+    """Return `Commissioning.better_known` for the bag of a motion.
 
     Raises BlfDscError if the bag does not show the response.
     """
-    return commissioning.better_known(motion, measured_in(bag)[0])
+    return commissioning.better_known(planned, measured_in(bag)[0])
 
 
 def check(bag: Path) -> None:
@@ -124,7 +123,7 @@ def _named(name: str) -> Iterator[None]:
 
 
 def _set_aside(bag: Path, why: str) -> None:
-    """Give a bag, that no result comes from, a name of its own."""
+    """Rename a bag that is not in the result, so that its name is free for the next one."""
     there = bag.with_name(f'{why}_{bag.name}')
     while there.exists():
         there = there.with_name(f'again_{there.name}')
@@ -141,7 +140,7 @@ class PostureByPosture(ABC):
         self._folder = folder
         self._measured = 0
         self._requests = 0
-        self._left = ''  # what is left after an end before its time, of a proof
+        self._left = ''  # what a proof has found so far; empty: the arm is measured
 
     @abstractmethod
     def _positions(self) -> ArrayLike:
@@ -160,8 +159,8 @@ class PostureByPosture(ABC):
         Raises EndedError or BlfDscError if it ended before its time.
         """
 
-    def leave(self) -> None:  # noqa: B027 - most robots hold themselves
-        """Hold the arm after the last run for as long as it needs it."""
+    def hold_after(self) -> None:  # noqa: B027 - most robots hold themselves
+        """Hold an arm after its last run that would fall otherwise."""
 
     def _aside(
         self,
@@ -169,7 +168,7 @@ class PostureByPosture(ABC):
         *given: Given.args,
         **named: Given.kwargs,
     ) -> Answer:
-        """Return what takes a moment to compute, between two runs."""
+        """Return the answer of a function that may take longer than a sample, between two runs."""
         return compute(*given, **named)
 
     def request_end(self) -> None:
@@ -215,36 +214,43 @@ class PostureByPosture(ABC):
             name = f'posture {k}'
             way = self._aside(move, self._config, self.position(), posture)
             self._run(way.config, way.duration, f'move {k}')
-            motion, bag = self._measure(name)
+            planned, bag = self._measure(name)
             while k == 1:
                 with _named(name):
-                    better = self._aside(better_known, self._commissioning, motion, bag)
+                    better = self._aside(
+                        better_known_by_bag, self._commissioning, planned, bag
+                    )
                 if better is None:
                     break
                 self._commissioning = better
                 _set_aside(bag, 'soft')
-                motion, bag = self._measure(name)
+                planned, bag = self._measure(name)
             self._measured = k
             yield name, bag
 
     def _measure(self, name: str) -> tuple[Planned, Path]:
-        """Measure the arm where it rests, again if the motion hides much; return the last one."""
-        motion = self._aside(self._commissioning.motion, self.position())
-        bag = self._run(motion.config, motion.duration, name)
+        """Measure the arm where it rests, repeatedly if need be; return the last motion and bag."""
+        planned = self._aside(self._commissioning.motion, self.position())
+        bag = self._run(planned.config, planned.duration, name)
         for _ in range(REPEATS):
             with _named(name):
                 again = self._aside(
-                    stronger, self._commissioning, motion, bag, self.position()
+                    stronger_by_bag,
+                    self._commissioning,
+                    planned,
+                    bag,
+                    self.position(),
                 )
             if again is None:
-                return motion, bag
+                return planned, bag
             _set_aside(bag, 'weak')
-            motion = again
-            self._commissioning.share = again.share  # also if it was computed elsewhere
-            bag = self._run(motion.config, motion.duration, name)
+            planned = again
+            # `stronger` has set it, but of a copy if another process has computed it
+            self._commissioning.share = again.share
+            bag = self._run(planned.config, planned.duration, name)
         with _named(name):
             self._aside(check, bag)
-        return motion, bag
+        return planned, bag
 
     def proof(self, steps: Sequence[Step]) -> Iterator[tuple[Step, Errors]]:
         """Yield the errors of each step, to whose start the arm goes slowly.
@@ -268,6 +274,7 @@ class PostureByPosture(ABC):
         return bag
 
     def _ended(self, name: str, end: End, text: str) -> EndedError:
+        """Return the error of a run that ended for this reason, with what is left."""
         reason = f': {text}' if text else ''
         left = self._left or (
             f'No gains were chosen or written; whole bags of {self._measured} postures are in '

@@ -42,7 +42,7 @@ class Step(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the run, and of its bag."""
         return f'{self.share:.0%} of the gains'
 
 
@@ -64,7 +64,7 @@ def steps(config: ControllerConfig) -> list[Step]:
             'feedback.joint_stiffness is empty: prove the file that blf_dsc commission has written'
         )
     calm: dict[str, Value] = {'safety.oscillation': 'stop'}
-    soft = change(config, motion.watched(config) | calm)
+    soft = change(config, motion.undisturbed_parameters(config) | calm)
     found = []
     for share in SHARES[:-1]:
         factor = share * gains.stiffness

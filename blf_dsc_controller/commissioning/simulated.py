@@ -66,27 +66,27 @@ def proof(loop: LoopConfig) -> Proof:
 def runs_of(
     commissioning: Commissioning, loop: LoopConfig
 ) -> Iterator[tuple[str, Measured | BlfDscError]]:
-    """Yield the runs of all motions, then one with the rated payload, with their names.
+    """Yield names and runs: one in each posture, then the first motion with the rated payload.
 
-    Where noise or friction hide much, it is the run of another motion.  The last one may be beyond
-    what soft gains hold: then it is the error.
+    A posture in which noise or friction hide much is measured again, and its last run counts.  Soft
+    gains may not hold the payload: then the error is yielded in the place of the run.
     """
     plant = loop.plant
     postures = [
         each.posture for each in commissioning.motions_from(plant.initial.position)
     ]
-    strongest = []
+    motions = []
     for k, posture in enumerate(postures, 1):
-        shaken, run = _strongest(commissioning, posture, plant)
-        while k == 1 and (better := commissioning.better_known(shaken, run[0])):
+        planned, run = _strongest(commissioning, posture, plant)
+        while k == 1 and (better := commissioning.better_known(planned, run[0])):
             commissioning = better
-            shaken, run = _strongest(commissioning, posture, plant)
-        strongest.append(shaken)
+            planned, run = _strongest(commissioning, posture, plant)
+        motions.append(planned)
         yield f'posture {k}', run
     payload = loop.controller.robot.payload
     name = f'posture 1 with {payload:g} kg'
     try:
-        yield name, measured(strongest[0], plant, payload)
+        yield name, measured(motions[0], plant, payload)
     except BlfDscError as error:
         yield name, error
 
@@ -95,11 +95,11 @@ def _strongest(
     commissioning: Commissioning, posture: Floats, plant: PlantConfig
 ) -> tuple[Planned, Measured]:
     """Return a motion around a posture (n,) [rad] that shows enough, or the last, and its run."""
-    shaken = commissioning.motion(posture)
-    run = measured(shaken, plant)
+    planned = commissioning.motion(posture)
+    run = measured(planned, plant)
     for _ in range(REPEATS):
-        again = commissioning.stronger(shaken, run[0])
+        again = commissioning.stronger(planned, run[0])
         if again is None:
             break
-        shaken, run = again, measured(again, plant)
-    return shaken, run
+        planned, run = again, measured(again, plant)
+    return planned, run

@@ -4,12 +4,12 @@
 Noise is counted against the modulus margin, and falls as the torque of the motion grows.  A
 first, weak motion shows how much it takes; where that is much, the posture is measured again
 with the torque that makes it little, as far as `MOST` allows.  Where friction damps a joint
-more than its gains do, it is measured again with swings that keep its joints sliding: one that
-sticks shows its friction, of which a steady motion has none.
+more than its gains do, it is measured again with swings that keep its joints sliding.  A joint
+that sticks shows damping by friction that a steady motion does not have.
 
-An arm that nearly oscillates with the gains of its measurement makes noise of its own, which no
-torque overcomes, and the controller reports it.  It is measured again with half of them: the
-response is the same.
+An arm that nearly oscillates with the gains of its measurement makes noise that no torque
+overcomes, and the controller reports an oscillation.  The arm is measured again with half of
+these gains: its response does not depend on them.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ def chosen_by(law: str, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_usual(name: str, value: object, given: Mapping[str, Any]) -> bool:
-    """Whether a law without this one of `SWITCHES` does what it says."""
+    """Whether laws that lack a switch (of `SWITCHES`) do what its `value` asks for."""
     return bool(chosen_by('paper', given)[of_law(name, 'paper')] == value)
 
 

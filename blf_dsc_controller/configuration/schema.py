@@ -141,7 +141,7 @@ class Parameter:
             yield f'{self.name}: got {format_value(entry)}{place}, but {expected}'
 
     def _unquoted(self, entries: Sequence[Any]) -> str:
-        """Return the remedy if it is quotes that make texts of what would be of this type."""
+        """Return the remedy if entries would be of this type but for their quotes, or empty."""
         words = [parse_scalar(each) for each in entries if isinstance(each, str)]
         return (
             ': write it without quotes'

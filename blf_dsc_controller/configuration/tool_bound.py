@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint bounds that follow from a bound at the tool.
 
-They are k = lambda w, with the largest lambda for which the tool keeps its bound at
-every posture.  w are the errors to expect of the joints: a loop whose gains follow from
-the arm turns a torque d that its model lacks into errors in proportion to M^-1 d, with
-friction and the residual floor in d, or the weight of the rated payload.  Where each
-joint has a stiffness of its own, it is d over that, with the torque of a payload that
-moves: a first joint bears no weight, but a load that is accelerated.  So all joints use
-about the same part of their bounds, which leaves the most room.  What commissioning has measured
-of friction, and not seen of inertia, is in d.
+They are k = lambda w, with the largest lambda for which the tool keeps its bound at every
+posture.  w are the errors to expect of the joints, so all joints use about the same part of
+their bounds, which leaves the most room.
+
+d is the torque that the model lacks: friction and the residual floor, or the rated payload.  It
+includes the friction that a commissioning has measured, and the inertia that it did not see.
+If gains follow from the inertia of the arm, w is in proportion to M^-1 d, with the weight of the
+payload.  If each joint has a stiffness of its own, w is d over this stiffness, with the torque of
+a payload that moves: a first joint bears no weight, but accelerates the load.
 """
 
 from __future__ import annotations

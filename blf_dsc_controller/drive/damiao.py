@@ -4,9 +4,9 @@
 Each period, all motors get a frame and answer with their states, which the next frames
 follow: a torque acts a period after its state.  Ranges are read from the motors.
 
-Motors keep the last frame.  At the end, and for the others where one has failed, that is
-a frame that holds the arm where it is, with the torque that it had: such arms have no
-brakes, and one that is disabled falls.
+Motors keep the last frame.  Such arms have no brakes, and fall if they are disabled.  So the
+last frame, at the end or after another motor has failed, holds the arm where it is, with the
+torque that it had.
 """
 
 from __future__ import annotations

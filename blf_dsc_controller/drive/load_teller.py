@@ -15,8 +15,8 @@ _SAME = 1e-5  # kg; robots report single precision
 class LoadTeller:
     """What a robot is told of its load: as weighed, or as a script declares it.
 
-    The law takes a step over with the state that reports it, or, of a robot that
-    reports no load, with the first one after the robot has accepted it.
+    A step of the load counts for the law from the state on that reports it.  If the robot reports
+    no load, it counts from the first state after the robot has accepted it.
 
     Attributes:
         problem: why the robot is told nothing more, or empty.

@@ -79,11 +79,8 @@ def read_bag(
         source += f', positions of motors of {other.topics[JOINT_STATES].name}'
 
     file = _File(path, Tree.of(text), dict(zip(theirs, joints, strict=True)), units)
-    if len(groups) > 1:
-        _refuse_commands(path, len(groups), commanded=commanded)
-        motion = _of_several(file, content, groups, source)
-    else:
-        motion = _of_one(file, content, theirs, source, commanded=commanded)
+    motion_of = _of_one if len(groups) == 1 else _of_several
+    motion = motion_of(file, content, groups, source, commanded=commanded)
     theta = None
     if other is not None:
         theta = units['q'].factor * _motors_at(motion.stamp, other, theirs)
@@ -109,19 +106,20 @@ class _Motion(NamedTuple):
     said: list[str]  # of what was left out
 
 
-def _refuse_commands(path: Path, messages: int, *, commanded: bool) -> None:
-    """Raise BagError if commands are wanted of joints that come in several messages."""
+def _of_several(
+    file: _File,
+    content: Content,
+    groups: Sequence[Sequence[str]],
+    source: str,
+    *,
+    commanded: bool,
+) -> _Motion:
+    """Return the motion of joints that come in several messages, with efforts."""
     if commanded:
         raise BagError(
-            f'{path}: the joints come in {messages} messages, to which commands cannot be '
+            f'{file.path}: the joints come in {len(groups)} messages, to which commands cannot be '
             'assigned: leave out --effort command'
         )
-
-
-def _of_several(
-    file: _File, content: Content, groups: Sequence[Sequence[str]], source: str
-) -> _Motion:
-    """Return the motion of joints that come in several messages."""
     parts = [single_run(content, group).states for group in groups]
     found = [file.sound(part, part, _OF_EFFORTS) for part in parts]
     said = [each for _, remarks in found for each in remarks]
@@ -132,12 +130,13 @@ def _of_several(
 def _of_one(
     file: _File,
     content: Content,
-    joints: Sequence[str],
+    groups: Sequence[Sequence[str]],
     source: str,
     *,
     commanded: bool,
 ) -> _Motion:
     """Return the motion of joints that come in one message, with efforts, or else commands."""
+    (joints,) = groups
     states = single_run(content, joints).states
     efforts, remedy = states, _OF_EFFORTS
     if commanded or not _any(states.field(2), states.size):

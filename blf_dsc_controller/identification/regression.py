@@ -80,16 +80,12 @@ def regression(
         deviation = np.maximum(found, floor)
         if (np.abs(deviation - deviation_used) <= _AGREE * deviation).all():
             break
-    residual = np.concatenate(
-        [each @ np.append(theta, -1.0) for each in weighted.blocks()]
-    )
-    lengths = np.array([correlation_length(column) for column in residual.T])
     solved = Regression(
         A,
         b,
         np.empty(0),
         theta,
-        lengths * HOP,
+        _lasting(weighted, theta),
         deviation_used,
         weighted.delay,
     )
@@ -172,6 +168,13 @@ def triangle(blocks: Iterable[Floats]) -> Floats:
 
 def _triangle(blocks: Sequence[Floats]) -> Floats:
     return np.asarray(np.linalg.qr(np.concatenate(blocks, axis=-2), mode='r'))
+
+
+def _lasting(weighted: Weighted, theta: Floats) -> Floats:
+    """Return the correlation length (n,) [s] of each joint's residual."""
+    solution = np.append(theta, -1.0)
+    residual = np.concatenate([each @ solution for each in weighted.blocks()])
+    return HOP * np.array([correlation_length(column) for column in residual.T])
 
 
 def correlation_length(residual: Floats) -> float:

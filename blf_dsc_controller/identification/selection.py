@@ -2,9 +2,9 @@
 """What the model is, by cross-validation: contacts, optional terms, and widths of the prior.
 
 The recording is cut into five parts; each is predicted by the values found from the
-others.  Optional terms are many, and what shows one of them may be short: there it is
-ten parts, so that less is missing from what predicts.  Only the part that is fitted is
-used, never the one held back for the score.  Bounds are ignored here.
+others.  For optional terms there are ten parts: the motion that shows a term may be short, and
+then less of it is missing in the parts that predict.  Only the recording that is fitted is
+used, never the part held back for the score.  Bounds are ignored here.
 """
 
 from __future__ import annotations

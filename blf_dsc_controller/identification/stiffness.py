@@ -72,7 +72,7 @@ class Compliance(NamedTuple):
 
     @property
     def is_computed(self) -> np.ndarray:
-        """Whether twists (n,) are so exactly as the torque that they are computed from it."""
+        """Whether twists (n,) fit the torque so exactly that they must be computed from it."""
         return np.asarray(self.is_known & (self.left < _COMPUTED))
 
 

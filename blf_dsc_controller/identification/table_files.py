@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of tables: names of columns, and values that are read when they are asked for.
 
-The columns of npz and mat files are their vectors, and those of matrices, in which each
-is named after its matrix with its index.  Only the longest columns are kept.
+The columns of npz and mat files are their vectors, and the columns of their matrices, each
+named after its matrix and its index.  Only the longest columns are kept.
 
 Files are not trusted: what they unpack to has a limit.
 """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages over a `Link` between a loop without ROS and the process of its topics.
 
-The kind of a message is that of a topic, whose content is the serialised message, or
-one of those below, whose content is JSON.
+The kind of a message is either a topic, and the content is the serialised message, or one of
+those below, and the content is JSON.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ class Rerun:
         first, last: stamps [ns] of its first and last sample; -1 before the first.
         answers: number of answers reached.
         skipped: number of joint states that the controller did not answer.
-        departure: in what, and at which stamp [ns], the controller first started,
-            stopped or accepted otherwise than the recorded one, which ends the replay.
+        departure: how, and at which stamp [ns], the controller differed first from the recorded
+            one in what it started, stopped or accepted; this ends the replay.
         alteration: the first event that happened alike, but says something else; or None.
         end: any other reason why the replay ended before the bag, or empty.
     """

@@ -123,12 +123,12 @@ def compare_pairs(study: Study, results: Columns) -> Summary:
 
 
 def _compare(study: Study, results: Columns, law: str, other: str = WITHOUT) -> Summary:
-    """Compare the runs of a law, by its prefix, with those of another one that learns nothing.
+    """Compare the runs of a law with those of another one that learns nothing.
 
-    `factor` is the largest settled error with it over that without. It and the medians
-    are of the runs that keep the bound without. `near` counts the runs that come near
-    the bound without, with a largest error that is at least 1 % larger or smaller with
-    it.
+    `law` and `other` are the prefixes of their columns. `factor` has quantiles of the largest
+    settled error of the law over that of the other. It and the medians are of the runs in
+    which the other keeps the bound. `near` counts the runs in which the other comes near the
+    bound, and the largest errors of the two differ by at least 1 %.
     """
     kept = results[f'{law}outcome'] == KEPT
     without = results[f'{other}outcome'] == KEPT

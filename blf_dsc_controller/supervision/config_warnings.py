@@ -228,14 +228,14 @@ def _of_unmodelled(
             'this bound at the tool'
         )
     yield (
-        f'{parameter}: friction{_of_unknown(config)} and unmodelled torque '
+        f'{parameter}: friction{_assumed_friction(config)} and unmodelled torque '
         f'(learning.residual_floor) alone are expected to move {config.joints[worst]} '
         f'{errors[worst]:.2g} rad from its reference: {remedy}'
     )
 
 
-def _of_unknown(config: ControllerConfig) -> str:
-    """Return of which friction the expected errors are, if that of a joint is not known."""
+def _assumed_friction(config: ControllerConfig) -> str:
+    """Return how much friction is assumed, in brackets; empty if that of each joint is known."""
     robot = config.robot
     is_unknown = robot.unknown_friction(robot.chain(config.joints)).any()
     if config.commissioning.friction or not is_unknown:
@@ -268,7 +268,7 @@ def _of_pick_up(
 
 
 def _remedy_of_pick_up(config: ControllerConfig, share: float) -> str:
-    """Return by what the error of a pick-up gets to this share of what it is."""
+    """Return the change that reduces the error of a pick-up to this share of it."""
     lag = config.robot.lag
     if config.feedback.inertia == 'none':
         return 'a larger feedback.stiffness, if the arm bears it'

@@ -29,7 +29,7 @@ class Readings:
 
     Attributes:
         gap: time [s] between the last state, used or not, and the one before.
-        is_after_gap: whether that is so long that the last state does not follow that one.
+        is_after_gap: whether this time is too long to compare the two.
     """
 
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:

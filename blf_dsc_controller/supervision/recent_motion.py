@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The motion of the last samples and its torques: what the arm carries besides its model.
 
-The disturbance estimate of the law is an integral: in motion it is also the friction,
-the error of the inertia, and what it has wound up so far.  As a load to be held it moves
-the joints that are light.  What the torques of the last samples have moved besides the
-model is not:
+The disturbance estimate of the law is an integral.  In motion it also contains friction, the
+error of the inertia, and what it has wound up so far: held as a load, it would move light
+joints.  The load that follows from the torques of the last samples contains none of these:
 
     load = mean of tau - H(q, dq, dq, ddq) P^ - friction
 """
@@ -26,7 +25,7 @@ _BLOCKS = 10  # of it or some more, each with the mean acceleration in it
 
 
 def is_gap(elapsed: float, sample_time: float) -> bool:
-    """Whether a state comes so long [s] after the last one that it does not follow it."""
+    """Whether the time [s] since the last state is too long to compare the two."""
     return elapsed >= max(_GAP, LONG_GAP * sample_time)
 
 

@@ -135,9 +135,10 @@ class SafeStop:
         )
 
     def _load_at_stop(self, reason: Reason) -> Vector:
-        """Return what holds the arm besides its model (n,) [N m], where the law stops.
+        """Return the torque (n,) [N m] that holds the arm besides its model when the law stops.
 
-        After a gap it is what holds it now, whoever commands that.
+        After a gap in the states it is the torque that holds the arm now, also if another node
+        commands it.
         """
         held = self._held.command()
         if held is not None:

@@ -67,19 +67,21 @@ class SafeTorque:
 
     It obeys the rate limit, except for the last torque of all.
 
-    What holds the arm besides the model's gravity is observed from its motion, in the
-    stop, too (`ObservedLoad`).  The acceleration of an elastic joint is not that of a
-    rigid one: above the first resonance, what it says about the load is as wrong as it is
-    large.  One pole of 30 1/s lets an oscillation go on at up to 20 rad/s; two of 10 do
-    not feed one that stops the arm, and let a load sink further.  So they are those of an
-    arm that oscillates at the stop, and of each joint that swings in it.
-    Estimated friction is not part of it, since it helps to brake.  So an arm comes to
-    rest with a payload, or with a model, that the law had not learned yet.  Commands
-    that do not reach the arm would make that sum up for ever: after a stop that this
-    may have caused, the load stays as it is until the arm accelerates, as one on which
-    they act (`CommandEffect`).  Once the arm has sped up it stays for good.
+    The load that holds the arm besides the model's gravity is observed from its motion,
+    also during the stop (`ObservedLoad`).  So an arm comes to rest with a payload, or with
+    a model, that the law had not learned yet.  Estimated friction is not part of the load,
+    since friction helps to brake.
 
-    A joint that swings under its damping gets as much of it as it bears (`Swing`).
+    Above its first resonance, an elastic joint accelerates other than a rigid one, and shows
+    a wrong load.  An observer with one pole of 30 1/s lets an oscillation go on at up to
+    20 rad/s.  Two poles of 10 1/s do not feed an oscillation, but let a load sink further: an
+    arm that oscillates at the stop has these, and so has each joint that swings during it.
+
+    If commands do not reach the arm, the observed load would grow for ever.  After a stop that
+    may have this cause, the load is kept until the arm accelerates, as it does if commands act
+    on it (`CommandEffect`).  Once the arm has sped up the load is kept for good.
+
+    A joint that swings under its damping gets the share of it that it bears (`Swing`).
 
     Attributes:
         load: torque (n,) [N m] that the model lacks; initially that of the motion before

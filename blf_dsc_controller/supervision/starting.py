@@ -118,8 +118,8 @@ class Starting:
     def take_over_from(self, torque: Vector) -> None:
         """Start from a torque (n,) [N m] by which another node holds the arm.
 
-        The watchdog holds it so after a controller has ended.  The first torque continues
-        this one, and the law carries from the start what it holds besides the model.
+        The watchdog does so after a controller has ended.  The first torque of the law continues
+        this one, and what it contains besides the model is the law's load from the start.
         """
         self._command.note(EventType.TAKEOVER, torque=torque.tolist())
         self._takeover.acting = torque.copy()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cause of a stop, where an arm left its bound or did not follow its commands.
 
-An oscillation, a torque that only repeats the noise of a sensor, a torque at its limit,
-or feedback that has been softened: whichever it is, its remedy is another than that of
-the check which stops the arm.
+It may be an oscillation, a torque that only repeats the noise of a sensor, a torque at its
+limit, or feedback that has been softened.  Each has a remedy of its own, which is not that of
+the check that stops the arm.
 """
 
 from __future__ import annotations

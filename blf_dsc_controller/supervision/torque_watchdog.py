@@ -31,8 +31,8 @@ class TorqueWatchdog:
 
     It then waits for the next torque of the controller before it watches again, as it
     does after a silence of the states of LONG_SILENCE, and after the controller has
-    said that its silence is meant (`stand_down`).  While it commands, it is what holds
-    the arm, and only a torque of the controller ends that.
+    said that its silence is meant (`stand_down`).  While it commands, nothing else may hold
+    the arm, so only a torque of the controller ends that.
 
     The gravity is that of the initial estimate, and what it lacks (a payload, say) is
     observed from the motion and the controller's torques all along, as in a safe stop.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The journal of a watched controller: its parameters, and when its silence is meant.
 
-A controller that has not commanded yet speaks for itself alone.  It may be a restarted
-one, while its predecessor is dead and the watchdog holds the arm, or a second one beside
-one in command: its parameters count from its start on, and its end ends nothing.
+A controller that has not commanded yet may be a restarted one, while the watchdog holds the
+arm, or a second one beside one in command.  Until it starts, its parameters do not count, and
+its end changes nothing.
 """
 
 from __future__ import annotations

@@ -1,0 +1,542 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sub-commands of `blf_dsc`: what each does, an example, and its options."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Option(NamedTuple):
+    """An option or argument of a command."""
+
+    name: str
+    settings: dict[str, Any]  # of `argparse.ArgumentParser.add_argument`
+
+
+class Command(NamedTuple):
+    """A sub-command."""
+
+    name: str
+    module: str  # of `blf_dsc_controller.cli`, with the function of that name
+    about: str  # its first sentence stands in the list of commands
+    example: str  # what to type behind the name
+    options: tuple[Option, ...]
+
+
+def option(name: str, about: str, **settings: Any) -> Option:
+    """Return an option with its help."""
+    return Option(name, {'help': about, **settings})
+
+
+def _positive(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'got {text}: give a whole number above 0')
+    return value
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 1.0:
+        raise argparse.ArgumentTypeError(
+            f'got {text}: give a number above 0 and below 1'
+        )
+    return value
+
+
+def _parameter_file(text: str) -> Path:
+    path = Path(text)
+    if path.suffix not in ('.yaml', '.yml'):
+        raise argparse.ArgumentTypeError(
+            f'got {text}, but it will be a parameter file: give a name in .yaml'
+        )
+    return path
+
+
+_BAG = 'folder of the bag, or its .mcap, .db3 or .bag file'
+_CONFIG = 'parameter file, or a preset (recommended)'
+_OF_URDF = 'parameter file of an arm from a URDF, or a preset, such as ur5e'
+_NAMES = (
+    option(
+        '--map',
+        'what a topic or a joint is called in the bag, such as joint1=shoulder; or which columns '
+        'of a table are the time=, q= and tau=, and theta= of motors; can be repeated',
+        action='append',
+        default=[],
+        metavar='OURS=THEIRS',
+    ),
+    option('--namespace', 'robot to use, if a bag holds several', default=''),
+)
+_FORCE = option('--force', 'overwrite existing files', action='store_true')
+
+_RUN = Command(
+    name='run',
+    module='run',
+    about='Run the controller on the simulated arm and plot the results. Arm, controller and '
+    'recorder run over ROS 2; a bag, pictures and summary.json are written into a new folder. '
+    'Exit code: 0 done, 5 the controller stopped before the end, 130 interrupted, 1 an error.',
+    example='--config noisy --duration 30 --mode realtime --out first',
+    options=(
+        option('--config', _CONFIG, default='recommended'),
+        option(
+            '--duration',
+            'simulated time [s]; 0: until Ctrl-C (as configured, or else 60)',
+            type=float,
+        ),
+        option(
+            '--mode',
+            'steps by the wall clock, or one for each torque (as configured)',
+            choices=('realtime', 'lockstep'),
+        ),
+        option('--seed', 'seed of the sensor noise (as configured)', type=int),
+        option(
+            '--physics',
+            'mechanics of the simulated arm: our own equations, or MuJoCo (as configured)',
+            choices=('own', 'mujoco'),
+        ),
+        option(
+            '--offline',
+            'run without ROS, in this process; nothing is published',
+            action='store_true',
+        ),
+        option(
+            '--out', 'new folder (closed_loop)', type=Path, default=Path('closed_loop')
+        ),
+        option('--view', 'show the run on a page in the browser', action='store_true'),
+    ),
+)
+_PRECOMPILE = Command(
+    name='precompile',
+    module='run',
+    about='Compile the kernels of a configuration before its first start. Controller and '
+    'simulated arm then start within seconds. Use it after an installation, or when you build an '
+    'image. The kernels go into the cache of the user (NUMBA_CACHE_DIR, or '
+    '~/.cache/blf_dsc_controller).',
+    example='--config my.yaml',
+    options=(
+        option('--config', _CONFIG, default='recommended'),
+        option(
+            '--package',
+            'also copy them into the package, for wheels, workspaces and images made from it',
+            action='store_true',
+        ),
+    ),
+)
+_DRIVE = Command(
+    name='drive',
+    module='drive',
+    about='Control an arm over its own interface, without ROS: a Franka Research 3, or motors by '
+    'Damiao on CAN. The law runs in the loop that reads states and writes torques; --ros adds '
+    'the topics. Ctrl-C or SIGTERM brings the arm to rest and ends; a second one ends at once. '
+    'Exit code: 0 the duration is over, 5 the controller or the robot stopped before, 130 '
+    'interrupted, 1 an error.',
+    example='--robot 172.16.0.2 --config fr3_direct.yaml --duration 60 --out first',
+    options=(
+        option(
+            '--robot',
+            'address of the robot; simulated: the simulated arm of the file',
+            required=True,
+        ),
+        option(
+            '--config', 'parameter file, or a preset (fr3_direct)', default='fr3_direct'
+        ),
+        option('--duration', 'time [s]; 0: until Ctrl-C (0)', type=float, default=0.0),
+        option(
+            '--out', 'new folder for a bag (without it nothing is recorded)', type=Path
+        ),
+        option(
+            '--ros',
+            'publish the topics of the controller, and accept motions on its topics',
+            action='store_true',
+        ),
+        option('--namespace', 'namespace of these topics (none)', default=''),
+    ),
+)
+_REPLAY = Command(
+    name='replay',
+    module='bags',
+    about='Run a bag through the controller again and compare every output bit for bit. The '
+    'controller has the recorded configuration and gets the recorded joint states. With --play, '
+    'publish the bag instead. Exit code: 0 all outputs are bit-equal, 3 some differ, 4 some '
+    'could not be compared and the others are bit-equal, 1 an error.',
+    example='run1/bag',
+    options=(
+        *_NAMES,
+        option('bag', _BAG, type=Path),
+        option('--play', 'publish the recorded topics over ROS', action='store_true'),
+        option(
+            '--law',
+            'law to run if the recorded one is a Python file, which no bag can choose: its path, '
+            'and the SHA-256 of its content',
+            default='',
+            metavar='FILE@SHA256',
+        ),
+    ),
+)
+_REPORT = Command(
+    name='report',
+    module='bags',
+    about='Show one or several bags on one HTML page. It has zoomable plots, events and the '
+    'configuration, and needs no network.',
+    example='run1/bag run2/bag --out comparison.html',
+    options=(
+        *_NAMES,
+        _FORCE,
+        option('bags', _BAG, type=Path, nargs='+', metavar='BAG'),
+        option('--out', 'file (report.html)', type=Path, default=Path('report.html')),
+    ),
+)
+_RECOVER = Command(
+    name='recover',
+    module='bags',
+    about='Write a clean bag from one that was cut off or damaged, and list what was lost. The '
+    'damaged bag is not changed. Exit code: 1 if nothing could be recovered.',
+    example='run1/bag --out rescued',
+    options=(
+        option('bag', 'folder of the bag, or its .mcap file', type=Path),
+        option('--out', 'new folder (BAG_recovered)', type=Path),
+    ),
+)
+_EXPORT = Command(
+    name='export',
+    module='bags',
+    about='Write a bag as a table, in CSV or Parquet. It has a row for each joint state.',
+    example='run1/bag --out run1.csv',
+    options=(
+        *_NAMES,
+        _FORCE,
+        option('bag', _BAG, type=Path),
+        option('--out', 'FILE.csv or FILE.parquet', type=Path, required=True),
+    ),
+)
+_PLOT = Command(
+    name='plot',
+    module='bags',
+    about='Draw the pictures of a bag (tracking.png, ...) and write summary.json.',
+    example='run1/bag --out pictures',
+    options=(
+        *_NAMES,
+        _FORCE,
+        option('bag', _BAG, type=Path),
+        option('--out', 'folder to write into (.)', type=Path, default=Path()),
+    ),
+)
+_COMMISSION = Command(
+    name='commission',
+    module='commission',
+    about='Measure an arm from a URDF, and choose its gains by what was measured. A reference '
+    'shakes all joints a little, in a few postures; from torques and positions follow the '
+    'responses of the joints, and the stiffest gains with a modulus margin. With --robot, the '
+    'driver of `blf_dsc drive` moves the robot to each posture and measures it; with --ros, the '
+    "controller's node does. With --write, write the motions for a loop of your own; then give "
+    'their bags. With none of these the arm is simulated. Exit code: 0 done, 3 no gains have the '
+    'margin, 5 the controller or the robot stopped before, 130 interrupted, 1 an error.',
+    example='--config ur5e --out commissioned.yaml\n'
+    '  blf_dsc commission --config my.yaml --robot 172.16.0.2 --out commissioned.yaml\n'
+    '  blf_dsc commission --config my.yaml --ros --commands effort_controller/commands\n'
+    '  blf_dsc commission --config my.yaml --write motion.yaml\n'
+    '  blf_dsc commission run1/bag run2/bag run3/bag --config my.yaml --out commissioned.yaml',
+    options=(
+        _FORCE,
+        option('bags', 'runs of the motions', type=Path, nargs='*', metavar='BAG'),
+        option('--config', _OF_URDF, required=True),
+        option(
+            '--out',
+            'parameter file to write, and a picture beside it (commissioned.yaml)',
+            type=_parameter_file,
+            default=Path('commissioned.yaml'),
+        ),
+        option(
+            '--robot',
+            'measure this robot; with BAGs, these count, too',
+            metavar='ADDRESS',
+        ),
+        option(
+            '--ros',
+            'measure the robot behind topics; with BAGs, these count, too',
+            action='store_true',
+        ),
+        option(
+            '--prove',
+            'measure nothing, but raise the gains of a commissioned file in three steps along '
+            'its reference, on the robot, and compare its errors with those expected',
+            action='store_true',
+        ),
+        option(
+            '--states', 'joint states of its driver (joint_states)', metavar='TOPIC'
+        ),
+        option(
+            '--commands',
+            'torques that its driver takes (blf_dsc_controller/commands)',
+            metavar='TOPIC',
+        ),
+        option('--namespace', 'namespace of these topics (none)', default=''),
+        option('--yes', 'start the robot without a question', action='store_true'),
+        option(
+            '--record',
+            'new folder for the bags of the robot (commissioned_bags)',
+            type=Path,
+            metavar='FOLDER',
+        ),
+        option(
+            '--write',
+            'measure nothing, but write MOTION_1.yaml and so on, one for each posture',
+            type=_parameter_file,
+            metavar='MOTION.yaml',
+        ),
+        option(
+            '--posture',
+            'angles of all joints [rad]; can be repeated (three along the reference)',
+            type=float,
+            nargs='+',
+            action='append',
+            metavar='ANGLE',
+        ),
+        option(
+            '--torque',
+            'rms torque of the motion, as a share of the rated one (0.03)',
+            type=_share,
+            default=0.03,
+        ),
+        option(
+            '--travel',
+            'farthest that the tool travels from its middle [m] (0.01)',
+            type=float,
+            default=0.01,
+        ),
+        option(
+            '--margin', 'modulus margin of the gains (0.5)', type=_share, default=0.5
+        ),
+    ),
+)
+_EXCITE = Command(
+    name='excite',
+    module='identify',
+    about='Find the motion from which most is learned about an arm from a URDF. It is a sum of '
+    'sinusoids with the period of the learning window. It keeps the joint and torque limits, and '
+    'the links clear of each other and of the floor; nothing else around the arm is known. It is '
+    'written as a parameter file.',
+    example='exciting.yaml --config my.yaml',
+    options=(
+        _FORCE,
+        option('out', 'parameter file to write', type=_parameter_file),
+        option('--config', _OF_URDF, required=True),
+        option(
+            '--harmonics',
+            'number of harmonics of the window (3)',
+            type=_positive,
+            default=3,
+        ),
+        option(
+            '--starts',
+            'number of searches; the best result is kept (4)',
+            type=_positive,
+            default=4,
+        ),
+        option(
+            '--radius',
+            'radius of the links, for their clearance [m] (0.07)',
+            type=float,
+            default=0.07,
+        ),
+        option(
+            '--floor',
+            'height of the floor in the base frame [m] (0)',
+            type=float,
+            default=0.0,
+        ),
+    ),
+)
+_IDENTIFY = Command(
+    name='identify',
+    module='identify',
+    about='Correct the inertias and friction of a URDF from recordings with positions and '
+    'efforts. The new URDF has physical inertias that reproduce the torques. The changes are '
+    'printed, with 95 % intervals, and the torque error on the last fifth of the motion, which '
+    'is held back for this test. With --payload, weigh what the arm holds. Exit code: 0 done, 3 '
+    'do not use the result (it is written with --force only), 1 an error.',
+    example='run1/bag --urdf robot.urdf --out corrected.urdf --report page.html\n'
+    '  blf_dsc identify run.csv --urdf robot.urdf --map time=t --map tau=tau_* --out new.xml\n'
+    '  blf_dsc identify empty/bag --urdf robot.urdf --payload loaded/bag',
+    options=(
+        *_NAMES,
+        _FORCE,
+        option(
+            'bags',
+            f'{_BAG}, or a table (.csv, .txt, .npz, .mat)',
+            type=Path,
+            nargs='+',
+            metavar='RECORDING',
+        ),
+        option(
+            '--urdf',
+            'URDF: a file, package://name/path, or a file in config/',
+            required=True,
+        ),
+        option(
+            '--out',
+            'file to write: .urdf, .xml (MJCF), .yaml (our parameters); can be repeated',
+            type=Path,
+            action='append',
+            default=[],
+            metavar='FILE',
+        ),
+        option(
+            '--report',
+            'page with measured and predicted torques and the tables',
+            type=Path,
+        ),
+        option(
+            '--payload',
+            'weigh the load that the arm carries in this bag and not in the first; without BAG, '
+            'the load that it picks up in the first',
+            type=Path,
+            nargs='?',
+            const=True,
+            metavar='BAG',
+        ),
+        option(
+            '--foresee',
+            'fit nothing, but say what can be identified from the recording, or from the table '
+            'of a planned motion without torques',
+            action='store_true',
+        ),
+        option(
+            '--effort',
+            'what the efforts contain: the whole torque, or all but gravity; or use the commands '
+            'instead (torque)',
+            choices=('torque', 'without-gravity', 'command'),
+            default='torque',
+        ),
+        option(
+            '--gains',
+            'if efforts are currents: torque per current, of each joint [N m/A]',
+            type=float,
+            nargs='+',
+            default=(),
+        ),
+        option('--base', 'fixed link (the root)', default=''),
+        option('--tip', 'last link (that of the last joint in the bag)', default=''),
+        option(
+            '--gravity',
+            'gravity in the base frame [m/s^2] (0 0 -9.81)',
+            type=float,
+            nargs=3,
+            default=(0.0, 0.0, -9.81),
+            metavar=tuple('XYZ'),
+        ),
+        option(
+            '--rated-payload',
+            'largest mass on the last link that is not in the URDF [kg] (3)',
+            type=float,
+            default=3.0,
+        ),
+    ),
+)
+_ARMS = Command(
+    name='arms',
+    module='studies',
+    about='Compare laws on arms whose URDF is wrong. Each law is tuned on one simulated arm and '
+    'run on others; the errors are printed as a table. Runs without ROS, on all cores, for some '
+    'minutes.',
+    example='--config panda_rigid --out arms',
+    options=(
+        option(
+            '--config',
+            'presets or files (panda_rigid ur5e_rigid)',
+            nargs='+',
+            default=['panda_rigid', 'ur5e_rigid'],
+        ),
+        option(
+            '--laws',
+            'laws of the study by name, or Python files with more laws (all of the study)',
+            nargs='+',
+            default=[],
+            metavar='LAW',
+        ),
+        option('--out', 'new folder for the figures', type=Path, default=Path('arms')),
+    ),
+)
+_MONTE_CARLO = Command(
+    name='monte-carlo',
+    module='studies',
+    about='Run a study of many random arms. Thousands of closed loops run in parallel, and the '
+    'report says how many kept the bound. To resume an interrupted study, start the same command '
+    'again.',
+    example='--config my_study.yaml --out study\n'
+    '  blf_dsc monte-carlo --reproduce study 365',
+    options=(
+        option(
+            '--config', 'study file, or a preset (monte_carlo)', default='monte_carlo'
+        ),
+        option('--runs', 'number of runs (as configured)', type=_positive),
+        option(
+            '--workers',
+            'number of processes (one per core of this computer)',
+            type=_positive,
+        ),
+        option(
+            '--dask',
+            'compute the runs on the dask cluster of this scheduler instead',
+            metavar='ADDRESS',
+        ),
+        option(
+            '--report',
+            'compare the studies of pairs in these folders, into --out (changes)',
+            type=Path,
+            nargs='+',
+            metavar='DIR',
+        ),
+        option(
+            '--reproduce',
+            'repeat one run of a study, with a bag, into --out',
+            nargs=2,
+            metavar=('DIR', 'RUN'),
+        ),
+        option('--out', 'folder of the study (monte_carlo)', type=Path),
+    ),
+)
+_DOCTOR = Command(
+    name='doctor',
+    module='doctor',
+    about='Say what is installed, what this computer is like for a control loop, and what to '
+    'mend. It takes some seconds and changes nothing. Paste what it prints into a report of a '
+    'bug. Exit code: 0 no problem, 1 a problem.',
+    example='--config my.yaml --robot 172.16.0.2',
+    options=(
+        option(
+            '--config', 'parameter file or preset, to hear what is said at its start'
+        ),
+        option(
+            '--robot',
+            'IP address or name of a robot, to ask how fast it answers (ping)',
+        ),
+    ),
+)
+
+COMMANDS = (
+    _RUN,
+    _PRECOMPILE,
+    _DRIVE,
+    _REPLAY,
+    _REPORT,
+    _RECOVER,
+    _EXPORT,
+    _PLOT,
+    _COMMISSION,
+    _EXCITE,
+    _IDENTIFY,
+    _ARMS,
+    _MONTE_CARLO,
+    _DOCTOR,
+)
+"""All, as `blf_dsc --help` lists them."""
