@@ -317,6 +317,7 @@ def test_the_bound_that_a_warning_asks_for_is_wide_enough():
     ('changes', 'remedy'),
     [
         ({'robot.payload': 3.0}, 'Give less robot.payload'),
+        ({'robot.payload': 1.7}, 'expected to be up to 0.34 rad'),  # and room
         ({'robot.payload': 0.01}, 'is it in degrees? Give 0.0192'),
     ],
 )

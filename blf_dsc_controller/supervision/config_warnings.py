@@ -101,7 +101,7 @@ def _of_width(config: ControllerConfig, errors: ExpectedErrors | None) -> Iterat
         is_widest = np.array(barrier.bound) == widest
         needed = np.where(is_widest, errors.unmodelled + errors.pick_up, 0.0)
         j = int(needed.argmax())
-        if needed[j] > _WIDEST_BOUND:
+        if _ROOM * needed[j] > _WIDEST_BOUND:
             remedy = (
                 f'{config.joints[j]} is expected to be up to {needed[j]:.2g} rad from its '
                 'reference with these gains. Give less robot.payload, if the arm carries less, or '
