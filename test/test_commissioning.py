@@ -43,8 +43,9 @@ from blf_dsc_controller.commissioning.motion import (
     lines_in,
 )
 from blf_dsc_controller.commissioning.own_loop import REPEATS
-from blf_dsc_controller.commissioning.page import sentences
+from blf_dsc_controller.commissioning.page import errors_table, sentences
 from blf_dsc_controller.commissioning.postures import PostureByPosture
+from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.response import (
     Response,
     _noise,
@@ -969,6 +970,11 @@ def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():
     choice = least.choice._replace(factors=np.array([2.0, 4.0]))
     told = sentences(least._replace(choice=choice))
     assert not any('times the gains it was measured' in each for each in told)
+
+
+def test_errors_above_100_mrad_are_told_without_an_exponent():
+    rows = errors_table(('joint1',), Errors(np.array([0.1293]), np.array([0.28])))
+    assert rows.split()[-3:] == ['joint1', '130', '280']
 
 
 def test_frequencies_above_100_hz_are_told_without_an_exponent():

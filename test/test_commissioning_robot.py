@@ -322,12 +322,13 @@ def test_a_posture_that_noise_hides_is_measured_again(whole, capsys):
 
 
 def test_gains_too_soft_for_any_bound_are_refused(whole, capsys):
-    """So coarse are the positions, or so weak is the motion."""
+    """So coarse are the positions, or so weak is the motion: the table shows it."""
     coarsen(whole, '4.0e-4')
     assert commission(whole, 'plant', '--yes', '--torque', '0.01') == 1
-    told = capsys.readouterr().err
-    assert 'too soft for any bound: joint1 would be off by up to 1.7 rad' in told
-    assert '--torque' in told
+    told, why = capsys.readouterr()
+    assert 'too soft for any bound: joint1 would be off by up to 1.7 rad' in why
+    assert '--torque' in why
+    assert 'as assumed' in told
     assert nothing_looks_whole(whole)
 
 

@@ -293,6 +293,42 @@ def test_figures_that_nobody_can_have_measured_are_named(changes, expected):
         assert [text for text in found if re.search(pattern, text)], found
 
 
+def gains(stiffness, damping):
+    """Return the same stiffness and damping for each of seven joints."""
+    return {
+        'feedback.inertia': 'none',
+        'feedback.joint_stiffness': [stiffness] * 7,
+        'feedback.joint_damping': [damping] * 7,
+    }
+
+
+def test_the_bound_that_a_warning_asks_for_is_wide_enough():
+    """Friction that nobody stated moves the arm beyond the bound, before any load does."""
+    light = {'robot.payload': 0.01, **gains(50.0, 5.0), **BARE}
+    given = {**light, 'barrier.bound': [0.01] * 7}
+    (text,) = config_warnings(arm_of('panda_rigid', changes=given))
+    assert 'alone are expected to move' in text
+    wide = float(re.search(r'give (\S+) rad', text)[1])
+    given = {**light, 'barrier.bound': [wide] * 7}
+    assert config_warnings(arm_of('panda_rigid', changes=given)) == []
+
+
+@pytest.mark.parametrize(
+    ('changes', 'remedy'),
+    [
+        ({'robot.payload': 3.0}, 'Give less robot.payload'),
+        ({'robot.payload': 1.7}, 'expected to be up to 0.34 rad'),  # and room
+        ({'robot.payload': 0.01}, 'is it in degrees? Give 0.0192'),
+    ],
+)
+def test_a_wide_bound_of_soft_gains_is_not_taken_for_degrees(changes, remedy):
+    given = {**gains(50.0, 5.0), 'barrier.bound': [1.1] * 7, **changes}
+    found = config_warnings(arm_of('panda_rigid', changes=given))
+    (text,) = [each for each in found if ' rad is ' in each]
+    assert text.startswith('barrier.bound: 1.1 rad is 63 degrees and bounds nothing')
+    assert remedy in text
+
+
 def test_neither_gains_nor_the_residual_floor_rest_on_placeholders():
     config = arm_of('panda_rigid', changes={'robot.urdf': PLACEHOLDERS})
     assert max(config.learning.residual_floor) < 1.0  # N m

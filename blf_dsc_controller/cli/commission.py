@@ -37,6 +37,7 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.supervision.digits import two_digits
 
 _WIDTH = 98
 
@@ -79,8 +80,9 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
     found = commissioning.result(runs)
+    print(page.table(found))  # also if the gains are too soft for any bound: an error
     lines = _told(options, found)
-    print('\n'.join([page.table(found), '', *lines]))
+    print('\n'.join(['', *lines]))
     page.draw(found, names, picture)
     print(f'wrote {picture}')
     if not found.has_margin:
@@ -223,5 +225,5 @@ def _prove(path: Path) -> None:
         return
     print(
         f'with these gains the simulated arm follows its own motion for {proof.duration:g} s, '
-        f'with {1e3 * proof.error:.2g} mrad at most'
+        f'with {two_digits(1e3 * proof.error)} mrad at most'
     )

@@ -266,7 +266,7 @@ def errors_table(joints: Sequence[str], errors: Errors) -> str:
     """Return the largest errors of a proof beside those to expect, for each joint."""
     rows: list[Sequence[str]] = [('', 'error', 'expected'), ('', 'mrad', 'mrad')]
     rows += [
-        (joint, f'{1e3 * measured:.2g}', f'{1e3 * expected:.2g}')
+        (joint, two_digits(1e3 * measured), two_digits(1e3 * expected))
         for joint, measured, expected in zip(joints, *errors, strict=True)
     ]
     return aligned(rows)

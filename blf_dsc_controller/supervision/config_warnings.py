@@ -25,7 +25,10 @@ from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.state import Settings
-from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.supervision.expected_errors import (
+    ExpectedErrors,
+    expected_errors,
+)
 from blf_dsc_controller.supervision.gear_warnings import gear_warnings, softer_by
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.retuning import settings_in_loop
@@ -47,6 +50,7 @@ _TIMES = (
 )
 # exponent of an error in the stiffness it needs: 0.5 without delays
 _STIFFENING = 0.6
+_ROOM = 1.1  # recommended bound over the errors to expect
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
 
 
@@ -66,18 +70,6 @@ def _of_units(config: ControllerConfig) -> Iterator[str]:
             f'robot.lag: {lag:g} s between a state and its torque is too long for any loop: is it '
             f'in ms? Give {1e-3 * lag:g}'
         )
-    barrier = config.barrier
-    widest = max(barrier.widest)
-    if widest > _WIDEST_BOUND:
-        bounds_nothing = (
-            f'{widest:g} rad is {math.degrees(widest):.3g} degrees and bounds nothing'
-        )
-        name = 'barrier.bound' if widest in barrier.bound else 'barrier.initial_bound'
-        remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
-        if barrier.bounds_tool:
-            name = POSITION if barrier.tool_bound > 0.0 else ANGLE
-            remedy = 'the bound of a joint follows from this one: give less'
-        yield f'{name}: {bounds_nothing}: {remedy}'
     limits = config.limits
     widths = np.subtract(limits.position_upper, limits.position_lower)
     crossed = max(_LONG, float(np.max(widths / limits.velocity)))
@@ -88,6 +80,36 @@ def _of_units(config: ControllerConfig) -> Iterator[str]:
                 f'safety.{name}: in {seconds:g} s the arm can cross its range (limits): is it in '
                 f'ms? Give {1e-3 * seconds:g}'
             )
+
+
+def _of_width(config: ControllerConfig, errors: ExpectedErrors | None) -> Iterator[str]:
+    """Check for bounds that bound nothing: of another unit, or because of soft gains.
+
+    `errors` are those to expect, if known.
+    """
+    barrier = config.barrier
+    widest = max(barrier.widest)
+    if widest <= _WIDEST_BOUND:
+        return
+    of_joint = widest in barrier.bound
+    name = 'barrier.bound' if of_joint else 'barrier.initial_bound'
+    remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
+    if barrier.bounds_tool:
+        name = POSITION if barrier.tool_bound > 0.0 else ANGLE
+        remedy = 'the bound of a joint follows from this one: give less'
+    elif of_joint and errors is not None and not errors.is_endless:
+        is_widest = np.array(barrier.bound) == widest
+        needed = np.where(is_widest, errors.unmodelled + errors.pick_up, 0.0)
+        j = int(needed.argmax())
+        if _ROOM * needed[j] > _WIDEST_BOUND:
+            remedy = (
+                f'{config.joints[j]} is expected to be up to {needed[j]:.2g} rad from its '
+                'reference with these gains. Give less robot.payload, if the arm carries less, or '
+                'stiffer gains, if it bears them; then narrow the bound'
+            )
+    yield (
+        f'{name}: {widest:g} rad is {math.degrees(widest):.3g} degrees and bounds nothing: {remedy}'
+    )
 
 
 def _of_stop(config: ControllerConfig) -> Iterator[str]:
@@ -112,13 +134,16 @@ def config_warnings(
     """
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
-    found = [*_of_units(config), *_of_stop(config)]
+    errors = None
+    if config.model == 'urdf' and config.law in OWN:
+        errors = expected_errors(config, settings)
+    found = [*_of_units(config), *_of_width(config, errors), *_of_stop(config)]
     if config.model == 'urdf':
         found += _of_urdf(config, load)
     found += [f'{each.subject} {each.text}' for each in _of_gains(config, load)]
-    if config.model == 'urdf' and config.law in OWN:
+    if errors is not None:
         found += gear_warnings(config, settings)
-        found += _of_errors(config, settings)
+        found += _of_errors(config, settings.barrier.bound, errors)
     if config.model != 'urdf' and config.law in OWN:
         found += _of_first_error(config, settings, load)
     if (
@@ -188,9 +213,10 @@ def _of_placeholders(config: ControllerConfig) -> Iterator[str]:
         )
 
 
-def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
-    """Check that the errors to expect are within the bound."""
-    errors = expected_errors(config, settings)
+def _of_errors(
+    config: ControllerConfig, bound: Floats, errors: ExpectedErrors
+) -> Iterator[str]:
+    """Check that the errors to expect are within the bound (n,) [rad]."""
     if errors.is_endless:
         softer = softer_by(config)
         yield (
@@ -200,8 +226,8 @@ def _of_errors(config: ControllerConfig, settings: Settings) -> Iterator[str]:
             'there: `blf_dsc drive` with drive.feedback: motor'
         )
         return
-    yield from _of_unmodelled(config, settings.barrier.bound, errors.unmodelled)
-    yield from _of_pick_up(config, settings.barrier.bound, errors.pick_up)
+    yield from _of_unmodelled(config, bound, errors.unmodelled)
+    yield from _of_pick_up(config, bound, errors.pick_up)
 
 
 def _tool_parameter(config: ControllerConfig) -> str:
@@ -219,7 +245,8 @@ def _of_unmodelled(
     if not errors[worst] > bound[worst]:
         return
     parameter = 'barrier.bound'
-    remedy = f'give more than {bound[worst]:g} rad'
+    wide_enough = f'{_ROOM * errors[worst]:.2g} rad'
+    remedy = f'give {wide_enough}, or stiffer gains, if the arm bears them'
     if of_tool := _tool_parameter(config):
         parameter = of_tool
         wider = float(errors[worst] / bound[worst])
@@ -254,10 +281,10 @@ def _of_pick_up(
         return
     share = bound[worst] / peak
     parameter = 'barrier.bound'
-    wide_enough = f'{1.1 * peak:.2g} rad'
+    wide_enough = f'{_ROOM * peak:.2g} rad'
     if of_tool := _tool_parameter(config):
         parameter = of_tool
-        wide_enough = f'{1.1 / share:.2g} times this bound at the tool'
+        wide_enough = f'{_ROOM / share:.2g} times this bound at the tool'
     payload = config.robot.payload
     yield (
         f'{parameter}: when {payload:g} kg (robot.payload) are picked '
