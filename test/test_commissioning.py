@@ -28,7 +28,7 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
-from blf_dsc_controller.commissioning.choice import Loops, RigidArm, choose
+from blf_dsc_controller.commissioning.choice import Loops, RigidArm, _one_by_one, choose
 from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
 from blf_dsc_controller.commissioning.commissioning import (
     commissioned,
@@ -562,6 +562,18 @@ def test_gains_are_none_that_the_inertia_alone_would_not_bear():
     more = choice.gains.scaled(np.array([1.0, 1.5]))
     assert loops.margin(more).value >= 0.5  # nothing else would limit them
     assert rigid.margin(more, loops.inertia) < 0.5
+
+
+@pytest.mark.parametrize(
+    ('together', 'alone'), [(0.1, 5.0), (0.9, 5.0), (2.0, 10.0), (60.0, 100.0)]
+)
+def test_joint_is_raised_to_five_times_what_all_bear_or_what_it_was_measured_with(
+    together, alone
+):
+    """One whose motor is guessed far too heavy does not keep the others soft."""
+    factors = _one_by_one(np.full(2, together), lambda tried: tried[1] <= together)
+    assert alone / 1.1 < factors[0] <= alone
+    assert factors[1] == together
 
 
 def test_inertias_of_the_arm_are_those_that_were_measured():

@@ -43,7 +43,8 @@ BARELY = 0.1
 
 _STEP = 1.1
 _LEAST, _MOST = 0.05, 100.0  # times the damping of the measurement
-_OF_ONE = 5.0  # times that of all joints, of one joint by itself
+# Of one joint by itself, times that of all joints, or that of the measurement, if this is more.
+_OF_ONE = 5.0
 
 
 class Margin(NamedTuple):
@@ -165,7 +166,7 @@ def choose(
 
 def _one_by_one(factors: Floats, has_margin: Callable[[Floats], bool]) -> Floats:
     """Raise the factor (n,) of each joint in turns."""
-    most = np.minimum(_OF_ONE * factors, _MOST)
+    most = np.minimum(_OF_ONE * np.maximum(factors, 1.0), _MOST)
     grows = np.ones(len(factors), bool)
     while grows.any():
         for j in np.flatnonzero(grows):
