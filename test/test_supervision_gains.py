@@ -19,13 +19,14 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
+from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import (
     expectation,
     expected_errors,
     linear_feedback,
     linear_loop,
 )
+from blf_dsc_controller.supervision.gain_limits import worsened
 from blf_dsc_controller.supervision.reference_load import reference_load
 
 BOUND = 0.002  # rad

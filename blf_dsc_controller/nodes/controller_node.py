@@ -32,7 +32,8 @@ from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.reference.approach import end_of_waypoints
-from blf_dsc_controller.supervision.config_warnings import config_warnings, worsened
+from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.gain_limits import worsened
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load

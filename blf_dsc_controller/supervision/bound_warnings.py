@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warnings about the bound: one that bounds nothing, or that the errors to expect leave."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.tuning import SAMPLES, loop_delay
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION
+from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.supervision.expected_errors import ExpectedErrors
+from blf_dsc_controller.supervision.gear_warnings import softer_by
+
+Floats = NDArray[np.float64]
+
+# exponent of an error in the stiffness it needs: 0.5 without delays
+_STIFFENING = 0.6
+_ROOM = 1.1  # recommended bound over the errors to expect
+_WIDEST_BOUND = 0.35  # rad, 20 degrees
+
+
+def width_warnings(
+    config: ControllerConfig, errors: ExpectedErrors | None
+) -> Iterator[str]:
+    """Check for bounds that bound nothing: of another unit, or because of soft gains.
+
+    `errors` are those to expect, if known.
+    """
+    barrier = config.barrier
+    widest = max(barrier.widest)
+    if widest <= _WIDEST_BOUND:
+        return
+    of_joint = widest in barrier.bound
+    name = 'barrier.bound' if of_joint else 'barrier.initial_bound'
+    remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
+    if barrier.bounds_tool:
+        name = POSITION if barrier.tool_bound > 0.0 else ANGLE
+        remedy = 'the bound of a joint follows from this one: give less'
+    elif of_joint and errors is not None and not errors.is_endless:
+        is_widest = np.array(barrier.bound) == widest
+        needed = np.where(is_widest, errors.unmodelled + errors.pick_up, 0.0)
+        j = int(needed.argmax())
+        if _ROOM * needed[j] > _WIDEST_BOUND:
+            remedy = (
+                f'{config.joints[j]} is expected to be up to {needed[j]:.2g} rad from its '
+                'reference with these gains. Give less robot.payload, if the arm carries less, or '
+                'stiffer gains, if it bears them; then narrow the bound'
+            )
+    yield (
+        f'{name}: {widest:g} rad is {math.degrees(widest):.3g} degrees and bounds nothing: {remedy}'
+    )
+
+
+def error_warnings(
+    config: ControllerConfig, bound: Floats, errors: ExpectedErrors
+) -> Iterator[str]:
+    """Check that the errors to expect are within the bound (n,) [rad]."""
+    if errors.is_endless:
+        softer = softer_by(config)
+        yield (
+            f'{softer}: with a sample time of {config.sample_time:g} s and a robot.lag of '
+            f'{config.robot.lag:g} s these gains make errors grow from sample to sample, on rigid '
+            f'gears too: lower {softer}. Gains that the motors of an arm close themselves belong '
+            'there: `blf_dsc drive` with drive.feedback: motor'
+        )
+        return
+    yield from _of_unmodelled(config, bound, errors.unmodelled)
+    yield from _of_pick_up(config, bound, errors.pick_up)
+
+
+def _tool_parameter(config: ControllerConfig) -> str:
+    """Return the parameter by which the error at the tool is bounded; empty if it is not."""
+    if not config.barrier.bounds_tool:
+        return ''
+    return POSITION if config.barrier.tool_bound > 0.0 else ANGLE
+
+
+def _of_unmodelled(
+    config: ControllerConfig, bound: Floats, errors: Floats
+) -> Iterator[str]:
+    """Check the errors (n,) [rad] by friction and unmodelled torque."""
+    worst = int(np.argmax(errors / bound))
+    if not errors[worst] > bound[worst]:
+        return
+    parameter = 'barrier.bound'
+    wide_enough = f'{_ROOM * errors[worst]:.2g} rad'
+    remedy = f'give {wide_enough}, or stiffer gains, if the arm bears them'
+    if of_tool := _tool_parameter(config):
+        parameter = of_tool
+        wider = float(errors[worst] / bound[worst])
+        remedy = (
+            f'past its joint bound of {bound[worst]:g} rad; give more than {wider:.2g} times '
+            'this bound at the tool'
+        )
+    yield (
+        f'{parameter}: friction{_assumed_friction(config)} and unmodelled torque '
+        f'(learning.residual_floor) alone are expected to move {config.joints[worst]} '
+        f'{errors[worst]:.2g} rad from its reference: {remedy}'
+    )
+
+
+def _assumed_friction(config: ControllerConfig) -> str:
+    """Return how much friction is assumed, in brackets; empty if that of each joint is known."""
+    robot = config.robot
+    is_unknown = robot.unknown_friction(robot.chain(config.joints)).any()
+    if config.commissioning.friction or not is_unknown:
+        return ''
+    share = f'{100.0 * UNKNOWN_FRICTION:g} %'
+    return f' ({share} of the rated torque without robot.coulomb)'
+
+
+def _of_pick_up(
+    config: ControllerConfig, bound: Floats, errors: Floats
+) -> Iterator[str]:
+    """Check the errors (n,) [rad] when a load is picked up in motion."""
+    worst = int(np.argmax(errors / bound))
+    peak = errors[worst]
+    if not peak > bound[worst]:
+        return
+    share = bound[worst] / peak
+    parameter = 'barrier.bound'
+    wide_enough = f'{_ROOM * peak:.2g} rad'
+    if of_tool := _tool_parameter(config):
+        parameter = of_tool
+        wide_enough = f'{_ROOM / share:.2g} times this bound at the tool'
+    payload = config.robot.payload
+    yield (
+        f'{parameter}: when {payload:g} kg (robot.payload) are picked '
+        f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} rad from its '
+        f'reference, past its bound of {bound[worst]:g} rad: give {wide_enough}, or '
+        f'{_remedy_of_pick_up(config, share)}, or pick up at most {share * payload:.2g} kg'
+    )
+
+
+def _remedy_of_pick_up(config: ControllerConfig, share: float) -> str:
+    """Return the change that reduces the error of a pick-up to this share of it."""
+    lag = config.robot.lag
+    if config.feedback.inertia == 'none':
+        return 'a larger feedback.stiffness, if the arm bears it'
+    stiffer = config.feedback.stiffness / share**_STIFFENING
+    if stiffer <= 1.0:
+        return f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'
+    faster = loop_delay(config.sample_time, lag) * math.sqrt(share) - lag
+    if faster > 0.0:
+        return f'a sample time of {faster / SAMPLES:.2g} s'
+    return f'a robot.lag below {lag:g} s'

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of gains and torques in a sampled loop: what is used of each, and what to change.
+
+They rest on the initial parameter estimate, which is a guess. doc/tuning.md derives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.supervision.reference_load import ReferenceLoad
+from blf_dsc_controller.supervision.retuning import settings_in_loop
+
+Floats = NDArray[np.float64]
+
+_MARGIN = 1.25  # recommended torque limit over what the reference needs
+
+
+class Finding(NamedTuple):
+    """A limit of the gains: what it is on, how much is used, what follows above 1."""
+
+    subject: str
+    use: float
+    text: str  # goes on after the subject
+
+
+def exceeded_limits(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
+    """Return the limits that gains and torque limits exceed with this load of the reference."""
+    # a limit of next to nothing is exceeded infinitely
+    with np.errstate(over='ignore'):
+        return [each for each in _limits_of_gains(config, load) if each.use > 1.0]
+
+
+def worsened(
+    before: ControllerConfig, after: ControllerConfig, load: ReferenceLoad
+) -> list[str]:
+    """Return the warnings on gains that are new or worse after a change."""
+    known = {each.subject: each.use for each in exceeded_limits(before, load)}
+    return [
+        f'{each.subject} {each.text}'
+        for each in exceeded_limits(after, load)
+        if each.use > known.get(each.subject, 1.0)
+    ]
+
+
+def _limits_of_gains(
+    config: ControllerConfig, load: ReferenceLoad
+) -> Iterator[Finding]:
+    """Yield what the gains and torque limits use of their limits; above 1 is too much."""
+    settings = settings_in_loop(config)
+    yield from _limits_of_torque(config, load)
+    yield from _limits_of_feedback(config, settings, load)
+    if settings.has_barrier == 1:
+        yield from _limits_of_surface(config, settings)
+        yield from _limits_of_slope(config, settings, load)
+
+
+def _limits_of_torque(
+    config: ControllerConfig, load: ReferenceLoad
+) -> Iterator[Finding]:
+    for joint, need, limit in zip(
+        config.joints, load.torque, config.torque.limit, strict=True
+    ):
+        yield Finding(
+            f'torque.limit: {joint}',
+            _MARGIN * need / limit,
+            f'has {limit:g} N m, but with learning.initial_estimate the reference alone needs '
+            f'{need:.3g} N m: let the reference be slower, or give at least '
+            f'{_MARGIN * need:.3g} N m if the drive has that much',
+        )
+
+
+def _limits_of_feedback(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
+) -> Iterator[Finding]:
+    T = config.sample_time
+    rate = load.rate(settings)
+    yield Finding(
+        'feedback.gain: K_p over the inertia',
+        rate * T,
+        f'is {rate:.3g} 1/s with learning.initial_estimate, {rate * T:.2g} times the inverse of '
+        'sample_time. Above 1 the loop has little margin for delays, above 2 it chatters between '
+        'the limits: lower feedback.gain or sample_time',
+    )
+    absorbed = float(np.max(settings.disturbance.gain * T / _damping(settings, load)))
+    yield Finding(
+        'disturbance.gain: in each sample the disturbance estimate absorbs',
+        2.0 * absorbed,
+        f'{absorbed:.2g} of the velocity feedback. Above a half it oscillates against '
+        'feedback.gain: lower disturbance.gain',
+    )
+
+
+def _damping(settings: Settings, load: ReferenceLoad) -> Floats:
+    """Return the damping (n,) [N m s/rad] of the feedback, above zero."""
+    return np.asarray(np.maximum(load.damping(settings), 1e-12))
+
+
+def _limits_of_surface(
+    config: ControllerConfig, settings: Settings
+) -> Iterator[Finding]:
+    T, filtering = config.sample_time, config.surface.time_constant
+    yield Finding(
+        'surface.time_constant:',
+        T / filtering,
+        f'{filtering:g} s is less than the sample time, {T:g} s: alpha2 follows the measurement '
+        'noise, and its derivative enters the torque: give more',
+    )
+    if settings.surface.known_rate == 0:
+        rate = float(np.max(settings.surface.gain / 2.0 + settings.surface.mu))
+        yield Finding(
+            'surface.gain, surface.mu: K/2 + mu',
+            filtering * rate,
+            f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
+            f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
+        )
+
+
+def _limits_of_slope(
+    config: ControllerConfig, settings: Settings, load: ReferenceLoad
+) -> Iterator[Finding]:
+    T, damping = config.sample_time, _damping(settings, load)
+    ratios = settings.barrier.slope_limit * T / damping
+    for joint, ratio in zip(config.joints, ratios, strict=True):
+        yield Finding(
+            f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
+            ratio / 2.0,
+            f'{ratio:.2g} times its error in a sample. Above 2 the error grows: give less than '
+            '2 feedback.gain / sample_time',
+        )
