@@ -44,7 +44,7 @@ from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.supervision import config_warnings, retuning
+from blf_dsc_controller.supervision import gain_limits, retuning
 from sim_plant.plant import plant_of
 from sim_plant.settings import parameter_names_of, urdf_of
 from sim_plant.torque_input import Latency
@@ -443,7 +443,7 @@ def test_change_of_a_gain_builds_each_configuration_once(ros, monkeypatch):
     monkeypatch.setattr(parameters, 'build', counted_build)
     cached = lru_cache(maxsize=2)(counted_settings)
     cached(node.config)
-    for module in (retuning, config_warnings):
+    for module in (retuning, gain_limits):
         monkeypatch.setattr(module, 'settings_in_loop', cached)
     change = Parameter('feedback.gain', value=[30.0, 10.0])
     assert node.set_parameters([change])[0].successful
