@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import pickle
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -254,6 +255,63 @@ def test_law_is_called_with_its_gains_as_they_are_declared(tmp_path):
     assert state.values.tolist() == [3e-3, 0.0, 0.0]
     again = called(law(1.0, 3, inverted=False), *views)
     assert again.computes.address == given.computes.address
+
+
+ADDING = """\
+class LAW(NamedTuple):
+    gain: Annotated[float, parameter(0.5, 'gain')]
+
+    def compute_demand(self, settings, state, signals, t, dt):
+        signals.values[0] = {} * self.gain
+
+    def finish(self, settings, state, signals, dt, saturated):
+        pass
+
+"""
+
+RUN_LAWS = """\
+import sys
+
+import numpy as np
+from test_law_of_file import few_of, run_law
+
+from blf_dsc_controller.configuration.law_file import load_law
+from blf_dsc_controller.law.called_law import called
+
+vectors = np.zeros((3, 4))
+vectors[:, 0] = 3
+views = [few_of(each) for each in vectors]
+for given in [called(load_law(path)(0.5), *views) for path in sys.argv[1:]]:
+    run_law(given, vectors, False)
+    print(views[2].values[0])
+"""
+
+
+@compiling
+def test_laws_that_other_processes_compiled_are_not_taken_for_one_another(tmp_path):
+    """Numba's symbols of their methods were the same: the first became the second."""
+    paths = [tmp_path / 'one.py', tmp_path / 'two.py']
+    for path, factor in zip(paths, (1.0, 2.0), strict=True):
+        law_of_text(path, ADDING.format(factor))
+    folder = Path(__file__).parent
+    environment = {
+        **os.environ,
+        'NUMBA_CACHE_DIR': str(tmp_path / 'cache'),
+        'PYTHONPATH': os.pathsep.join(map(str, (folder, folder.parent))),
+    }
+
+    def run(*laws):
+        done = subprocess.run(
+            [sys.executable, '-c', RUN_LAWS, *map(str, laws)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout.split()
+
+    assert [*run(paths[0]), *run(paths[1])] == ['0.5', '1.0']
+    assert run(*paths, paths[0]) == ['0.5', '1.0', '0.5']
 
 
 @compiling

@@ -13,18 +13,26 @@ as a whole, in 0.6 of the time.
 Numba also counts the references to every array in every tuple argument, which makes up
 more than half of the code, for LLVM to remove again. Here nothing is counted, which
 halves the time.
+
+Numba numbers the functions that a process compiles, from 1 on, and their symbols contain
+the number.  Of two kernels with the same name and names of types, each compiled by
+another process, one would be called for the other where both are loaded from the cache:
+the methods of two laws are such kernels.  Here each process begins at a random number.
 """
 
 from __future__ import annotations
 
 import gc
+import secrets
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numba
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
@@ -45,6 +53,8 @@ if not FIRST <= numba.version_info.short < AFTER:
     raise ImportError(
         f'numba {numba.__version__}: its private parts are not known here'
     )
+
+FunctionIdentity._unique_ids = count(secrets.randbits(48))  # noqa: SLF001
 
 _ENVIRONMENT = '_ZN08NumbaEnv'
 _ALLOCATORS = ('NRT_Allocate', 'NRT_MemInfo_alloc')
