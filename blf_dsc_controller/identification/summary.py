@@ -31,12 +31,17 @@ _LATE = 0.01  # s, longest plausible delay
 _LARGE_OFFSET = 0.1  # of the torque
 _HARDLY = 0.01  # of the largest torque: a joint whose torque is mostly noise
 _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not explain
+_POOR = 0.2  # of a joint's torque, error with which its values are not to be trusted
 
 _NOTHING = 1e-3  # of half of its interval, value that is printed as 0 ...
 _ROUNDING = 1e-9  # ... and value of a URDF
 _OF_OFFSETS = (
     ', for which a URDF has no place: calibrate the torque sensors, or let the controller learn '
     'them (learning.bias)'
+)
+_OF_POOR = (
+    ' are not explained: do not trust the values there before sign, unit and zero are those of '
+    'the URDF'
 )
 _OF_RESIDUALS = (
     ': these are torques, not noise, and may have shifted values beyond their intervals'
@@ -250,6 +255,7 @@ def _joint_notes(found: Identified) -> Iterator[str]:
     lasting: list[str] = []
     still: list[str] = []
     idle: list[str] = []
+    poor: list[str] = []
     for i, joint in enumerate(found.chain.joints):
         name = joint.name
         unit = units_of(joint.kind)[OFFSET]
@@ -268,11 +274,14 @@ def _joint_notes(found: Identified) -> Iterator[str]:
             still.append(name)
         elif share[i] > _ALL_WRONG and score.torque[i] < _HARDLY * score.torque.max():
             idle.append(f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit})')
+        elif share[i] > _POOR:
+            poor.append(f'{100.0 * share[i]:.0f} % of the torque of {name}')
     for joints, ending in (
         (offsets, _OF_OFFSETS),
         (lasting, _OF_RESIDUALS),
         (still, ' did not move: rotors and friction of these are guesses'),
         (idle, ', so the error in % means little there'),
+        (poor, _OF_POOR),
     ):
         if joints:
             yield ', '.join(joints) + ending
