@@ -58,6 +58,7 @@ from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted, regression
 from blf_dsc_controller.identification.scoring import scored
 from blf_dsc_controller.identification.selection import select
+from blf_dsc_controller.identification.summary import interval
 from blf_dsc_controller.identification.values import (
     LOAD_FRICTION,
     QUADRATIC,
@@ -357,11 +358,6 @@ def _terms(found: Identified) -> str:
     return '; '.join(texts) or '-'
 
 
-def _mass_text(found: Identified) -> str:
-    values, deviations = found.load
-    return f'{values[0]:.3f} +- {1.96 * deviations[0]:.2g} kg'
-
-
 def _weigh_loaded(entry: Entry, bag: Path, mass: float) -> str:
     taken = entry.taken
     loaded = read_recording(bag, taken.robot.text, taken.joints)
@@ -370,5 +366,7 @@ def _weigh_loaded(entry: Entry, bag: Path, mass: float) -> str:
     for given in (boundary, float('nan')):
         found = identify_arm(together, taken.robot, picked_up=given)
         if found.carried is not None:
-            texts.append(f'{_mass_text(found)} {found.carried.when}')
+            value, deviation = (float(each[0]) for each in found.load)
+            found_mass = interval(value, deviation, '.3f')
+            texts.append(f'{found_mass} kg {found.carried.when}')
     return f'{taken.name} with {mass:.3f} kg: {texts[0]}; as one bag: {texts[1]}'

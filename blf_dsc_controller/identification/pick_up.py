@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a load is picked up within a recording, and put down again."""
+"""When a load is picked up within a recording, and put down again.
+
+All of the motion is looked at, also the part that is held back for the score of the model.
+"""
 
 from __future__ import annotations
 
@@ -67,14 +70,15 @@ def _per_step(moving: Indices) -> int:
 
 
 def _best_interval(cost: Callable[[int, int], float], steps: int) -> tuple[int, int]:
-    """Return begin and end of the interval of least cost, within so many steps."""
+    """Return begin and end of the interval of least cost, which is a part of so many steps."""
 
     def best(intervals: Iterable[tuple[int, int]]) -> tuple[int, int]:
-        return min(intervals, key=lambda each: cost(*each))
+        parts = (each for each in intervals if each != (0, steps))
+        return min(parts, key=lambda each: cost(*each))
 
     part = -(-steps // _COARSE)
     edges = [*range(0, steps, part), steps]
-    begin, end = best(each for each in combinations(edges, 2) if each != (0, steps))
+    begin, end = best(combinations(edges, 2))
 
     def around(k: int) -> range:
         return range(max(k - part, 0), min(k + part, steps) + 1)
