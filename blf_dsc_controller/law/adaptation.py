@@ -140,6 +140,7 @@ def adapt(
     H is (n, m); the tracking error acts on the p parameters, where it `tracks`.
     """
     gain = settings.adaptation_gain
+    # all rates before any estimate: the projection takes them together
     for j in range(estimate.size):
         tracking = 0.0
         if j < p and tracks:

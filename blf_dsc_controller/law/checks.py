@@ -73,10 +73,10 @@ def check_error(
 @inner
 def may_oscillate(checks: Checks) -> bool:
     """Whether what a joint shows may be an oscillation."""
-    is_one = False
+    is_any = False
     for i in range(checks.oscillation.waves.size):
-        is_one = is_one or checks.oscillation.waves[i] >= oscillation.SOME
-    return is_one
+        is_any = is_any or checks.oscillation.waves[i] >= oscillation.SOME
+    return is_any
 
 
 @inner

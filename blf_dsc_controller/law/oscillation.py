@@ -35,6 +35,9 @@ from blf_dsc_controller.compiled.layout import Array, Cell
 WAVES = 6
 """Half waves in a row that are an oscillation."""
 
+SOME = 2
+"""Half waves in a row from which on what a joint shows may be an oscillation."""
+
 FEW = 3
 """Half waves in a row that tell why an arm stops: an oscillation may grow fast."""
 
@@ -47,9 +50,6 @@ PATIENCE = 0.25
 _LOWEST = 8.0  # Hz
 _LONGEST = 0.5 / _LOWEST  # s, half period
 _FAST = 20.0  # Hz, from which a velocity may lag far behind its positions
-SOME = 2.0
-"""Half waves in a row from which on what a joint shows may be an oscillation."""
-
 _STRONG = 0.05  # of the torque limit, amplitude of its torque
 _TURNED = 0.25  # of a half wave, by which p turns back at its end
 # a half wave that is longer is one of the arm: standard deviations of the sensor's
@@ -159,12 +159,12 @@ def count_down(now: Oscillation, limit: Array, dt: float) -> bool:
     torques.
     """
     now.wait[0] = max(0.0, now.wait[0] - dt)
-    is_one = is_violent = False
+    is_any = is_violent = False
     for i in range(limit.size):
         if oscillates(now, i):
-            is_one = True
+            is_any = True
             is_violent = is_violent or now.amplitude[i] > VIOLENT * limit[i]
-    if not is_one or (now.wait[0] > 0.0 and not is_violent):
+    if not is_any or (now.wait[0] > 0.0 and not is_violent):
         return False
     now.wait[0] = PATIENCE
     return True
