@@ -21,9 +21,7 @@ from sim_plant.arm import (
     rigid_arm,
     rigid_bodies,
 )
-from sim_plant.kernels import (
-    lag,
-)
+from sim_plant.kernels import lag
 from sim_plant.layout import (
     SIDES,
     VELOCITY_SOURCES,
@@ -67,63 +65,84 @@ def plant_settings(config: PlantConfig) -> PlantSettings:
         BlfDscError: a joint has a spring, but no motor.
     """
     arm = arm_of(config)
-    n = len(config.joints)
-    T = config.sample_time
-    sensor = config.sensor
-    actuator = config.actuator
-    events = config.events
-    robot = config.robot
-    friction = config.disturbance
-    decay, mean_decay = lag(actuator.time_constant, T)
-    overcomes_friction = robot.drive_compensates == 'gravity_and_friction'
-    bodies = drive_bodies(config)
-    omega = events.sloshing_frequency
+    drives = _drives_of(config)
     return PlantSettings(
         arm=arm,
-        n=n,
+        n=len(config.joints),
         p=arm.p,
         period_ns=config.sample_time_ns,
-        events=len(events.begin),
-        bodies_size=bodies.size,
-        memory_size=motion_size(arm) if bodies.size else 0,
-        encoders=filled(
-            Encoders,
-            sensor,
-            velocity_source=VELOCITY_SOURCES[sensor.velocity],
-            side=SIDES[sensor.side],
-            eccentricity=np.array(sensor.eccentricity or np.zeros(n)),
-        ),
-        disturbance=filled(
-            Disturbance,
-            friction,
-            ripple=actuator.ripple * np.array(actuator.torque_limit),
-            ripple_frequency=actuator.ripple_cycles,
-            warm_samples=friction.warm_time / T,
-        ),
-        drives=filled(
-            Drives,
-            actuator,
-            decay=decay,
-            mean_decay=mean_decay,
-            friction=config.drive.friction if overcomes_friction else 0.0,
-            effort_is_whole=int(robot.effort != 'commanded'),
-            effort_scale=_CURRENT if robot.effort == 'current' else 1.0,
-            step=actuator.rate_limit * T,
-            jump=actuator.reflex_rate * T,
-            bodies=bodies,
-        ),
-        load=filled(
-            Load,
-            config.load,
-            sensor,
-            stiffness=omega**2,
-            damping=2.0 * events.sloshing_damping * omega,
-            gravity=np.array(
-                robot.gravity if robot.urdf else (0.0, 0.0, -config.arm.gravity)
-            ),
-        ),
+        events=len(config.events.begin),
+        bodies_size=drives.bodies.size,
+        memory_size=motion_size(arm) if drives.bodies.size else 0,
+        encoders=_encoders_of(config),
+        disturbance=_disturbance_of(config),
+        drives=drives,
+        load=_load_of(config),
         schedule=_schedule_of(config),
         **_elasticity_of(config, arm)._asdict(),
+    )
+
+
+def _encoders_of(config: PlantConfig) -> Encoders:
+    """Return what the encoders measure, and how well."""
+    sensor = config.sensor
+    n = len(config.joints)
+    return filled(
+        Encoders,
+        sensor,
+        velocity_source=VELOCITY_SOURCES[sensor.velocity],
+        side=SIDES[sensor.side],
+        eccentricity=np.array(sensor.eccentricity or np.zeros(n)),
+    )
+
+
+def _disturbance_of(config: PlantConfig) -> Disturbance:
+    """Return friction and torque ripple."""
+    given = config.disturbance
+    actuator = config.actuator
+    return filled(
+        Disturbance,
+        given,
+        ripple=actuator.ripple * np.array(actuator.torque_limit),
+        ripple_frequency=actuator.ripple_cycles,
+        warm_samples=given.warm_time / config.sample_time,
+    )
+
+
+def _drives_of(config: PlantConfig) -> Drives:
+    """Return how the drives apply torques, what they compensate, and report as effort."""
+    actuator = config.actuator
+    robot = config.robot
+    T = config.sample_time
+    decay, mean_decay = lag(actuator.time_constant, T)
+    overcomes_friction = robot.drive_compensates == 'gravity_and_friction'
+    return filled(
+        Drives,
+        actuator,
+        decay=decay,
+        mean_decay=mean_decay,
+        friction=config.drive.friction if overcomes_friction else 0.0,
+        effort_is_whole=int(robot.effort != 'commanded'),
+        effort_scale=_CURRENT if robot.effort == 'current' else 1.0,
+        step=actuator.rate_limit * T,
+        jump=actuator.reflex_rate * T,
+        bodies=drive_bodies(config),
+    )
+
+
+def _load_of(config: PlantConfig) -> Load:
+    """Return how a load sloshes, and the gravity on it."""
+    robot = config.robot
+    events = config.events
+    omega = events.sloshing_frequency
+    gravity = robot.gravity if robot.urdf else (0.0, 0.0, -config.arm.gravity)
+    return filled(
+        Load,
+        config.load,
+        config.sensor,
+        stiffness=omega**2,
+        damping=2.0 * events.sloshing_damping * omega,
+        gravity=np.array(gravity),
     )
 
 

@@ -202,21 +202,31 @@ def adaptation_gain(integral: np.ndarray, deviation: np.ndarray) -> float:
 
 
 def _of_arm(arm: Design) -> dict[str, Value]:
-    """Return limits, and what learning needs, whatever the feedback."""
-    chain = arm.chain
-    n = len(chain.joints)
-    effort = _finite([joint.effort for joint in chain.joints], UNKNOWN_EFFORT)
-    velocity = _finite([joint.velocity for joint in chain.joints], 2.0)
-    acceleration = np.array([joint.acceleration for joint in chain.joints])
-    lower, upper = arm.limits
-    P = arm.parameters.of(chain.inertias, arm.rotors)
-    fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
-    floor = _UNMODELLED * arm.efforts
-    zeros = (0.0,) * n
+    """Return what does not depend on the feedback: limits, learning, safety."""
+    zeros = (0.0,) * len(arm.chain.joints)
     return {
-        'joints': tuple(joint.name for joint in chain.joints),
         'surface.time_constant': max(arm.sample_time, SURFACE),
         'feedback.robust_gain': zeros,
+        'truth.constant': zeros,
+        'truth.amplitude': zeros,
+        'truth.frequency': (1.0,) * len(zeros),
+        'truth.phase': zeros,
+        **_limits_of(arm),
+        **_learning_of(arm),
+    }
+
+
+def _limits_of(arm: Design) -> dict[str, Value]:
+    """Return the joints, their limits, a reference that holds within them, and safety."""
+    joints = arm.chain.joints
+    effort = _finite([joint.effort for joint in joints], UNKNOWN_EFFORT)
+    velocity = _finite([joint.velocity for joint in joints], 2.0)
+    acceleration = np.array([joint.acceleration for joint in joints])
+    lower, upper = arm.limits
+    fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
+    zeros = (0.0,) * len(joints)
+    return {
+        'joints': tuple(joint.name for joint in joints),
         'torque.limit': _listed(effort),
         'torque.rate_limit': zeros,
         'torque.first_step': zeros,
@@ -229,6 +239,20 @@ def _of_arm(arm: Design) -> dict[str, Value]:
         'limits.acceleration': _listed(
             np.minimum(4.0 * _SLOW * velocity, acceleration)
         ),
+        'safety.oscillation': 'soften',
+        'safety.torque': 'hold_gravity',
+        'safety.damping': _listed(
+            _BRAKING * arm.over_postures().free_inertia * fastest
+        ),
+        'safety.velocity_limit': 3.0 * float(velocity.max()),
+    }
+
+
+def _learning_of(arm: Design) -> dict[str, Value]:
+    """Return what learning needs: where it begins, how far it goes, and its filters."""
+    P = arm.parameters.of(arm.chain.inertias, arm.rotors)
+    floor = _UNMODELLED * arm.efforts
+    return {
         'learning.initial_estimate': _listed(P),
         'learning.radius': 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload),
         'learning.window': _WINDOW,
@@ -242,16 +266,6 @@ def _of_arm(arm: Design) -> dict[str, Value]:
         'learning.viscous': True,
         'learning.coulomb': True,
         'learning.coulomb_velocity': 0.02,
-        'truth.constant': zeros,
-        'truth.amplitude': zeros,
-        'truth.frequency': (1.0,) * n,
-        'truth.phase': zeros,
-        'safety.oscillation': 'soften',
-        'safety.torque': 'hold_gravity',
-        'safety.damping': _listed(
-            _BRAKING * arm.over_postures().free_inertia * fastest
-        ),
-        'safety.velocity_limit': 3.0 * float(velocity.max()),
     }
 
 

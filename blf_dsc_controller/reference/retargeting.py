@@ -178,6 +178,21 @@ def profile(
     """
     if ruckig is None:
         raise MotionError(WITHOUT)
+    given = _limited(state, config, drift)
+    if target is None:
+        given.control_interface = ruckig.ControlInterface.Velocity
+        given.target_velocity = [0.0] * len(config.joints)
+    else:
+        given.target_position, given.target_velocity = target.tolist()
+    if duration > 0.0:
+        given.minimum_duration = duration
+    return _pieces_of(_solved(given, state), state)
+
+
+def _limited(
+    state: np.ndarray, config: ControllerConfig, drift: np.ndarray | float
+) -> Any:
+    """Return ruckig's problem of a motion from a state within the limits, yet without a target."""
     n = len(config.joints)
     given = ruckig.InputParameter(n)
     given.current_position, given.current_velocity, given.current_acceleration = (
@@ -188,30 +203,26 @@ def profile(
     given.min_velocity = (-fastest - drift).tolist()
     given.max_acceleration = config.limits.acceleration
     given.max_jerk = config.limits.largest_jerk
-    if target is None:
-        given.control_interface = ruckig.ControlInterface.Velocity
-        given.target_velocity = [0.0] * n
-    else:
-        given.target_position, given.target_velocity = target.tolist()
     given.target_acceleration = [0.0] * n
-    if duration > 0.0:
-        given.minimum_duration = duration
+    return given
+
+
+def _solved(given: Any, state: np.ndarray) -> Any:
+    """Return ruckig's trajectory; raise MotionError, which names the state, if there is none."""
+    n = state.shape[1]
     found = ruckig.Trajectory(n)
+    none = (
+        'ruckig found no motion from position, velocity and acceleration '
+        f'{state.tolist()}: '
+    )
     try:
         result = ruckig.Ruckig(n).calculate(given, found)
     # it fails by an exception, by one of its own numbers that it has no name for, ...
     except (ruckig.RuckigError, ValueError) as error:
-        reason = str(error).strip().partition('\n')[0]
-        raise MotionError(
-            f'ruckig found no motion from position, velocity and acceleration '
-            f'{state.tolist()}: {reason}'
-        ) from error
+        raise MotionError(none + str(error).strip().partition('\n')[0]) from error
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):  # ... or so
-        raise MotionError(
-            f'ruckig found no motion from position, velocity and acceleration '
-            f'{state.tolist()}: {result.name}'
-        )
-    return _pieces_of(found, state)
+        raise MotionError(none + result.name)
+    return found
 
 
 def _pieces_of(found: Any, state: np.ndarray) -> Pieces:
