@@ -184,6 +184,17 @@ class NodeProcess:
             self._process.wait()
 
 
+@contextmanager
+def _kept_interrupts() -> Iterator[list[int]]:
+    """Give the list of SIGINT and SIGTERM that come meanwhile; they end nothing."""
+    interrupts: list[int] = []
+    with ExitStack() as handlers:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before = signal.signal(number, lambda number, _: interrupts.append(number))
+            handlers.callback(signal.signal, number, before)
+        yield interrupts
+
+
 def _run_nodes(
     config: LoopConfig,
     monitor: ProgressMonitor,
@@ -197,12 +208,9 @@ def _run_nodes(
     Return False if something else ended the run; raise KeyboardInterrupt if it had not
     begun.
     """
-    interrupts: list[int] = []
     # stops the nodes in reverse, then restores the handlers
     with ExitStack() as ending:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            handler = signal.signal(number, lambda number, _: interrupts.append(number))
-            ending.callback(signal.signal, number, handler)
+        interrupts = ending.enter_context(_kept_interrupts())
 
         def started(name: str) -> NodeProcess:
             node = NodeProcess(name, params_file, logs)

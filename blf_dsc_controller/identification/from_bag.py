@@ -84,16 +84,7 @@ def read_bag(
     theta = None
     if other is not None:
         theta = units['q'].factor * _motors_at(motion.stamp, other, theirs)
-    recording = resampled(
-        joints,
-        motion.stamp,
-        _Scaled(motion.q, units['q'].factor),
-        _Scaled(motion.torque, units['tau'].factor),
-        '; '.join([motion.source, *motion.said]),
-        file.tree.turning(joints),
-        theta,
-    )
-    return recording._replace(currents=is_of_drive(units['tau'].name))
+    return _recording_of(file, motion, theta)
 
 
 class _Motion(NamedTuple):
@@ -104,6 +95,21 @@ class _Motion(NamedTuple):
     torque: Rows
     source: str  # of the torques
     said: list[str]  # of what was left out
+
+
+def _recording_of(file: _File, motion: _Motion, theta: Floats | None) -> Recording:
+    """Return a motion in rad and N m, at even times; theta (N, n) [rad] is of motors."""
+    joints = tuple(file.joints.values())
+    recording = resampled(
+        joints,
+        motion.stamp,
+        _Scaled(motion.q, file.units['q'].factor),
+        _Scaled(motion.torque, file.units['tau'].factor),
+        '; '.join([motion.source, *motion.said]),
+        file.tree.turning(joints),
+        theta,
+    )
+    return recording._replace(currents=is_of_drive(file.units['tau'].name))
 
 
 def _of_several(

@@ -280,20 +280,36 @@ class Rows(NamedTuple):
 
 def rows_of(recording: Recording, model: SerialChain) -> Rows:
     """Return the rows of all windows of a recording without gaps."""
+    n = len(recording.joints)
+    rows = _empty_rows(recording, model)
+    dq = rows.dq
+    _add_inertial(rows, model)
+    _add_gravity(rows, model)
+    rows.set_sliding(np.zeros(n))
+    rows.set_column('viscous', lambda at: dq[at])
+    rows.set_column('offset', lambda at: np.ones_like(dq[at]))
+    rows.set_column('quadratic', lambda at: dq[at] * np.abs(dq[at]))
+    if n > 1:
+        _set_coupling(rows)
+
+    def in_motion(at: slice) -> Floats:
+        return np.asarray(dq[at] ** 2 / (dq[at] ** 2 + _REST**2))
+
+    return rows._replace(
+        weight=rows.over_windows(in_motion, rows.g) ** 2,
+        speeds=rows.over_windows(lambda at: np.abs(dq[at]), rows.g),
+    )
+
+
+def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
+    """Return the windows and what they are taken from, with columns that are zero or missing."""
     h = recording.period
     n = len(recording.joints)
     size = recording.gap.size
     g, slope = weighting(h)
     q, dq, near_gap = _smoothed(recording)
     starts = _starts(near_gap, g.size, h)
-    every = max(1, round(_GRAVITY / h))
-    gravity = OnDisk(n * model.p)
-    for block in blocks_of(size):
-        postures = q[block][-block.start % every :: every]
-        zeros = np.zeros_like(postures)
-        H = regressors_at(model, postures, zeros, zeros, zeros)
-        gravity.append(H.reshape(len(H), -1))
-    rows = Rows(
+    return Rows(
         time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
         inertial=OnDisk(n * model.p),
         friction=np.zeros((starts.size, len(COLUMNS), n)),
@@ -312,23 +328,8 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         starts=starts,
         period=h,
         sliding=mapped(size, lambda rows: np.zeros((rows.stop - rows.start, n))),
-        gravity=gravity,
-        every=every,
-    )
-    _add_inertial(rows, model)
-    rows.set_sliding(np.zeros(n))
-    rows.set_column('viscous', lambda at: dq[at])
-    rows.set_column('offset', lambda at: np.ones_like(dq[at]))
-    rows.set_column('quadratic', lambda at: dq[at] * np.abs(dq[at]))
-    if n > 1:
-        _set_coupling(rows)
-
-    def in_motion(at: slice) -> Floats:
-        return np.asarray(dq[at] ** 2 / (dq[at] ** 2 + _REST**2))
-
-    return rows._replace(
-        weight=rows.over_windows(in_motion, g) ** 2,
-        speeds=rows.over_windows(lambda at: np.abs(dq[at]), g),
+        gravity=OnDisk(n * model.p),
+        every=max(1, round(_GRAVITY / h)),
     )
 
 
@@ -380,6 +381,15 @@ def _add_inertial(rows: Rows, model: SerialChain) -> None:
         dq = rows.dq[samples]
         add_windows(model, q, dq, rows.g, rows.slope, starts, regressors, X)
         rows.inertial.append(X.reshape(len(X), -1))
+
+
+def _add_gravity(rows: Rows, model: SerialChain) -> None:
+    """Compute the regressors at rest, of one in `every` samples: see `Rows.gravity_torque`."""
+    for block in blocks_of(len(rows.q)):
+        postures = rows.q[block][-block.start % rows.every :: rows.every]
+        zeros = np.zeros_like(postures)
+        H = regressors_at(model, postures, zeros, zeros, zeros)
+        rows.gravity.append(H.reshape(len(H), -1))
 
 
 def weighting(h: float) -> tuple[Floats, Floats]:
