@@ -16,8 +16,10 @@ halves the time.
 
 Numba numbers the functions that a process compiles, from 1 on, and their symbols contain
 the number.  Of two kernels with the same name and names of types, each compiled by
-another process, one would be called for the other where both are loaded from the cache:
-the methods of two laws are such kernels.  Here each process begins at a random number.
+another process, one would be called for the other where both are loaded from the cache
+and an address is asked for again, as `address_of` does: the methods of two laws are such
+kernels.  Here each process begins at a random number.  In numba's ordinary way a kernel
+keeps the address that it had when it was loaded, which is its own.
 """
 
 from __future__ import annotations
