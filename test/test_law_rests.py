@@ -27,6 +27,21 @@ def test_insertion_by_an_arm_whose_friction_is_unknown_is_no_change(study):
     assert study.outside(run.readings).mean() <= 0.05
 
 
+@pytest.mark.parametrize(
+    ('seed', 'motion'), [(13, 'pick'), (101, 'trapezoids'), (208, 'pick')]
+)
+def test_first_stop_of_an_arm_whose_drives_are_heavier_than_guessed_is_no_change(
+    study, monkeypatch, seed, motion
+):
+    """Five times as heavy.  A change was found at 2.1 s, as the arm stopped and moved on."""
+    monkeypatch.setattr(study, 'DURATION', 3.0)
+    guess = study.load_loop('ur5e').controller.robot
+    truth = study.load_loop('ur5e').plant.truth.rotor_inertia
+    chain = guess.chain(study.load_loop('ur5e').controller.joints)
+    np.testing.assert_allclose(truth, 5.0 * guess.rotors(chain))
+    assert run_of(study, 'ur5e', motion, seed, 0.0).changes.size == 0
+
+
 def test_true_load_is_found_as_soon_in_the_same_insertion(study):
     """It was found after 0.13 s, among seven changes that were none."""
     run = run_of(study, 'ur5e_rigid', 'insertion', 10, study.LOAD)

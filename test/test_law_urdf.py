@@ -22,6 +22,7 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import (
     columns_of,
+    doubting_covariance,
     estimate_names,
     model_of,
     prior_covariance,
@@ -151,10 +152,38 @@ def test_prior_covers_the_deviations_of_links_drives_and_friction():
     np.testing.assert_allclose(information @ covariance, np.eye(62), atol=1e-5)
 
 
-def deviations(config):
-    """Standard deviation of the prior of each estimate."""
+def test_rows_are_compared_with_a_prior_that_doubts_drives_which_nobody_told():
+    """As much as those published for an FR3 are off; learning, whose rate follows, does not."""
+    guessed, told = panda(), panda(robot__rotor_inertia=[0.3] * 7)
+    doubted, learned = (
+        deviations(guessed, each) for each in (doubting_covariance, prior_covariance)
+    )
+    guess = guessed.robot.rotors(guessed.robot.chain(guessed.joints))
+    alone = {f'rotor{i}': each for i, each in enumerate(guess, 1) if i > 2}
+    assert len(alone) == 5  # those of the first two joints are in other base parameters
+    for name, each in alone.items():
+        assert doubted[name] ** 2 - learned[name] ** 2 == pytest.approx(
+            (4.0**2 - 0.5**2) * each**2
+        )
+    np.testing.assert_array_equal(doubting_covariance(told), prior_covariance(told))
+    fr3 = load_loop('fr3')
+    robot = fr3.controller.robot
+    factors = fr3.plant.truth.rotor_inertia / robot.rotors(
+        robot.chain(fr3.controller.joints)
+    )
+    assert np.sqrt(np.mean((factors - 1.0) ** 2)) == pytest.approx(4.0, abs=0.05)
+    settings = settings_of_config(guessed)
+    for information, covariance in (
+        (settings.information, prior_covariance(guessed)),
+        (settings.row_information, doubting_covariance(guessed)),
+    ):
+        np.testing.assert_allclose(information @ covariance, np.eye(62), atol=1e-4)
+
+
+def deviations(config, of=prior_covariance):
+    """Standard deviation of a prior of each estimate."""
     names = estimate_names(config)
-    covariance = prior_covariance(config)
+    covariance = of(config)
     return dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
 
 

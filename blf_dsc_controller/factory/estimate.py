@@ -9,7 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.base_parameters import ROTORS, UNKNOWN_ROTOR, prior_factor
+from blf_dsc_controller.arms.base_parameters import (
+    GUESSED_ROTORS,
+    ROTORS,
+    UNKNOWN_ROTOR,
+    prior_factor,
+)
 from blf_dsc_controller.arms.model import ArmModel, arm_model, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION, parameters_of
@@ -102,13 +107,29 @@ def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
 
 def prior_covariance(config: ControllerConfig) -> np.ndarray:
     """Return the prior covariance (m, m) of theta: identity for planar arms, else of the URDF."""
+    return _covariance(config, ROTORS)
+
+
+def doubting_covariance(config: ControllerConfig) -> np.ndarray:
+    """Return the same (m, m) where inertias of drives that are a guess are doubted as they must be.
+
+    Rows of an arm with other drives are compared with it.  Learning does not use it: its rate
+    follows from its prior, and must not rise with what is not known of drives.
+    """
+    robot = config.robot
+    is_known = config.model != 'urdf' or robot.known_rotors(robot.chain(config.joints))
+    return _covariance(config, ROTORS if is_known else GUESSED_ROTORS)
+
+
+def _covariance(config: ControllerConfig, relative: float) -> np.ndarray:
+    """Return a covariance (m, m) of theta, with a `relative` deviation of the drives' inertias."""
     columns = columns_of(config)
     if config.model != 'urdf':
         return np.eye(model_of(config).p + len(columns))
     robot = config.robot
     chain = config.robot.chain(config.joints)
     rotors = robot.rotors(chain)
-    unsure = np.where(rotors > 0.0, ROTORS * rotors, UNKNOWN_ROTOR)
+    unsure = np.where(rotors > 0.0, relative * rotors, UNKNOWN_ROTOR)
     L = prior_factor(chain, parameters_of(robot, chain), robot.payload, unsure)
     covariance = np.diag([0.0] * len(L) + [column.deviation**2 for column in columns])
     covariance[: len(L), : len(L)] = product(L, L.T)

@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.robot import (
 from blf_dsc_controller.factory.estimate import (
     Column,
     columns_of,
+    doubting_covariance,
     model_of,
     prior_covariance,
 )
@@ -93,6 +94,7 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         has_barrier=int(law_of(config).has_barrier),
         initial_estimate=np.array((*config.learning.initial_estimate, *initial)),
         information=inverse(covariance),
+        row_information=inverse(doubting_covariance(config)),
         joint_inertia=inertia,
         robust_gain=np.zeros(model.n),
         truth=_truth(config, model.p),

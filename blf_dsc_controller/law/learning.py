@@ -266,7 +266,7 @@ def detect_change(
     """
     of, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.window)
-    prior = Prior(settings.initial_estimate, settings.information)
+    prior = Prior(settings.initial_estimate, settings.row_information)
     if change.is_predicted(sliding):
         has_changed = change.compare_with_rows(
             state.change,

@@ -58,6 +58,8 @@ class Settings(NamedTuple):
     initial_estimate: Annotated[Array, 'm']  # P^(0), then that of the columns
     # R, inverse covariance of the prior of theta
     information: Annotated[Array, 'm', 'm']
+    # of the prior that rows are compared with, which doubts guessed drives
+    row_information: Annotated[Array, 'm', 'm']
     # m, least inertia of a joint with the others free, kg m^2
     joint_inertia: Annotated[Array, 'n']
     robust_gain: Annotated[Array, 'n']  # mu_bar of (35), N m
