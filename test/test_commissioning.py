@@ -999,12 +999,11 @@ def test_frequencies_above_100_hz_are_told_without_an_exponent():
     assert 'at 230 Hz' in told
 
 
-def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
-    tmp_path, capsys, monkeypatch
-):
-    urdf = tmp_path / 'arm.urdf'
+def file_of_arm(folder):
+    """Return a file of ARM in this folder."""
+    urdf = folder / 'arm.urdf'
     urdf.write_text(ROBOT['robot.urdf'])
-    config = tmp_path / 'arm.yaml'
+    config = folder / 'arm.yaml'
     config.write_text(f"""
 /**:
   ros__parameters:
@@ -1021,6 +1020,13 @@ def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
     limits.position_lower: [-3.0, -3.0]
     limits.position_upper: [3.0, 3.0]
 """)
+    return config
+
+
+def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
+    tmp_path, capsys, monkeypatch
+):
+    config = file_of_arm(tmp_path)
     common = ['commission', '--config', str(config)]
     posture = ['--posture', '0.3', '1.1']
     motion = tmp_path / 'motion.yaml'
@@ -1046,6 +1052,28 @@ def test_bags_of_the_written_motions_commission_as_the_simulated_arm(
     )
     assert main([*common, '--out', str(by_arm)]) == 1  # exists
     assert 'exists already' in capsys.readouterr().err
+
+
+def test_load_that_was_not_measured_is_told_at_the_end_and_in_the_file(
+    tmp_path, capsys, monkeypatch
+):
+    """It was said in passing, before the table, and the file did not say it."""
+    measured = simulated.measured
+
+    def dropped(planned, plant, payload=0.0):
+        if payload:
+            raise BlfDscError('the simulated arm stopped: it fell')
+        return measured(planned, plant)
+
+    monkeypatch.setattr(simulated, 'measured', dropped)
+    monkeypatch.setattr(figures, 'draw_panels', lambda path, *_, **__: path.touch())
+    out = tmp_path / 'out.yaml'
+    given = ['--config', str(file_of_arm(tmp_path)), '--posture', '0.3', '1.1']
+    assert main(['commission', *given, '--out', str(out)]) == 0
+    before, _, summary = capsys.readouterr().out.partition('commissioned on')
+    comment = out.read_text().partition('/**:')[0].replace('# ', '')
+    for told in (before, summary, comment):
+        assert 'posture 1 with 0.1 kg: not measured: the simulated arm stopped' in told
 
 
 @pytest.mark.parametrize(('period', 'T'), [(8.0, 1e-3), (12.0, 1.0 / 600.0)])

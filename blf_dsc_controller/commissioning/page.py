@@ -25,6 +25,7 @@ from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.expected_errors import expectation
 
@@ -103,6 +104,14 @@ def sentences(found: Commissioned) -> Iterator[str]:
     yield (
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'
+    )
+
+
+def not_measured(name: str, reason: BlfDscError) -> str:
+    """Return that the run of this name, with a load, is missing, and what to do."""
+    return (
+        f'{name}: not measured: {reason}. The margin is that without this load: commission once '
+        'more with the file that is written, whose gains may hold it, or give less robot.payload'
     )
 
 
