@@ -359,6 +359,8 @@ def test_friction_does_not_hide_where_the_loop_is_unstable():
     assert stuck.has_margin
     assert true_loop(stuck.choice.gains, stuck.loops.inertia).margin().value == 0.0
     again = commissioning.stronger(first, run)
+    assert not first.excitation.sliding
+    assert commissioning.motion(POSTURE).excitation.sliding  # from the start, by then
     run, _ = simulated.measured(again, rubbing)
     again = commissioning.stronger(again, run)
     seen = commissioned(CONFIG, [simulated.measured(again, rubbing)])
@@ -1141,7 +1143,7 @@ def test_period_of_a_run_has_all_of_its_samples(period, T):
 def test_proof_has_the_largest_error_of_its_whole_run_or_the_reason_of_a_stop():
     loop = load_loop('recommended', {PLANT: {'duration': 0.5}})
     error = simulate(loop.controller, loop.plant).run().error
-    assert simulated.proof(loop) == (0.5, np.abs(error).max(), '')
+    assert simulated.proof(loop) == (0.5, np.abs(error).max(), '', [])
     slow = change(loop.controller, {'safety.velocity_limit': 0.02})
     assert 'velocity_limit' in simulated.proof(loop._replace(controller=slow)).stop
 
@@ -1157,6 +1159,8 @@ def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
     factor = shown_by(*run).factor
     assert 2.0 < factor < MOST
     again = commissioning.stronger(weak, run[0])
+    # the next posture begins with it
+    assert commissioning.motion(POSTURE).torque == again.torque == factor * 0.01
     shares = again.excitation.amplitude / weak.excitation.amplitude
     np.testing.assert_allclose(shares[:, :-2], factor, rtol=1e-9)
     assert shown_by(*simulated.measured(again, coarse(7e-5))).factor == 1.0

@@ -157,11 +157,14 @@ def _prove_on_robot(
     """Raise the gains of a file step by step on a robot, and say how far it errs."""
     config = commissioning.config
     try:
-        *_, last = proven_on(options, _arm(options, path, commissioning), config)
+        arm = _arm(options, path, commissioning)
+        (*_, last), cycles = proven_on(options, arm, config)
     except EndedError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
     print(page.errors_table(config.joints, last))
+    for each in cycles:
+        print(page.of_limit_cycle(each))
     return 0
 
 
@@ -236,3 +239,5 @@ def _prove(path: Path) -> None:
         f'with these gains the simulated arm follows its own motion for {proof.duration:g} s, '
         f'with {two_digits(1e3 * proof.error)} mrad at most'
     )
+    for each in proof.cycles:
+        print(page.of_limit_cycle(each))

@@ -22,6 +22,7 @@ from blf_dsc_controller.commissioning.commissioning import (
     Planned,
 )
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
+from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
@@ -269,6 +270,16 @@ def _wider(found: Commissioned) -> dict[str, list[str]]:
         if wide > usual
     ]
     return {'barrier.bound': wider}
+
+
+def of_limit_cycle(cycle: LimitCycle) -> str:
+    """Return in a sentence how a joint shakes, and what to do."""
+    return (
+        f'{cycle.joint} shakes by {1e3 * cycle.amplitude:.2g} m{cycle.unit} at '
+        f'{two_digits(cycle.frequency)} Hz {cycle.when}: friction makes it stick and slip, '
+        'which no check stops. More feedback.joint_damping of this joint makes it smaller, at the cost of '
+        'the margin; softer gains make it larger'
+    )
 
 
 def errors_table(joints: Sequence[str], errors: Errors) -> str:
