@@ -75,13 +75,13 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
     picture = options.out.with_suffix('.png')
     make_room(options.out, picture, force=options.force)
     try:
-        names, runs = _all_runs(options, path, commissioning)
+        names, runs, missing = _all_runs(options, path, commissioning)
     except EndedError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
     found = commissioning.result(runs)
     print(page.table(found))  # also if the gains are too soft for any bound: an error
-    lines = _told(options, found)
+    lines = _told(options, found, missing)
     print('\n'.join(['', *lines]))
     page.draw(found, names, picture)
     print(f'wrote {picture}')
@@ -124,17 +124,20 @@ def _check(options: Namespace) -> None:
 
 def _all_runs(
     options: Namespace, path: Path, commissioning: Commissioning
-) -> tuple[list[str], list[Measured]]:
-    """Return names and runs: of bags, of the robot or both, else of the simulated arm."""
+) -> tuple[list[str], list[Measured], list[str]]:
+    """Return names and runs: of bags, of the robot or both, else of the simulated arm.
+
+    Also sentences about what was to be measured and could not be.
+    """
     if not (options.bags or options.robot or options.ros):
         return _simulated(path, commissioning)
     names = [str(bag) for bag in options.bags]
     runs = [measured_in(bag) for bag in options.bags]
     if not (options.robot or options.ros):
-        return names, runs
+        return names, runs, []
     measured = measured_on(options, _arm(options, path, commissioning), commissioning)
     names += [name for name, _ in measured]
-    return names, runs + [run for _, run in measured]
+    return names, runs + [run for _, run in measured], []
 
 
 def _arm(
@@ -154,11 +157,14 @@ def _prove_on_robot(
     """Raise the gains of a file step by step on a robot, and say how far it errs."""
     config = commissioning.config
     try:
-        *_, last = proven_on(options, _arm(options, path, commissioning), config)
+        arm = _arm(options, path, commissioning)
+        (*_, last), cycles = proven_on(options, arm, config)
     except EndedError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
     print(page.errors_table(config.joints, last))
+    for each in cycles:
+        print(page.of_limit_cycle(each))
     return 0
 
 
@@ -185,32 +191,38 @@ def _write_motions(
 
 def _simulated(
     path: Path, commissioning: Commissioning
-) -> tuple[list[str], list[Measured]]:
-    """Return names and runs of the motions on the simulated arm."""
+) -> tuple[list[str], list[Measured], list[str]]:
+    """Return names and runs of the motions on the simulated arm, and what it did not bear."""
     loop = load_loop(path)
     planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):
         print(f'posture {k}: {page.description(each)}', flush=True)
-    names, runs = [], []
+    names, runs, missing = [], [], []
     with announced_compilation(print_notice):
         made = simulated.runs_of(commissioning, loop)
         bar = tqdm(made, total=len(planned) + 1, unit='run', leave=False, disable=None)
         for name, run in bar:
             if isinstance(run, BlfDscError):
-                print(f'{name}: not measured: {run}')
+                missing.append(page.not_measured(name, run))
+                print(missing[-1])
                 continue
             names.append(name)
             runs.append(run)
-    return names, runs
+    return names, runs, missing
 
 
-def _told(options: Namespace, found: Commissioned) -> Sequence[str]:
-    """Return what was commissioned and when, and the sentences of the page; wrapped."""
+def _told(
+    options: Namespace, found: Commissioned, missing: Sequence[str]
+) -> Sequence[str]:
+    """Return what was commissioned and when, and the sentences of the page; wrapped.
+
+    What is `missing` comes last: it was said long before, and the file is to say it, too.
+    """
     origin = (
         f'{options.config} commissioned on {found.date} by blf_dsc_controller {__version__}, with '
         f'a modulus margin of {found.choice.margin.value:.2g}'
     )
-    told = [origin, *page.sentences(found)]
+    told = [origin, *page.sentences(found), *missing]
     return [line for each in told for line in textwrap.wrap(each, _WIDTH)]
 
 
@@ -227,3 +239,5 @@ def _prove(path: Path) -> None:
         f'with these gains the simulated arm follows its own motion for {proof.duration:g} s, '
         f'with {two_digits(1e3 * proof.error)} mrad at most'
     )
+    for each in proof.cycles:
+        print(page.of_limit_cycle(each))

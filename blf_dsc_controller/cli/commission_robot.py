@@ -21,6 +21,7 @@ from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.driven import Driven
+from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.own_loop import (
     REPEATS,
     Commissioning,
@@ -87,21 +88,24 @@ def proven_on(
     options: Namespace,
     arm: AbstractContextManager[PostureByPosture],
     config: ControllerConfig,
-) -> list[Errors]:
-    """Prove the gains of a configuration on a robot; return the errors of each step.
+) -> tuple[list[Errors], list[LimitCycle]]:
+    """Prove the gains of a configuration on a robot.
+
+    Return the errors of each step, and the limit cycles while the arm holds still.
 
     Raises as `measured_on`.
     """
     planned = steps(config)
     with arm as here:
         ask(options, _of_proof(options, planned))
-        found = []
-        for step, errors in here.proof(planned):
+        found, shaking = [], []
+        for step, errors, cycles in here.proof(planned):
             worst = 1e3 * float(errors.measured.max())
             print(f'{step.name}: calm, errors of {worst:.2g} mrad at most', flush=True)
             found.append(errors)
+            shaking += cycles
         here.hold_after()
-    return found
+    return found, shaking
 
 
 def prepared_folder(options: Namespace) -> Path:
@@ -159,7 +163,7 @@ def _of_proof(options: Namespace, planned: Sequence[Step]) -> Iterator[str]:
     )
     yield (
         f'then the arm follows the reference of {options.config}, for {seconds:g} s in all, with '
-        f'{", ".join(each.name for each in planned)}'
+        f'{", ".join(each.name for each in planned)}; before the last it holds still for {HOLD:g} s'
     )
     yield (
         'an oscillation, any other check of the controller, or Ctrl-C brings the arm to rest and '

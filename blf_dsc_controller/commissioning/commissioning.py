@@ -64,6 +64,7 @@ class Planned(NamedTuple):
     posture: Floats  # (n,) rad
     excitation: motion.Excitation
     share: float = 1.0  # of the gains of the arm in use
+    torque: float = TORQUE  # rms, as a share of the rated one, at most
 
     @property
     def duration(self) -> float:
@@ -218,7 +219,8 @@ def plan(
         _check_posture(config, posture)
         excitation = motion.excitation(arm, posture, torque, travel, sliding=sliding)
         values = {**gains, **motion.shaking_parameters(arm, excitation, posture)}
-        planned.append(Planned(change(arm, values), values, posture, excitation, share))
+        made = change(arm, values)
+        planned.append(Planned(made, values, posture, excitation, share, torque))
     return planned
 
 

@@ -31,7 +31,7 @@ from blf_dsc_controller.commissioning.commissioning import (
     postures_of,
 )
 from blf_dsc_controller.commissioning.motion import SLOW_TONES
-from blf_dsc_controller.commissioning.strength import shown_by
+from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.run import Run
@@ -64,8 +64,9 @@ class Commissioning:
         measured_with: the configuration of the motions: `config`, or the stiffer one by which
             `better_known` measures the arm anew.
         slides: whether the first motion in a posture has swings already.
-        share: of the gains of `measured_with` that motions have; `stronger` halves it if the arm
-            nearly oscillates.
+        share: of the gains of `measured_with` that motions have.
+        torque: of the first motion in a posture, rms, as a share of the rated torque, at most.
+            What an earlier posture needed, the next ones have from the start (`go_on_with`).
         anew_left: how many times `better_known` may still measure the arm anew.
     """
 
@@ -99,7 +100,8 @@ class Commissioning:
         self.share = 1.0
         self.anew_left = MOST_ANEW if is_known_by_urdf_only(config) else 0
         self._postures = postures
-        self._torque = torque
+        self.torque = torque
+        self._most = MOST * torque
         self._travel = travel
 
     @cached_property
@@ -128,14 +130,12 @@ class Commissioning:
     def motion(self, posture: ArrayLike) -> Planned:
         """Return the motion around a posture (n,) [rad], such as that of the arm at rest.
 
-        Once `stronger` has found that the arm nearly oscillates, it has softer gains.
+        It has the torque, swings and gains that `stronger` has found earlier postures to need.
 
         Raises:
             BlfDscError: the posture is not one of this arm, or too near its limits.
         """
-        return self._motion(
-            posture, self._torque, sliding=self.slides, share=self.share
-        )
+        return self._motion(posture, self.torque, sliding=self.slides, share=self.share)
 
     def sliding(self, posture: ArrayLike) -> Planned:
         """Return the motion around a posture (n,) [rad] with swings that keep joints sliding.
@@ -143,7 +143,7 @@ class Commissioning:
         Raises:
             BlfDscError: as for `motion`.
         """
-        return self._motion(posture, self._torque, sliding=True)
+        return self._motion(posture, self.torque, sliding=True)
 
     def stronger(
         self, motion: Planned, run: Run, posture: ArrayLike | None = None
@@ -151,8 +151,8 @@ class Commissioning:
         """Return the motion to measure a posture with again; None: the run shows enough.
 
         It has more torque, if noise hides much; swings, if friction damps a joint more than its
-        gains do; half of the gains, if the arm nearly oscillates with them.  Later motions then
-        have these gains, too.  It is around `posture` (n,) [rad], or that of the motion.  None
+        gains do; half of the gains, if the arm nearly oscillates with them.  The next postures
+        begin with all of this.  It is around `posture` (n,) [rad], or that of the motion.  None
         also if the travel of the tool and the speeds permit no larger motion.
 
         Raises:
@@ -164,15 +164,27 @@ class Commissioning:
         if shown.factor == 1.0 and sliding == slid:
             return None
         around = motion.posture if posture is None else posture
-        share = motion.share * (_SOFTER if shown.rings else 1.0)
-        self.share = min(self.share, share)
-        torque = shown.factor * self._torque
-        again = self._motion(around, torque, sliding=sliding, share=share)
-        if sliding != slid or shown.rings:
-            return again
+        again = self._motion(
+            around,
+            min(shown.factor * motion.torque, self._most),
+            sliding=sliding,
+            share=motion.share * (_SOFTER if shown.rings else 1.0),
+        )
         before, after = (each.excitation.amplitude for each in (motion, again))
         gained = float((after[:, :-SLOW_TONES] / before[:, :-SLOW_TONES]).max())
-        return again if gained > _WORTHWHILE else None
+        if sliding == slid and not shown.rings and gained <= _WORTHWHILE:
+            return None
+        self.go_on_with(again)
+        return again
+
+    def go_on_with(self, motion: Planned) -> None:
+        """Let the first motions of the next postures have what this one needed.
+
+        `stronger` has done so, unless another process has computed it.
+        """
+        self.torque = max(self.torque, motion.torque)
+        self.slides = self.slides or motion.excitation.sliding
+        self.share = min(self.share, motion.share)
 
     def better_known(self, motion: Planned, run: Run) -> Commissioning | None:
         """Return what measures this arm anew, by what a run shows; None: the run is good enough.

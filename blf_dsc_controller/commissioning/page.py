@@ -22,9 +22,11 @@ from blf_dsc_controller.commissioning.commissioning import (
     Planned,
 )
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
+from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.expected_errors import expectation
 
@@ -103,6 +105,14 @@ def sentences(found: Commissioned) -> Iterator[str]:
     yield (
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'
+    )
+
+
+def not_measured(name: str, reason: BlfDscError) -> str:
+    """Return that the run of this name, with a load, is missing, and what to do."""
+    return (
+        f'{name}: not measured: {reason}. The margin is that without this load: commission once '
+        'more with the file that is written, whose gains may hold it, or give less robot.payload'
     )
 
 
@@ -260,6 +270,16 @@ def _wider(found: Commissioned) -> dict[str, list[str]]:
         if wide > usual
     ]
     return {'barrier.bound': wider}
+
+
+def of_limit_cycle(cycle: LimitCycle) -> str:
+    """Return in a sentence how a joint shakes, and what to do."""
+    return (
+        f'{cycle.joint} shakes by {1e3 * cycle.amplitude:.2g} m{cycle.unit} at '
+        f'{two_digits(cycle.frequency)} Hz {cycle.when}: friction makes it stick and slip, '
+        'which no check stops. More feedback.joint_damping of this joint makes it smaller, at the cost of '
+        'the margin; softer gains make it larger'
+    )
 
 
 def errors_table(joints: Sequence[str], errors: Errors) -> str:

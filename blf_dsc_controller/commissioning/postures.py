@@ -23,12 +23,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.commissioning import Planned
+from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.own_loop import (
     REPEATS,
     Commissioning,
     measured_in,
 )
-from blf_dsc_controller.commissioning.proof import Errors, Step, errors_of, start_of
+from blf_dsc_controller.commissioning.proof import (
+    Errors,
+    Step,
+    cycles_in,
+    errors_of,
+    start_of,
+)
 from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
@@ -66,10 +73,13 @@ class Move(NamedTuple):
     duration: float  # s, with the rest at its end
 
 
-def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
+def move(
+    config: ControllerConfig, here: Floats, there: Floats, rest: float = _REST
+) -> Move:
     """Return the slow way from rest at `here` (n,) [rad] to rest at `there` (n,).
 
-    It has the gains of the configuration, and is straight in the angles of the joints.
+    It has the gains of the configuration, is straight in the angles of the joints, and rests at
+    its end for `rest` [s].
     """
     (target,), _ = short_way(there[None], here, config)
     far = np.abs(target - here)
@@ -81,7 +91,7 @@ def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
         'reference.times': [0.0, duration],
         'reference.waypoints': [*here.tolist(), *target.tolist()],
     }
-    return Move(change(config, values), duration + _REST)
+    return Move(change(config, values), duration + rest)
 
 
 def stronger_by_bag(
@@ -246,14 +256,19 @@ class PostureByPosture(ABC):
             _set_aside(bag, 'weak')
             planned = again
             # `stronger` has set it, but of a copy if another process has computed it
-            self._commissioning.share = again.share
+            self._commissioning.go_on_with(again)
             bag = self._run(planned.config, planned.duration, name)
         with _named(name):
             self._aside(check, bag)
         return planned, bag
 
-    def proof(self, steps: Sequence[Step]) -> Iterator[tuple[Step, Errors]]:
+    def proof(
+        self, steps: Sequence[Step]
+    ) -> Iterator[tuple[Step, Errors, list[LimitCycle]]]:
         """Yield the errors of each step, to whose start the arm goes slowly.
+
+        Before the last one it rests there for longer; its limit cycles by then, and in this step,
+        are yielded, too.
 
         Raises EndedError or BlfDscError as `runs`.
         """
@@ -261,10 +276,14 @@ class PostureByPosture(ABC):
         for step in steps:
             self._left = f'The gains are not proven: {held}; bags are in {self._folder}'
             here = self.position()
-            way = self._aside(move, step.config, here, start_of(step.config, here))
-            self._run(way.config, way.duration, f'way with {step.name}')
+            there = start_of(step.config, here)
+            is_last = step is steps[-1]
+            rest = HOLD if is_last else _REST
+            way = self._aside(move, step.config, here, there, rest)
+            still = self._run(way.config, way.duration, f'way with {step.name}')
             bag = self._run(step.config, step.duration, step.name)
-            yield step, self._aside(errors_of, bag, step.config)
+            cycles = self._aside(cycles_in, still, bag, step.config) if is_last else []
+            yield step, self._aside(errors_of, bag, step.config), cycles
             held = f'{step.share:.0%} of them were calm'
 
     def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:

@@ -2,7 +2,8 @@
 """The proof of commissioned gains: raised in three steps, along the arm's own reference.
 
 Half of the gains first, then three quarters, with bounds that soft gains keep; then all of
-them, with the configured bounds.  An oscillation ends it, whatever the file says.  The errors
+them, with the configured bounds.  Before these it rests for some seconds, to see whether it shakes
+(`limit_cycle`).  An oscillation ends it, whatever the file says.  The errors
 of the last step are compared with those that the linear loop lets expect.
 """
 
@@ -17,12 +18,19 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.chosen import with_gains
+from blf_dsc_controller.commissioning.limit_cycle import (
+    AT_REST,
+    IN_MOTION,
+    LimitCycle,
+    limit_cycles,
+)
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.run import Run
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 
 Floats = NDArray[np.float64]
@@ -86,6 +94,18 @@ def start_of(config: ControllerConfig, here: Floats) -> Floats:
     if config.reference.type == 'hold':
         return here
     return np.asarray(sampled(reference_of(config), np.zeros(1))[0, 0])
+
+
+def cycles_of(run: Run, config: ControllerConfig) -> list[LimitCycle]:
+    """Return the limit cycles of a run along the reference of its configuration."""
+    rests = config.reference.type == 'hold'
+    return limit_cycles(run, AT_REST if rests else IN_MOTION)
+
+
+def cycles_in(still: Path, moved: Path, config: ControllerConfig) -> list[LimitCycle]:
+    """Return the limit cycles in bags of an arm that rests, and follows its reference."""
+    at_rest = limit_cycles(read_run(still), AT_REST)
+    return at_rest + cycles_of(read_run(moved), config)
 
 
 def errors_of(bag: Path, config: ControllerConfig) -> Errors:

@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.commissioning import Planned
+from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.own_loop import (
     REPEATS,
     Commissioning,
     Measured,
 )
+from blf_dsc_controller.commissioning.proof import cycles_of
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
@@ -32,6 +34,7 @@ class Proof(NamedTuple):
     duration: float  # s
     error: float  # rad, the largest
     stop: str  # empty: none
+    cycles: list[LimitCycle]  # of an arm that does not stop
 
 
 def measured(planned: Planned, plant: PlantConfig, payload: float = 0.0) -> Measured:
@@ -60,7 +63,8 @@ def proof(loop: LoopConfig) -> Proof:
     run = simulate(loop.controller, change(plant, {'duration': duration})).run()
     stop = next((each.text for each in run.stops), '')
     error = np.zeros(1) if run.error is None else run.error
-    return Proof(duration, float(np.nanmax(np.abs(error))), stop)
+    cycles = [] if stop else cycles_of(run, loop.controller)
+    return Proof(duration, float(np.nanmax(np.abs(error))), stop, cycles)
 
 
 def runs_of(

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints that shake by friction: which errors are limit cycles, and that the proof tells them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.cli import commission
+from blf_dsc_controller.commissioning import simulated
+from blf_dsc_controller.commissioning.limit_cycle import (
+    AT_REST,
+    IN_MOTION,
+    LimitCycle,
+    limit_cycles,
+)
+from blf_dsc_controller.commissioning.page import of_limit_cycle
+from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.run import TURNING
+
+T = np.arange(0.0, 15.0, 1e-3)  # s
+
+
+def wave(amplitude, frequency):
+    return amplitude * np.sin(2.0 * np.pi * frequency * T + 0.3)
+
+
+def found(error, when=AT_REST):
+    """Return the limit cycles of a run of two joints, of which the second has an error (N,)."""
+    run = SimpleNamespace(
+        joints=('elbow', 'wrist'),
+        time=T,
+        error=np.column_stack((0.0 * T, error)),
+        units=lambda _: TURNING,
+    )
+    return limit_cycles(run, when)
+
+
+@pytest.mark.parametrize('when', [AT_REST, IN_MOTION])
+@pytest.mark.parametrize('frequency', [3.7, 6.15, 12.0])
+def test_wave_that_lasts_is_found_with_its_amplitude_and_frequency(frequency, when):
+    noise = np.random.default_rng(0).normal(0.0, 1e-4, T.size)
+    (cycle,) = found(wave(2.6e-3, frequency) + 1e-3 * T + noise, when)
+    assert cycle.joint == 'wrist'
+    assert cycle.when == when
+    assert cycle.amplitude == pytest.approx(2.6e-3, rel=0.05)
+    assert cycle.frequency == pytest.approx(frequency, abs=0.2)  # a line of 5 s
+    said = f'wrist shakes by 2.6 mrad at {cycle.frequency:.2g} Hz {when}: friction'
+    assert of_limit_cycle(cycle).startswith(said)
+
+
+def test_stick_and_slip_whose_frequency_wanders_is_found():
+    """As that of an arm in motion: 5.7 to 6.7 Hz."""
+    phase = 2.0 * np.pi * (6.2 * T + 0.4 * np.sin(2.0 * np.pi * 0.2 * T))
+    (cycle,) = found(2.5e-3 * np.sin(phase), IN_MOTION)
+    assert cycle.amplitude == pytest.approx(2.5e-3, rel=0.2)
+    assert cycle.frequency == pytest.approx(6.2, abs=0.7)
+
+
+@pytest.mark.parametrize(
+    'error',
+    [
+        wave(3e-4, 6.0),  # small
+        wave(50e-3, 6.0) * np.exp(-T / 1.0),  # dies out
+        wave(4e-3, 0.6) + wave(1e-3, 1.8) + wave(6e-4, 3.0),  # of a motion
+        np.random.default_rng(0).normal(0.0, 5e-3, T.size),  # noise
+        8e-3 * np.tanh(np.sin(2.0 * np.pi * 0.4 * T) / 0.1),  # friction that reverses
+    ],
+)
+def test_what_is_no_limit_cycle_is_not_told(error):
+    assert found(error, IN_MOTION) == []
+
+
+def test_joint_at_rest_may_shake_more_slowly():
+    assert found(wave(2e-3, 2.0), IN_MOTION) == []
+    (cycle,) = found(wave(2e-3, 2.0), AT_REST)
+    assert cycle.frequency == pytest.approx(2.0, abs=0.2)
+
+
+def test_simulated_arm_tells_its_limit_cycle_after_its_errors(capsys, monkeypatch):
+    """The run is that of the arm; a cycle of one joint is put on it."""
+    run = simulated.proof
+    seen = []
+
+    def shaking(loop):
+        proof = run(loop)
+        seen.append(proof)
+        cycle = LimitCycle('joint2', IN_MOTION, 'rad', 2.9e-3, 6.3)
+        return proof._replace(cycles=[*proof.cycles, cycle])
+
+    monkeypatch.setattr(simulated, 'proof', shaking)
+    short = load_loop('recommended', {'sim_plant': {'duration': 4.0}})
+    monkeypatch.setattr(commission, 'load_loop', lambda _: short)
+    commission._prove(None)
+    first, second = capsys.readouterr().out.splitlines()
+    assert 'follows its own motion for 4 s' in first
+    assert second.startswith('joint2 shakes by 2.9 mrad at 6.3 Hz in motion')
+    assert seen[0].cycles == []
