@@ -46,7 +46,7 @@ from sim_plant.layout import PlantSettings, PlantState
 from sim_plant.motion import dry_friction, put, subtract_tip_torque, update_loads
 
 REST, PREDICT, SWING = 16, 32, 64
-"""Further tasks of `run_elastic_plant`; the last two for links that something else computes."""
+"""Further tasks of `run_elastic_plant`; the last two where something else computes the links."""
 
 
 @inner
@@ -79,7 +79,7 @@ def fill_links(arm: RigidArm, now: PlantState) -> None:
 
 @inner
 def is_pushed(now: PlantState) -> bool:
-    """Return whether anything but the payload acts on the tip."""
+    """Whether anything but the payload acts on the tip."""
     push = now.acting.force
     pushes = push[0] != 0.0 or push[1] != 0.0 or push[2] != 0.0
     return bool(pushes or now.acting.sloshing[0] > 0.0)
@@ -217,8 +217,8 @@ def close_loop(plant: PlantSettings, now: PlantState) -> None:
         if springs.loop_gain > 0.0:
             rate = state.dtheta[i] - state.dq[plant.mounts + i]
             rate *= springs.stiffness[i] * memory.touches[i]
-            lacking = torque - now.drives.eased[i] - memory.spring[i]
-            torque += springs.loop_gain * lacking - springs.loop_damping * rate
+            missing = torque - now.drives.eased[i] - memory.spring[i]
+            torque += springs.loop_gain * missing - springs.loop_damping * rate
             torque = limited(torque, springs.loop_limit[i])
             torque += springs.loop_decay * (state.torque[i] - torque)
         state.torque[i] = torque
@@ -251,7 +251,7 @@ def slosh(plant: PlantSettings, now: PlantState, h: float) -> None:
 def accelerate(plant: PlantSettings, now: PlantState, dq: Array, dtheta: Array) -> None:
     """Write the accelerations of base and links, and of motors, at their velocities."""
     memory, springs = now.elastic_memory, plant.transmission
-    carry(plant, now, dq)
+    support_base(plant, now, dq)
     for i in range(plant.n):
         link = plant.mounts + i
         torque = now.elastic.torque[i]
@@ -268,14 +268,13 @@ def accelerate(plant: PlantSettings, now: PlantState, dq: Array, dtheta: Array) 
         memory.ddq[i] = 0.0
     for j in range(dq.size):
         net = memory.force[j] - memory.load[j]
-        for i in range(
-            dq.size
-        ):  # a row of a symmetric matrix: its entries are adjacent
+        # by rows of a symmetric matrix, whose entries are adjacent
+        for i in range(dq.size):
             memory.ddq[i] += memory.inverse[j, i] * net
 
 
 @inner
-def carry(plant: PlantSettings, now: PlantState, dq: Array) -> None:
+def support_base(plant: PlantSettings, now: PlantState, dq: Array) -> None:
     """Write the forces of the base's springs and dampers."""
     base, state = plant.base, now.elastic
     for i in range(plant.mounts):

@@ -35,7 +35,7 @@ class TorqueInput:
     def take(self, size: int, torque: NDArray[np.float64], sample: int) -> bool:
         """Store a command of `size` values, `torque` (n,), at a sample of the plant.
 
-        Returns whether it is valid; if not, `problem` describes why.
+        Return whether it is valid; if not, `problem` describes why.
         """
         if size == self.torque.size and (np.abs(torque) <= LARGEST).all():
             self.torque[:] = torque

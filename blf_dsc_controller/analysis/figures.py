@@ -46,8 +46,9 @@ _ABREAST = 3  # joints, at most, in columns; more are in rows
 _HIGH = (6.2, 3.2)
 _CLOSE_UP = (9.5, 2.6)
 _BEFORE, _AFTER = 1.0, 2.0  # s, shown of a change
-_FLAT, _DECADE = 2.0, 10.0
-_SHADED = 0.1
+_FLAT = 2.0  # ratio of the largest to the least value of what hardly changes
+_DECADE = 10.0
+_SHADED = 0.1  # opacity of a span
 _ABOVE = 1.15  # of the height of a panel, where the legend of its column is
 # points, widths of lines
 _NARROW = 1.3
@@ -318,10 +319,7 @@ def _stroke(line: Line, *, is_followed: bool, has_runs: bool) -> tuple[float, fl
 
 
 def _set_scale(axes: Axes, panel: Panel) -> None:
-    """Scale the value axis.
-
-    A logarithmic one spans two decades if the values hardly change.
-    """
+    """Scale the axis of the values; a logarithmic one spans two decades if they hardly change."""
     low, high = axes.dataLim.minposy, axes.dataLim.ymax
     if panel.log and math.isfinite(low):  # else no value is known
         if high < _FLAT * low:

@@ -270,7 +270,7 @@ class TopicMessages:
 
     @property
     def lost(self) -> str:
-        """Number of missing messages, by their numbers; empty if none or unknown."""
+        """How many messages are missing, as text, by their numbers; empty if none or unknown."""
         if len(self._next) > _MOST_PUBLISHERS or not self._missed + self._before:
             return ''
         earlier = (

@@ -50,9 +50,9 @@ class Parameter:
     Ranges and choices apply to each entry of an array. `read_only` is the reason why
     the parameter cannot change while the node runs; empty: it can. An `omittable` array
     may be empty. `kept` converts a given value to the one that a configuration holds,
-    or raises BlfDscError. The last three are derived from the field of the dataclass:
-    `length` names the parameters whose lengths multiply to the length of this array; a
-    number is itself a length.
+    or raises BlfDscError. `name` and what follows it are derived from the dataclass, as
+    are the choices of a `Literal`: `length` names the parameters whose lengths multiply
+    to the length of this array; a number is itself a length.
     """
 
     default: Value

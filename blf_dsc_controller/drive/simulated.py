@@ -186,7 +186,7 @@ def simulated(plant: PlantConfig, feedback: str = 'host') -> type[SimulatedDrive
     """Return the driver of a configured plant; `feedback` is `drive.feedback`."""
     n = len(plant.joints)
     limits = [limit or np.inf for limit in plant.actuator.torque_limit]
-    told = Facts(
+    facts = Facts(
         joints=n,
         period=plant.sample_time,
         drive_compensates=plant.robot.drive_compensates,
@@ -195,6 +195,5 @@ def simulated(plant: PlantConfig, feedback: str = 'host') -> type[SimulatedDrive
         torque_rate=[plant.actuator.reflex_rate or np.inf] * n,
         load_in_motion=True,
     )
-
     kind = SimulatedMotorsDriver if feedback == 'motor' else SimulatedDriver
-    return type('Simulated', (kind,), {'facts': told, 'plant_config': plant})
+    return type('Simulated', (kind,), {'facts': facts, 'plant_config': plant})

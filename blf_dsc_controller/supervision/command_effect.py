@@ -12,7 +12,7 @@ _SETTLING = 0.01  # s, for which the velocities lag behind the stop
 _AVERAGED = 0.02  # s, against their noise
 _NOTICED = 0.05  # of the torque limit
 _CHANGED = 0.2  # of it: a command that changes by more would have accelerated the arm
-_PATIENCE = 0.1  # s
+_PATIENCE = 0.1  # s, for which commands may have no effect
 
 
 class CommandEffect:
@@ -30,7 +30,7 @@ class CommandEffect:
     def restart(self) -> None:
         """Forget all that has been seen."""
         self._elapsed = 0.0
-        self._unanswered = 0.0
+        self._without_effect = 0.0
         self._average[:] = 0.0
         self.is_proven = False
 
@@ -51,7 +51,7 @@ class CommandEffect:
         the last call.  Call it until an effect is proven.
         """
         has_changed = bool((np.abs(change) > _CHANGED * limit).any())
-        if not has_changed or self._unanswered > _PATIENCE:
+        if not has_changed or self._without_effect > _PATIENCE:
             return False
-        self._unanswered += dt
-        return self._unanswered > _PATIENCE
+        self._without_effect += dt
+        return self._without_effect > _PATIENCE

@@ -19,10 +19,10 @@ from blf_dsc_controller.supervision.swing_names import SwingNames
 
 Vector = NDArray[np.float64]
 
-# Commands that do not reach the arm may be why, or velocities that are not its own:
-# both wind up the estimates.
+# The cause may be commands that do not reach the arm, or wrong velocities: both wind up
+# the estimates.
 _PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
-# A contact does so, too.
+# So do a velocity above its limit, a contact and an oscillation.
 WINDING_UP = (
     *_PERHAPS_UNREACHED,
     Reason.VELOCITY,

@@ -21,7 +21,7 @@ from blf_dsc_controller.supervision.supervisor import Fault, Reason
 Vector = NDArray[np.float64]
 # s between two states, at most: later, the arm may have been moved by hand
 _IN_A_ROW = 0.1
-_MOST = 1000.0  # turns: a position farther away is none
+_MOST = 1000.0  # turns: a position farther away is not measured
 
 
 class Wraps:
@@ -32,7 +32,7 @@ class Wraps:
         n = len(kinds)
         self._joints = config.joints
         self._is_free = turns_freely(config)
-        self._is_bound = np.array([kind == 'revolute' for kind in kinds])
+        self._has_range = np.array([kind == 'revolute' for kind in kinds])
         self._offset = np.zeros(n)  # rad, whole turns
         self._last = np.full(n, nan)  # rad, counted on
         self._counted = np.zeros(3 * n)
@@ -54,10 +54,10 @@ class Wraps:
             turns[np.abs(turns) > _MOST] = 0.0
             moved = np.abs(step + tau * turns)
             is_wrap = 0.0 < gap < _IN_A_ROW and moved <= fastest * gap
-            is_bound = self._is_bound & is_wrap & (turns != 0.0)
-            if is_bound.any():
-                fault = self._fault(int(np.argmax(is_bound)), measurement)
-            self._offset += tau * turns * (self._is_free | is_bound)
+            at_fault = self._has_range & is_wrap & (turns != 0.0)
+            if at_fault.any():
+                fault = self._fault(int(np.argmax(at_fault)), measurement)
+            self._offset += tau * turns * (self._is_free | at_fault)
             q = measurement[:n] + self._offset
         self._last = np.where(np.isfinite(q), q, self._last)
         if not self._offset.any():
@@ -71,8 +71,8 @@ class Wraps:
         self._last = measurement[: self._last.size].copy()
 
     def restart(self) -> bool:
-        """Believe the positions of joints that have a range; return whether they change."""
-        wrong = self._is_bound & (self._offset != 0.0)
+        """Take positions of joints that have a range as measured; return whether they change."""
+        wrong = self._has_range & (self._offset != 0.0)
         self._offset[wrong] = 0.0
         self._last[wrong] = nan
         return bool(wrong.any())
