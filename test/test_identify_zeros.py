@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Positions whose zeros are not those of the URDF, as in a DH convention."""
+"""Joints that count from other zeros, or the other way, than in the URDF."""
 
 from __future__ import annotations
 
@@ -34,9 +34,14 @@ def states():
     return measured(shake(PANDA_CHAIN, truth, reference_of(PANDA_CHAIN, 2), 15.0), 3)
 
 
-def identified(states, offsets=()):
-    """What is found if positions of joints, by number, are recorded with these offsets."""
+def identified(states, offsets=(), reversed_joints=()):
+    """What is found if positions of joints, by number, are recorded with these offsets.
+
+    Of reversed joints, positions and efforts are recorded negated before that.
+    """
     moved = states.copy()
+    for joint in reversed_joints:
+        moved[:, :, joint - 1] *= -1.0
     for joint, offset in dict(offsets).items():
         moved[:, POSITION, joint - 1] += offset
     return identify_arm(recording_of(moved[::EVERY], period=1e-3 * EVERY), ROBOT)
@@ -51,15 +56,42 @@ def test_zeros_that_are_quarter_turns_off_are_named_and_not_applied(states, offs
     right = np.zeros(7)
     for joint, offset in offsets.items():
         right[joint - 1] = -offset
-    np.testing.assert_allclose(found.other_zeros.offsets, right)
+    np.testing.assert_allclose(found.other_counting.counting.offsets, right)
+    np.testing.assert_array_equal(found.other_counting.counting.signs, 1.0)
     assert not is_usable(found)
     (problem,) = problems_of(found, 'torque')
-    assert problem.startswith('OTHER ZEROS')
+    assert problem.startswith('OTHER ZEROS:')
     for joint, offset in offsets.items():
         assert f'{-offset:+.5g} rad to panda_joint{joint}' in problem
     # 1 % of noise, which windows smooth; bodies that no arm has explain much as it is
-    assert found.other_zeros.error < 1.0
+    assert found.other_counting.score.total[2] < 1.0
     assert found.score.total[2] > 5.0
+
+
+def test_a_joint_that_counts_the_other_way_from_another_zero_is_named(states):
+    found = identified(states, {4: QUARTER}, [4])
+    counting = found.other_counting.counting
+    np.testing.assert_array_equal(counting.signs, [1, 1, 1, -1, 1, 1, 1])
+    # recorded: quarter - q
+    np.testing.assert_allclose(counting.offsets, [0, 0, 0, QUARTER, 0, 0, 0])
+    (problem,) = problems_of(found, 'torque')
+    assert problem.startswith('OTHER DIRECTIONS AND ZEROS:')
+    assert 'negated of panda_joint4, and if then there is added' in problem
+    assert f'{QUARTER:+.5g} rad to panda_joint4' in problem
+
+
+def test_a_last_joint_that_counts_the_other_way_is_named(states):
+    """Gravity hardly shows it, and in the error of the whole arm it is lost."""
+    found = identified(states, reversed_joints=[7])
+    assert found.score.total[2] < 2.0
+    np.testing.assert_array_equal(
+        found.other_counting.counting.signs, [1, 1, 1, 1, 1, 1, -1]
+    )
+    np.testing.assert_array_equal(found.other_counting.counting.offsets, 0.0)
+    assert not is_usable(found)
+    (problem,) = problems_of(found, 'torque')
+    assert problem.startswith('OTHER DIRECTIONS:')
+    assert 'positions and efforts are negated of panda_joint7.' in problem
 
 
 def test_friction_explains_the_torques_of_its_own_windows(states, monkeypatch):
@@ -75,7 +107,7 @@ def test_friction_explains_the_torques_of_its_own_windows(states, monkeypatch):
 
     monkeypatch.setattr(zeros, '_Gravity', keep)
     with pytest.raises(LookupError):
-        zeros.likely_zeros(recording, ROBOT)
+        zeros.likely_countings(recording, ROBOT, ())
     ((_, _, _, u, friction),) = seen
     assert len(u) >= 20
     for own, columns in zip(u, friction, strict=True):
@@ -84,15 +116,15 @@ def test_friction_explains_the_torques_of_its_own_windows(states, monkeypatch):
             assert (rows.friction[k] == column).all(axis=1).any()
 
 
-def test_right_zeros_are_not_doubted(states):
+def test_right_joints_are_not_doubted(states):
     found = identified(states)
-    assert found.other_zeros is None
+    assert found.other_counting is None
     assert is_usable(found)
 
 
-def test_efforts_in_another_order_are_not_taken_for_other_zeros(states):
+def test_efforts_in_another_order_are_not_taken_for_other_joints(states):
     efforts = states[:, TORQUE][:, [0, 3, 2, 1, 4, 5, 6]]
     other = np.stack((states[:, 0], states[:, 1], efforts), axis=1)
     found = identified(other)
-    assert found.other_zeros is None
+    assert found.other_counting is None
     assert not is_usable(found)

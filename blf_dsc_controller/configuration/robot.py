@@ -61,6 +61,8 @@ _NEEDED = 0.5
 _MOST_FRICTION = 0.25  # of the effort
 UNKNOWN_FRICTION = 0.05
 """Friction to expect where none is known, over the rated torque: its standard deviation."""
+UNKNOWN_ROTOR = 6.0
+"""Inertia that a guessed drive may have beyond the guess, over it: geared arms have up to seven."""
 _SLOWEST = {'revolute': 2.0, 'prismatic': 0.5}  # rad/s or m/s, of the drives of arms
 # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 _ROUNDING = 1e-12
@@ -263,6 +265,14 @@ class Robot:
         if len(known) == len(chain.joints):
             return np.array(known)
         return self.efforts(chain) / _DRIVE_ACCELERATION
+
+    def unknown_rotors(self, chain: Chain) -> np.ndarray:
+        """Return what drives may have beyond `rotors` (n,) [kg m^2] if these are guesses.
+
+        A loop at joint torque sensors hides it.
+        """
+        counts = not (self.torque_loop or self.known_rotors(chain))
+        return UNKNOWN_ROTOR * self.rotors(chain) * counts
 
 
 @lru_cache(maxsize=16)

@@ -6,7 +6,8 @@ posture.  w are the errors to expect of the joints, so all joints use about the 
 their bounds, which leaves the most room.
 
 d is the torque that the model lacks: friction and the residual floor, or the rated payload.  It
-includes the friction that a commissioning has measured, and the inertia that it did not see.
+includes the friction that a commissioning has measured, and the inertia that it did not see;
+without one, what drives may have beyond a guess.
 If gains follow from the inertia of the arm, w is in proportion to M^-1 d, with the weight of the
 payload.  If each joint has a stiffness of its own, w is d over this stiffness, with the torque of
 a payload that moves: a first joint bears no weight, but accelerates the load.
@@ -92,9 +93,8 @@ def joint_bounds(
     P0 = tuple(values['learning.initial_estimate'])
     coulomb = robot.friction(chain)['coulomb']
     n = len(chain.joints)
-    seen, unseen = (
-        tuple(values.get(name, ())) or (0.0,) * n for name in (_FRICTION, _UNSEEN)
-    )
+    seen = tuple(values.get(_FRICTION, ())) or (0.0,) * n
+    unseen = tuple(values.get(_UNSEEN, ())) or tuple(robot.unknown_rotors(chain))
     lengths = {len(each) for each in (lower, upper, floor, coulomb, seen, unseen)}
     if lengths != {n} or len(P0) != base.model.p or n > MOST_JOINTS:
         return None

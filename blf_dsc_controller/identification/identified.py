@@ -12,7 +12,11 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.identification.stiffness import Compliance
 from blf_dsc_controller.identification.values import Parts, indices, parts
 from blf_dsc_controller.identification.windows import Carried
+from blf_dsc_controller.identification.zeros import Counting
 from blf_dsc_controller.run import Floats
+
+IDLE = 0.01
+"""Of the largest torque, that of a joint that hardly needs one: most of it is noise."""
 
 
 class Score(NamedTuple):
@@ -34,12 +38,18 @@ class Score(NamedTuple):
         squares = np.sum(self.errors**2, axis=1) / np.sum(self.torque**2)
         return np.asarray(100.0 * np.sqrt(squares))
 
+    @property
+    def shares(self) -> Floats:
+        """Errors (n,) of all values over the torque of the joint, or the least that counts."""
+        least = IDLE * self.torque.max()
+        return np.asarray(self.errors[2] / np.maximum(self.torque, least))
 
-class OtherZeros(NamedTuple):
-    """Zeros of n joints with which the torques are explained far better."""
 
-    offsets: Floats  # (n,) to be added to the positions, rad
-    error: float  # of the torques held back with them, % of their rms
+class OtherCounting(NamedTuple):
+    """Directions and zeros of joints with which the torques are explained far better."""
+
+    counting: Counting
+    score: Score  # with them
 
 
 class OtherLoad(NamedTuple):
@@ -78,7 +88,9 @@ class Identified(NamedTuple):
     inertia: float  # share of its other inertial torque, likewise
     # (3,) gravity that explains the torques far better than the given one, m/s^2
     other_gravity: Floats | None
-    other_zeros: OtherZeros | None  # that explain the torques, if the given ones do not
+    other_counting: (
+        OtherCounting | None
+    )  # that explains the torques, if the URDF's does not
     other_load: (
         OtherLoad | None
     )  # that explains the torques, if a constant one does not

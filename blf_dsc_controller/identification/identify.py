@@ -3,8 +3,8 @@
 
 In four steps: the efforts are checked; the model is selected by cross-validation within
 the first four fifths of the motion; its values are fitted to these, and scored on the
-rest; then they are fitted to all of the motion.  If gravity is explained far better by
-other zeros of the joints, these are tried.
+rest; then they are fitted to all of the motion.  If this leaves much of the torques, or
+of that of one joint, other zeros and directions of the joints are tried.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.foresight import Foresight, foresee
 from blf_dsc_controller.identification.identified import (
     Identified,
+    OtherCounting,
     OtherLoad,
-    OtherZeros,
 )
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.plausibility import shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
-from blf_dsc_controller.identification.problems import is_usable
+from blf_dsc_controller.identification.problems import is_usable, unexplained_joints
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted
@@ -37,7 +37,11 @@ from blf_dsc_controller.identification.stiffness import Compliance, compliance_o
 from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
 from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
-from blf_dsc_controller.identification.zeros import likely_zeros, shifted
+from blf_dsc_controller.identification.zeros import (
+    Counting,
+    converted,
+    likely_countings,
+)
 from blf_dsc_controller.run import Floats
 
 STAGES = (
@@ -46,16 +50,14 @@ STAGES = (
     'selecting terms',
     'fitting',
     'intervals',
-    'trying other loads and zeros',
+    'trying other loads, zeros and directions',
 )
 """What takes time, in this order."""
 
-_GOOD = 2.0  # % of the torque, error with which other zeros are not looked for
-_BETTER = (
-    0.5  # times the error, at most, with zeros or loads that are not the given ones
-)
+_GOOD = 2.0  # % of the torque, error with which nothing else is looked for
+_BETTER = 0.5  # times the error, at most, with joints or loads that are not as given
 _SHOWN = 2.0  # deviations of its mass, least mass of such a load
-_AS_GOOD = 1.1  # times that error, at most, without an offset that is not needed
+_AS_GOOD = 1.1  # times that error, at most, without what is not needed
 
 
 def _tell_nobody(_stage: str) -> None:
@@ -175,9 +177,11 @@ def identify_arm(
     """
     found = _identified(recording, robot, effort, picked_up, find_signs, begin)
     begin(STAGES[5])
-    if found.score.total[2] < _GOOD:
+    unexplained = unexplained_joints(found)
+    is_good = found.score.total[2] < _GOOD
+    if is_good and not unexplained.size:
         return found
-    if picked_up is None:
+    if picked_up is None and not is_good:
         changing = _identified(
             recording, robot, effort, np.nan, find_signs, _tell_nobody
         )
@@ -186,12 +190,13 @@ def identify_arm(
     if effort == 'without-gravity':
         return found
 
-    def identified_at(offsets: Floats) -> Identified:
-        there = shifted(recording, offsets)
-        return _identified(there, robot, effort, picked_up, find_signs, _tell_nobody)
+    def identified_as(counting: Counting) -> Identified:
+        other = converted(recording, counting)
+        return _identified(other, robot, effort, picked_up, find_signs, _tell_nobody)
 
-    zeros = _better_zeros(found, likely_zeros(recording, robot), identified_at)
-    return found._replace(other_zeros=zeros)
+    likely = likely_countings(recording, robot, unexplained.tolist())
+    counting = _better_counting(found, likely, identified_as)
+    return found._replace(other_counting=counting)
 
 
 def _better_load(found: Identified, changing: Identified) -> OtherLoad | None:
@@ -205,31 +210,36 @@ def _better_load(found: Identified, changing: Identified) -> OtherLoad | None:
     return OtherLoad(changing.carried, mass, error)
 
 
-def _better_zeros(
+def _better_counting(
     found: Identified,
-    likely: Sequence[Floats],
-    identified_at: Callable[[Floats], Identified],
-) -> OtherZeros | None:
-    """Return the first of likely zeros that explain the torques far better, or None."""
-    for offsets in likely:
-        other = identified_at(offsets)
-        error = float(other.score.total[2])
-        if error < _BETTER * found.score.total[2] and is_usable(other):
-            return _simplest(OtherZeros(offsets, error), identified_at)
+    likely: Sequence[Counting],
+    identified_as: Callable[[Counting], Identified],
+) -> OtherCounting | None:
+    """Return the first of likely ones that explains the torques far better, or None."""
+    for counting in likely:
+        other = identified_as(counting)
+        if _left(other) < _BETTER * _left(found) and is_usable(other):
+            return _simplest(OtherCounting(counting, other.score), identified_as)
     return None
 
 
 def _simplest(
-    zeros: OtherZeros, identified_at: Callable[[Floats], Identified]
-) -> OtherZeros:
-    """Return the zeros without offsets that are not needed to explain the torques."""
-    for joint in np.flatnonzero(zeros.offsets):
-        fewer = zeros.offsets.copy()
-        fewer[joint] = 0.0
-        error = float(identified_at(fewer).score.total[2])
-        if fewer.any() and error < _AS_GOOD * zeros.error:
-            zeros = OtherZeros(fewer, error)
-    return zeros
+    best: OtherCounting, identified_as: Callable[[Counting], Identified]
+) -> OtherCounting:
+    """Return the counting without signs and offsets that are not needed."""
+    most = _AS_GOOD * _left(best)
+    for i in best.counting.unlike:
+        for simpler in best.counting.simpler(i):
+            other = identified_as(simpler)
+            if _left(other) < most:
+                best = OtherCounting(simpler, other.score)
+                break
+    return best
+
+
+def _left(found: Identified | OtherCounting) -> float:
+    """Return what is left of the torques held back, each joint by its own torque."""
+    return float(np.sqrt(np.mean(found.score.shares**2)))
 
 
 def _identified(
@@ -280,7 +290,7 @@ def _identified(
         gravity=size.gravity,
         inertia=size.inertia,
         other_gravity=problem.other_gravity,
-        other_zeros=None,
+        other_counting=None,
         other_load=None,
         carried=problem.carried,
         compliance=compliance,

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why an identified arm is not to be used: its efforts, its mounting, its zeros, its errors."""
+"""Why an identified arm is not to be used: its efforts, its mounting, its joints, its errors."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.identification.identified import (
+    IDLE,
     Identified,
+    OtherCounting,
     OtherLoad,
-    OtherZeros,
 )
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
 
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _GOOD = 0.02  # likewise, error that is accepted whatever else is possible
+_UNEXPLAINED = 0.2  # of the torque of a joint, error with which its values mean little
 _FAR = 3.0  # times the error of a model of a joint alone: this one is wrong
 _LARGE = 0.1  # of the torque of a joint, error that is a fault ...
 _RELEVANT = 0.02  # ... if it is so much of the largest torque
@@ -26,8 +29,8 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
     if found.other_load is not None:
         yield _load_problem(found, found.other_load)
         return
-    if found.other_zeros is not None:
-        yield _zeros_problem(found, found.other_zeros)
+    if found.other_counting is not None:
+        yield _counting_problem(found, found.other_counting)
         return
     if found.other_gravity is not None:
         words = ' '.join(f'{value:.3g}' for value in found.other_gravity)
@@ -55,18 +58,32 @@ def _load_problem(found: Identified, load: OtherLoad) -> str:
     )
 
 
-def _zeros_problem(found: Identified, zeros: OtherZeros) -> str:
-    """Return which zeros of joints would explain the torques."""
+def _counting_problem(found: Identified, other: OtherCounting) -> str:
+    """Return which zeros and directions of joints would explain the torques."""
+    signs, offsets = other.counting
+    reversed_joints = [found.joints[i] for i in np.flatnonzero(signs < 0.0)]
     moved = ', '.join(
         f'{offset:+.5g} rad to {name}'
-        for name, offset in zip(found.joints, zeros.offsets, strict=True)
+        for name, offset in zip(found.joints, offsets, strict=True)
         if offset
     )
+    steps, differ = [], []
+    if reversed_joints:
+        names = ', '.join(reversed_joints)
+        steps.append(f'positions and efforts are negated of {names}')
+        differ.append('directions')
+    if moved:
+        steps.append(f'there is added to the positions: {moved}')
+        differ.append('zeros')
+    i = int(np.argmax(found.score.shares - other.score.shares))
+    shares = (f'{100.0 * each.shares[i]:.2g}' for each in (other.score, found.score))
+    of_joint = ' instead of '.join(shares)
     return (
-        f'OTHER ZEROS: the torque error is {zeros.error:.3g} instead of '
-        f'{found.score.total[2]:.3g} % if there is added to the positions: {moved}. So the joints '
-        'seem to have other zeros than in the URDF, as in a DH convention: check this, and convert '
-        'the positions'
+        f'OTHER {" AND ".join(differ).upper()}: the torque error is '
+        f'{other.score.total[2]:.3g} instead of {found.score.total[2]:.3g} % (of '
+        f'{found.joints[i]} {of_joint} %) if {", and if then ".join(steps)}. So the joints seem '
+        f'to have other {" and ".join(differ)} than in the URDF, as in a DH convention: check '
+        'this, and convert the recording'
     )
 
 
@@ -108,6 +125,16 @@ def _joint_problems(found: Identified) -> Iterator[str]:
             f'of this joint alone leaves {100.0 * alone / score.torque[i]:.1f} %. Do the sign and '
             'the unit of its effort, and its axis in the URDF, agree with those of other joints?'
         )
+
+
+def unexplained_joints(found: Identified) -> NDArray[np.intp]:
+    """Return the joints of whose own torque much is left, the worst first."""
+    torque = found.score.torque
+    shares = found.score.errors[2] / torque
+    is_idle = (torque < IDLE * torque.max()) & (shares > 1.0)
+    shares[is_idle | np.isin(found.joints, found.still)] = 0.0
+    order = np.argsort(-shares)
+    return np.asarray(order[shares[order] > _UNEXPLAINED])
 
 
 def is_usable(found: Identified) -> bool:

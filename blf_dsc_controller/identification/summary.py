@@ -8,8 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from blf_dsc_controller.analysis.output import aligned
-from blf_dsc_controller.identification.identified import Identified, mass_and_centre
+from blf_dsc_controller.identification.identified import (
+    IDLE,
+    Identified,
+    mass_and_centre,
+)
 from blf_dsc_controller.identification.left_out import KINDS
+from blf_dsc_controller.identification.problems import unexplained_joints
 from blf_dsc_controller.identification.stiffness import LARGEST_TWIST
 from blf_dsc_controller.identification.values import (
     COULOMB,
@@ -29,9 +34,7 @@ UNSEEN = 0.5
 _LASTING = 3.0 * WINDOW  # s; noise is correlated over one window
 _LATE = 0.01  # s, longest plausible delay
 _LARGE_OFFSET = 0.1  # of the torque
-_HARDLY = 0.01  # of the largest torque: a joint whose torque is mostly noise
 _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not explain
-_POOR = 0.2  # of a joint's torque, error with which its values are not to be trusted
 
 _NOTHING = 1e-3  # of half of its interval, value that is printed as 0 ...
 _ROUNDING = 1e-9  # ... and value of a URDF
@@ -255,6 +258,7 @@ def _joint_notes(found: Identified) -> Iterator[str]:
     lasting: list[str] = []
     still: list[str] = []
     idle: list[str] = []
+    unexplained = unexplained_joints(found)
     poor: list[str] = []
     for i, joint in enumerate(found.chain.joints):
         name = joint.name
@@ -272,9 +276,9 @@ def _joint_notes(found: Identified) -> Iterator[str]:
             lasting.append(f'{of} ({found.lasting[i]:.2g} s)')
         if name in found.still:
             still.append(name)
-        elif share[i] > _ALL_WRONG and score.torque[i] < _HARDLY * score.torque.max():
+        elif share[i] > _ALL_WRONG and score.torque[i] < IDLE * score.torque.max():
             idle.append(f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit})')
-        elif share[i] > _POOR:
+        elif i in unexplained:
             poor.append(f'{100.0 * share[i]:.0f} % of the torque of {name}')
     for joints, ending in (
         (offsets, _OF_OFFSETS),

@@ -1,24 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Zeros of joints that are quarter turns from those of the URDF, as in a DH convention.
+"""Directions and zeros of joints that are not those of the URDF, as in a DH convention.
 
-Which ones are likely is seen from gravity alone, with the masses of the URDF: a search
-over the zeros of two joints at a time, since two that are off often hide each other.
-A joint whose zero gravity does not show, such as the first of an upright arm, keeps it.
-Gravity only proposes: see `identify`, which fits the arm to the best.
+Zeros are quarter turns away; a joint that counts the other way has its positions and its
+efforts negated.  Which ones are likely is seen from gravity alone, with the masses of
+the URDF: a search over the zeros of two joints at a time, since two that are off often
+hide each other, and over the direction of each joint.  A joint of which gravity shows
+nothing, such as the first of an upright arm, keeps both.  But one whose torque a fit
+leaves unexplained, such as a last joint with little weight, may count the other way,
+whatever gravity says.  All of this only proposes: see `identify`, which fits the arm to
+the best.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations, islice, product
+from itertools import chain, combinations, islice, product
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.mounting import gravity_columns
-from blf_dsc_controller.identification.on_disk import mapped
+from blf_dsc_controller.identification.on_disk import Samples, mapped
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.turns import TURN
 from blf_dsc_controller.identification.windows import COLUMNS, rows_of, split
@@ -28,32 +34,87 @@ _QUARTERS = (0, 1, 2, -1)  # turns over 4, of a zero
 _FRICTION = ('viscous', 'Coulomb')
 _POSTURES = 200  # at most, that are compared
 _ROUNDS = 3  # over all pairs of joints
-_CLEAR = 0.98  # times the cost, at most, for which a zero is moved
-_BETTER = 0.9  # times the cost, at most, of zeros that are fitted: masses may be rough
-_CANDIDATES = 2  # that are fitted
+_CLEAR = 0.98  # times the cost, at most, for which a joint counts in another way
+_BETTER = 0.9  # times the cost, at most, of ways that are fitted: masses may be rough
+_DIGITS = 6  # of a cost that are compared
+_CANDIDATES = 2  # that are fitted, of all joints and of unexplained ones each
+
+_Way = tuple[
+    int, int
+]  # sign and quarter turns: a joint of the URDF is at sign q + turns
+_Ways = tuple[_Way, ...]
+_AS_IS: _Way = (1, 0)
 
 
-def shifted(recording: Recording, offsets: Floats) -> Recording:
-    """Return the recording with offsets (n,) [rad] added to the positions."""
+class Counting(NamedTuple):
+    """How n joints count: those of the URDF are at signs q + offsets."""
+
+    signs: Floats  # (n,) 1 or -1, of positions and efforts
+    offsets: Floats  # (n,) rad
+
+    @property
+    def unlike(self) -> NDArray[np.intp]:
+        """Numbers of the joints that count otherwise than the URDF."""
+        return np.flatnonzero((self.signs < 0.0) | (self.offsets != 0.0))
+
+    def simpler(self, i: int) -> Iterator[Counting]:
+        """Yield other ways of counting, in which joint i is as in the URDF, or has its zero."""
+        for sign in dict.fromkeys((1.0, float(self.signs[i]))):
+            signs, offsets = self.signs.copy(), self.offsets.copy()
+            signs[i], offsets[i] = sign, 0.0
+            simpler = Counting(signs, offsets)
+            is_other = sign != self.signs[i] or self.offsets[i] != 0.0
+            if is_other and simpler.unlike.size:
+                yield simpler
+
+
+def converted(recording: Recording, counting: Counting) -> Recording:
+    """Return the recording as if it had been counted as the URDF does."""
+    signs, offsets = counting
+
+    def negated(values: Samples) -> Samples:
+        return mapped(recording.gap.size, lambda rows: signs * values[rows])
+
     q = recording.q
-    moved = mapped(recording.gap.size, lambda rows: q[rows] + offsets)
-    return recording._replace(q=moved)
+    return recording._replace(
+        q=mapped(recording.gap.size, lambda rows: signs * q[rows] + offsets),
+        torque=negated(recording.torque),
+        twist=None if recording.twist is None else negated(recording.twist),
+    )
 
 
-def likely_zeros(recording: Recording, robot: Robot) -> list[Floats]:
-    """Return offsets (n,) [rad] that may have to be added to the positions, the best first."""
-    chain = robot.chain(recording.joints)
-    rows = rows_of(recording, base_parameters(chain, robot.gravity).model)
+def likely_countings(
+    recording: Recording, robot: Robot, unexplained: Sequence[int]
+) -> list[Counting]:
+    """Return ways in which the joints may count, the best first.
+
+    `unexplained` are joints, the worst first, that may count the other way round
+    whatever gravity says.
+    """
+    arm = robot.chain(recording.joints)
+    rows = rows_of(recording, base_parameters(arm, robot.gravity).model)
     fit = split(rows).fit
     fit = fit[:: max(1, fit.size // _POSTURES)]
     q = rows.over_windows(lambda at: rows.q[at], rows.g)[fit]
     columns = rows.friction[fit][:, [COLUMNS.index(name) for name in _FRICTION]]
-    gravity = _Gravity(chain, np.array(robot.gravity), q, rows.u(0.0)[fit], columns)
-    turning = [i for i, joint in enumerate(chain.joints) if joint.kind != 'prismatic']
-    _search(gravity, turning, q.shape[1])
-    most = _BETTER * gravity.cost((0,) * q.shape[1])
+    gravity = _Gravity(arm, np.array(robot.gravity), q, rows.u(0.0)[fit], columns)
+    turning = [i for i, joint in enumerate(arm.joints) if joint.kind != 'prismatic']
+    as_is = (_AS_IS,) * q.shape[1]
+    _search(gravity, turning, as_is)
+    most = _BETTER * gravity.cost(as_is)
     likely = (each for each in gravity.best() if gravity.cost(each) < most)
-    return [0.25 * TURN * np.array(each) for each in islice(likely, _CANDIDATES)]
+    turned = (gravity.turned(as_is, i) for i in unexplained if i in turning)
+    ways = chain(islice(likely, _CANDIDATES), islice(turned, _CANDIDATES))
+    return [_counting(each) for each in dict.fromkeys(ways)]
+
+
+def _counting(ways: _Ways) -> Counting:
+    signs, quarters = np.array(ways, dtype=float).T
+    return Counting(signs, 0.25 * TURN * quarters)
+
+
+def _with(ways: _Ways, i: int, way: _Way) -> _Ways:
+    return (*ways[:i], way, *ways[i + 1 :])
 
 
 class _Gravity:
@@ -71,48 +132,92 @@ class _Gravity:
         joints = range(q.shape[1])
         self._bases = [np.linalg.qr(friction[:, :, i])[0] for i in joints]
         self._scale = np.maximum(np.linalg.norm(u, axis=0), 1e-9)
-        self._known: dict[tuple[int, ...], float] = {}
+        self._known: dict[_Ways, float] = {}
 
-    def cost(self, quarters: tuple[int, ...]) -> float:
-        """Return the squares that remain with other zeros."""
-        if quarters not in self._known:
-            q = self._q + 0.25 * TURN * np.array(quarters)
-            left = (self._u - gravity_columns(self._chain, q) @ self._g) / self._scale
+    def cost(self, ways: _Ways) -> float:
+        """Return the squares that remain if joints count in other ways."""
+        if ways not in self._known:
+            signs, offsets = _counting(ways)
+            weight = gravity_columns(self._chain, signs * self._q + offsets) @ self._g
+            left = (self._u - signs * weight) / self._scale
             explained = [Q.T @ own for Q, own in zip(self._bases, left.T, strict=True)]
-            self._known[quarters] = float(
+            self._known[ways] = float(
                 np.sum(left**2) - sum(each @ each for each in explained)
             )
-        return self._known[quarters]
+        return self._known[ways]
 
-    def simplest(self, quarters: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the zeros without moves that hardly matter."""
-        for i, moved in enumerate(quarters):
-            other = (*quarters[:i], 0, *quarters[i + 1 :])
-            if moved and _CLEAR * self.cost(other) <= self.cost(quarters):
-                quarters = other
-        return quarters
+    def turned(self, ways: _Ways, i: int) -> _Ways:
+        """Return the best ways in which joint i counts in the other direction."""
+        sign = -ways[i][0]
+        return min((_with(ways, i, (sign, k)) for k in _QUARTERS), key=self.cost)
 
-    def best(self) -> Iterator[tuple[int, ...]]:
-        """Yield those that were asked for, the best first, but each only in its simplest form."""
+    def better(self, ways: _Ways, other: _Ways) -> _Ways:
+        """Return the other ways if they are clearly better."""
+        return other if self.cost(other) < _CLEAR * self.cost(ways) else ways
+
+    def simplest(self, ways: _Ways) -> _Ways:
+        """Return the ways without what hardly matters: of each joint all, or its offset."""
+        for i, way in enumerate(ways):
+            for simpler in (_AS_IS, (way[0], 0)):
+                other = _with(ways, i, simpler)
+                if other != ways and _CLEAR * self.cost(other) <= self.cost(ways):
+                    ways = other
+                    break
+        return ways
+
+    def best(self) -> Iterator[_Ways]:
+        """Yield those that were asked for, the best first, but each only in its simplest form.
+
+        Each sign and offset must explain something: there are others with the same gravity.
+        """
         found = set()
-        for quarters in sorted(self._known, key=self._known.__getitem__):
-            simplest = self.simplest(quarters)
+        for ways in sorted(self._known, key=self._rank):
+            simplest = self.simplest(ways)
             if simplest not in found:
                 found.add(simplest)
                 yield simplest
 
+    def _rank(self, ways: _Ways) -> tuple[float, int]:
+        """Return what counts against these ways; of what is as good, directions are likelier."""
+        offsets = sum(quarter != 0 for _, quarter in ways)
+        moves = offsets + sum(sign < 0 for sign, _ in ways)
+        return round(self.cost(ways) / _BETTER**moves, _DIGITS), offsets
 
-def _search(gravity: _Gravity, turning: Sequence[int], n: int) -> None:
-    """Ask for the costs of likely zeros, in quarter turns, of n joints of which some turn."""
-    best = (0,) * n
-    for _ in range(_ROUNDS):
-        before = best
-        for pair in combinations(turning, 2):
-            for chosen in product(_QUARTERS, repeat=2):
-                other = list(best)
-                for joint, quarter in zip(pair, chosen, strict=True):
-                    other[joint] = quarter
-                if gravity.cost(tuple(other)) < _CLEAR * gravity.cost(best):
-                    best = tuple(other)
-        if best == before:
+
+def _search(gravity: _Gravity, turning: Sequence[int], as_is: _Ways) -> None:
+    """Ask for the costs of likely ways in which joints that turn may count.
+
+    Two searches: a direction may look like zeros of others, and the other way round.
+    """
+    for first, then in (
+        (_with_zeros, _with_directions),
+        (_with_directions, _with_zeros),
+    ):
+        ways = as_is
+        for _ in range(_ROUNDS):
+            before = ways
+            ways = then(gravity, turning, first(gravity, turning, ways))
+            if ways == before:
+                break
+
+
+def _with_zeros(gravity: _Gravity, turning: Sequence[int], ways: _Ways) -> _Ways:
+    """Return these ways with better zeros, of two joints at a time."""
+    for pair in combinations(turning, 2):
+        for quarters in product(_QUARTERS, repeat=2):
+            other = ways
+            for i, quarter in zip(pair, quarters, strict=True):
+                other = _with(other, i, (other[i][0], quarter))
+            ways = gravity.better(ways, other)
+    return ways
+
+
+def _with_directions(gravity: _Gravity, turning: Sequence[int], ways: _Ways) -> _Ways:
+    """Return these ways with better directions, first of the joint where it matters most."""
+    for _ in turning:
+        turned = (gravity.turned(ways, i) for i in turning)
+        other = gravity.better(ways, min(turned, key=gravity.cost))
+        if other == ways:
             break
+        ways = other
+    return ways

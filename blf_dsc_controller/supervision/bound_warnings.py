@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.tuning import SAMPLES, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION
+from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION, UNKNOWN_ROTOR
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
-from blf_dsc_controller.supervision.expected_errors import ExpectedErrors
+from blf_dsc_controller.supervision.expected_errors import (
+    ExpectedErrors,
+    guesses_rotors,
+)
 from blf_dsc_controller.supervision.gear_warnings import softer_by
 
 Floats = NDArray[np.float64]
@@ -99,7 +102,8 @@ def _of_unmodelled(
         )
     yield (
         f'{parameter}: friction{_assumed_friction(config)} and unmodelled torque '
-        f'(learning.residual_floor) alone are expected to move {config.joints[worst]} '
+        f'(learning.residual_floor){_guessed_rotors(config)} alone are expected to move '
+        f'{config.joints[worst]} '
         f'{errors[worst]:.2g} rad from its reference: {remedy}'
     )
 
@@ -112,6 +116,16 @@ def _assumed_friction(config: ControllerConfig) -> str:
         return ''
     share = f'{100.0 * UNKNOWN_FRICTION:g} %'
     return f' ({share} of the rated torque without robot.coulomb)'
+
+
+def _guessed_rotors(config: ControllerConfig) -> str:
+    """Return how heavy the drives may be, after a comma; empty if that is known."""
+    if not guesses_rotors(config):
+        return ''
+    return (
+        f', and drives up to {1.0 + UNKNOWN_ROTOR:g} times as heavy as guessed '
+        '(without robot.rotor_inertia),'
+    )
 
 
 def _of_pick_up(

@@ -124,14 +124,27 @@ def _unmodelled(config: ControllerConfig, ddq: Floats) -> Floats:
 
     With what commissioning has measured of friction, and not seen of inertia.  The law
     compensates the friction that it knows; the rest has either sign at a reversal.  Where
-    none is known or measured, some is expected.
+    none is known or measured, some is expected, and drives heavier than guessed.
     """
     robot, measured = config.robot, config.commissioning
     chain = robot.chain(config.joints)
     known = np.array(robot.friction(chain)['coulomb'])
     friction = measured.friction or tuple(robot.unknown_friction(chain))
     floor = np.array(config.learning.residual_floor) + at_reversal(known, friction)
-    return np.asarray(floor + np.abs(ddq) * np.array(measured.unseen_inertia or 0.0))
+    unseen = measured.unseen_inertia or tuple(robot.unknown_rotors(chain))
+    return np.asarray(floor + np.abs(ddq) * np.array(unseen))
+
+
+def guesses_rotors(config: ControllerConfig) -> bool:
+    """Whether the drives may be heavier than the inertia that is guessed for them."""
+    unknown = config.robot.unknown_rotors(config.robot.chain(config.joints))
+    return not config.commissioning.unseen_inertia and bool(unknown.any())
+
+
+def _causes(config: ControllerConfig) -> str:
+    if guesses_rotors(config):
+        return 'friction, unmodelled torque and drives heavier than guessed'
+    return 'friction and unmodelled torque'
 
 
 def expectation(config: ControllerConfig) -> str:
@@ -143,8 +156,7 @@ def expectation(config: ControllerConfig) -> str:
     joint = config.joints[int(errors.pick_up.argmax())]
     sensed = config.disturbance.observer_bandwidth > 0.0
     return (
-        f'{two_digits(usual)} mrad by friction and unmodelled torque; {two_digits(most)} '
-        f'mrad of {joint} when '
+        f'{two_digits(usual)} mrad by {_causes(config)}; {two_digits(most)} mrad of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
         + (', less what joint torque sensors show in time' if sensed else '')
     )
