@@ -17,7 +17,6 @@ import numpy as np
 
 from blf_dsc_controller.cli.drive import signals_to
 from blf_dsc_controller.cli.main import make_room
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.driven import Driven
@@ -36,6 +35,7 @@ from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.progress import print_notice
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
