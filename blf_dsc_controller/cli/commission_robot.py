@@ -55,6 +55,7 @@ def robot(
     with announced_compilation(print_notice):
         ArmController(config).close()
     with closing(driver):
+        print_notice(f'connecting to {options.robot}: some seconds')
         for remark in driver.connect():
             print_notice(remark)
         driven = Driven(driver, commissioning, folder)

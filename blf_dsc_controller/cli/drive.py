@@ -62,6 +62,7 @@ def drive(options: Namespace) -> int:
             ending.callback(ros.close)
         ending.enter_context(controller)
         ending.callback(driver.close)
+        print_notice(f'connecting to {options.robot}: some seconds')
         for remark in driver.connect():
             print_notice(remark)
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))

@@ -104,6 +104,7 @@ def _foresee(options: Namespace, robot: Robot) -> None:
 def _identified(options: Namespace, robot: Robot) -> Identified:
     """Return the identified arm, and say how far it is."""
     pick_up = options.payload is True
+    names = NameMap.parse(options.map)
     begun = (
         f'identifying from {_listed(options.bags)}: some ten seconds for a minute of a few '
         'joints, and up to some minutes where other loads or zeros have to be tried'
@@ -119,7 +120,7 @@ def _identified(options: Namespace, robot: Robot) -> Identified:
             options.bags,
             robot,
             options.namespace,
-            NameMap.parse(options.map),
+            names,
             options.effort,
             options.gains,
             None if pick_up else options.payload,
