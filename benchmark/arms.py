@@ -28,9 +28,9 @@ from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.cli import studies
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import CONTROLLER, LoopConfig, load_loop
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.monte_carlo import UNSEEN, torque_rows
 from blf_dsc_controller.studies.runs import cores

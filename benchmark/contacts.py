@@ -35,13 +35,13 @@ from blf_dsc_controller.analysis.figures import Picture, head
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.cli.result_folder import make_folder
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import FIRST_STAMP, Floats
 from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.studies import laws

@@ -30,12 +30,12 @@ from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, INK, MUTED, ORANGE
 from blf_dsc_controller.cli.result_folder import make_folder
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 from blf_dsc_controller.configuration.tool_bound import certified, tool_of
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import laws

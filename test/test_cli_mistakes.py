@@ -185,6 +185,79 @@ def test_wrong_name_is_answered_with_what_may_be_meant(
     assert (tmp_path / 'notes.md').read_text() == 'mine'
 
 
+ARM = '/**: {ros__parameters: {robot: {urdf: ur5e.urdf, tip: tool0}}}\n'
+GIVEN = '/**/blf_dsc_controller: {ros__parameters: '
+
+
+@pytest.mark.parametrize(
+    ('text', 'answer'),
+    [
+        (
+            f'{GIVEN}{{kp: [9.0], kd: [1.0]}}}}',
+            'did you mean feedback.joint_stiffness?',
+        ),
+        (f'{GIVEN}{{gains.kd: [1.0]}}}}', 'did you mean feedback.joint_damping?'),
+        (f'{GIVEN}{{robot.end_effector: tool0}}}}', 'did you mean robot.tip?'),
+        (f'{GIVEN}{{update_rate: 500}}}}', 'did you mean sample_time?'),
+        (
+            f'{ARM}{GIVEN}{{feedback: {{joint_stiffness: 900.0}}}}}}',
+            'write a list, like [900.0], an entry for each',
+        ),
+        (
+            f'{ARM}{GIVEN}{{reference.waypoints: [[0.0, 0.0]]}}}}',
+            'which ROS rejects: write one list, row after row',
+        ),
+        (
+            '<robot name="arm">\n  <link name="base"/>\n</robot>',
+            'it is XML: give a parameter file that names it',
+        ),
+        (
+            '<?xml version="1.0"?>\n<robot name="a: b"/>',
+            'it is XML: give a parameter file that names',
+        ),
+    ],
+)
+def test_what_other_packages_call_it_is_answered_with_our_name(
+    text, answer, tmp_path, capsys
+):
+    path = tmp_path / 'my.yaml'
+    path.write_text(text)
+    out = tmp_path / 'out'
+    assert main(['run', '--offline', '--config', str(path), '--out', str(out)]) == 1
+    assert answer in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ('table', 'urdf', 'answer'),
+    [
+        ('', 'two_link.urdf', 'run.csv is empty: it has neither names nor numbers'),
+        ('time,q1,tau1\n0,1,2\n1,1,2\n', 'fixed.urdf', 'no joint moves: '),
+        (
+            'time,q1,q2,tau1,tau2\n'
+            + ''.join(f'{k / 50},1,1,2,2\n' for k in range(99)),
+            'two_link.urdf',
+            'the recording lasts 1.96 s; record at least 5 s',
+        ),
+    ],
+)
+def test_recording_that_shows_nothing_is_told(
+    table, urdf, answer, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'run.csv').write_text(table)
+    (tmp_path / 'fixed.urdf').write_text('<robot name="a"><link name="b"/></robot>')
+    assert main(['identify', 'run.csv', '--urdf', urdf, '--out', 'new.urdf']) == 1
+    assert answer in capsys.readouterr().err
+
+
+def test_mapping_that_is_none_is_told_before_work_is_announced(capsys):
+    words = 'identify run.csv --urdf two_link.urdf --map q --out new.urdf'
+    assert main(words.split()) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert '--map q: one side is missing' in line
+
+
 @pytest.mark.parametrize(
     ('command', 'what'),
     [('report', 'drawn'), ('replay', 'run through the controller again')],

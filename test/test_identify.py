@@ -262,7 +262,7 @@ def test_bags_that_cannot_be_identified_are_rejected_for_their_reason(states, tm
             'joints': tuple(f'ur_{i}' for i in range(7)),
         },
         "joint 'panda_joint4' is not in": {'states': some, 'joints': inner},
-        'the bag holds 2 s': {'states': states[:2001]},
+        'the recording lasts 2 s': {'states': states[:2001]},
         'at least one in 0.02 s': {'states': some, 'period': 0.1},
         'no joint moves': {'states': still},
     }

@@ -243,6 +243,41 @@ def test_commands_that_arrive_are_not_said_to_have_no_effect(effort):
     assert 'effort controller' not in guard.supervisor.text
 
 
+@pytest.mark.parametrize(
+    ('preset', 'effort', 'factor', 'payload'),
+    [('panda', 'unknown', 0.5, 0.0), ('ur5e_rigid', 'whole', 1.0, 20.0)],
+)
+def test_weak_drives_are_named_where_no_effort_shows_what_they_give(
+    preset, effort, factor, payload
+):
+    """Without efforts a load and a weak drive look alike; with them only the load is named."""
+    loop = load_loop(preset)
+    given = {
+        'robot.effort': effort,
+        'safety.first_torque': 'send',
+        'disturbance.observer_bandwidth': 0.0,  # it needs efforts
+    }
+    load = {'events.begin': [0.5], 'events.duration': [0.0]}
+    arm = {'duration': 0.0, **load, 'events.payload': [payload]}
+    guard, *_ = stopped_by(
+        change(loop.controller, given),
+        change(loop.plant, arm),
+        reach=lambda torque: factor * torque,
+        at=0.0,
+        after=0.1,
+    )
+    assert guard.supervisor.reason is Reason.OUTSIDE_BOUND
+    found = re.search(
+        r'; it is sent (\S+) N m, where the model needs (\S+) N m at rest, and leaves',
+        guard.supervisor.text,
+    )
+    sent, needed = map(float, found.groups())
+    assert abs(sent) > 2.0 * abs(needed)  # the torque of gravity, and what brakes
+    assert 'it carries more than the model knows' in guard.supervisor.text
+    named = 'its drive gives less than it is sent (torque constant'
+    assert (named in guard.supervisor.text) == (effort == 'unknown')
+
+
 def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     """A drive of the wrong sign: damping drives the arm, and so does what is observed."""
     rig = Rig({'safety.torque': 'hold_gravity'})

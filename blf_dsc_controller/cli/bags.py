@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
@@ -16,6 +15,7 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import Run
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def export(options: Namespace) -> None:
     """Write a bag as a table."""
     table.check_format(options.out)  # before a large bag is read
     make_room(options.out, force=options.force)
+    _announce([options.bag], 'written as a table')
     run = _run(options)
     columns = table.export(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
@@ -73,6 +74,7 @@ def plot(options: Namespace) -> None:
 
     names = ('summary.json', *figures.NAMES)
     make_room(*(options.out / name for name in names), force=options.force)
+    _announce([options.bag], 'drawn')
     run = _run(options)
     metrics = measure(run)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -89,6 +91,7 @@ def recover(options: Namespace) -> int:
     """
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
+    _announce([options.bag], 'read and written again')
     messages, losses = recovery.recover(options.bag, out)
     for topic, count in messages.items():
         print(f'{topic}: {count} messages')
@@ -130,14 +133,14 @@ def speed_text(times: float) -> str:
 
 
 def _announce(bags: Sequence[Path], what: str) -> None:
-    """Say to stderr what is done with bags, if that takes more than some seconds."""
+    """Say what is done with bags, if that takes more than some seconds."""
     files = [
         file for bag in bags for file in ([bag] if bag.is_file() else bag.glob('*'))
     ]
     size = sum(file.stat().st_size for file in files if file.is_file())
     if size > _LARGE:
         listed = ', '.join(map(str, bags))
-        print(f'{listed}: {size / 1e6:.0f} MB are {what}', file=sys.stderr, flush=True)
+        print_notice(f'{listed}: {size / 1e6:.0f} MB are {what}')
 
 
 def play(options: Namespace) -> None:

@@ -10,14 +10,11 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from tqdm import tqdm
-
 from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.commission_robot import measured_on, proven_on, robot
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.ros_check import require_ros
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import files, page, simulated
 from blf_dsc_controller.commissioning.commissioning import Commissioned
 from blf_dsc_controller.commissioning.own_loop import (
@@ -37,6 +34,7 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.progress import print_notice, steps
 from blf_dsc_controller.supervision.digits import two_digits
 
 _WIDTH = 98
@@ -79,6 +77,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
     except EndedError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
+    print_notice('choosing the gains by what was measured: some ten seconds')
     found = commissioning.result(runs)
     print(page.table(found))  # also if the gains are too soft for any bound: an error
     lines = _told(options, found, missing)
@@ -200,8 +199,13 @@ def _simulated(
     names, runs, missing = [], [], []
     with announced_compilation(print_notice):
         made = simulated.runs_of(commissioning, loop)
-        bar = tqdm(made, total=len(planned) + 1, unit='run', leave=False, disable=None)
-        for name, run in bar:
+        total = len(planned) + 1
+        longest = max(each.duration for each in planned)
+        begun = (
+            f'simulating {total} runs of {longest:g} s, at some ten times real time; where '
+            'noise or friction hides much, a run is repeated'
+        )
+        for name, run in steps(made, total, 'run', begun):
             if isinstance(run, BlfDscError):
                 missing.append(page.not_measured(name, run))
                 print(missing[-1])
@@ -229,6 +233,9 @@ def _told(
 def _prove(path: Path) -> None:
     """Say what the simulated arm does with its new gains."""
     loop = load_loop(path)
+    print_notice(
+        'simulating the arm with these gains along its own motion: some seconds'
+    )
     proof = simulated.proof(loop)
     if proof.stop:
         print(

@@ -17,7 +17,6 @@ import numpy as np
 
 from blf_dsc_controller.cli.drive import signals_to
 from blf_dsc_controller.cli.main import make_room
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.driven import Driven
@@ -37,6 +36,7 @@ from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.progress import print_notice
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -56,6 +56,7 @@ def robot(
     with announced_compilation(print_notice):
         ArmController(config).close()
     with closing(driver):
+        print_notice(f'connecting to {options.robot}: some seconds')
         for remark in driver.connect():
             print_notice(remark)
         driven = Driven(driver, commissioning, folder)

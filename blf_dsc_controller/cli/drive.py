@@ -16,7 +16,7 @@ from blf_dsc_controller.cli.result_folder import (
     keep,
 )
 from blf_dsc_controller.cli.ros_check import require_ros
-from blf_dsc_controller.cli.run import STOPPED, print_notice
+from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
@@ -28,6 +28,7 @@ from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
 from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
@@ -61,6 +62,7 @@ def drive(options: Namespace) -> int:
             ending.callback(ros.close)
         ending.enter_context(controller)
         ending.callback(driver.close)
+        print_notice(f'connecting to {options.robot}: some seconds')
         for remark in driver.connect():
             print_notice(remark)
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))

@@ -6,11 +6,10 @@ from __future__ import annotations
 import textwrap
 from argparse import Namespace
 from collections.abc import Sequence
+from contextlib import closing
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryFile
-
-from tqdm import tqdm
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import NameMap
@@ -47,6 +46,7 @@ from blf_dsc_controller.identification.summary import (
     notes_of,
     stiffness_table,
 )
+from blf_dsc_controller.progress import Stages, print_notice
 from blf_dsc_controller.writing import write_text
 
 UNUSABLE = 3
@@ -79,6 +79,7 @@ def identify(options: Namespace) -> int:
     tables = [*load_table(found), joints, *stiffness, errors_table(found)]
     print('\n\n'.join([*facts[:2], bodies, base, *tables, *facts[2:]]))
     if options.report:
+        print_notice(f'drawing {options.report}: some seconds')
         # slow: its libraries
         from blf_dsc_controller.identification.page import write_identified
 
@@ -101,21 +102,25 @@ def _foresee(options: Namespace, robot: Robot) -> None:
 
 
 def _identified(options: Namespace, robot: Robot) -> Identified:
-    """Return the identified arm, with a progress bar on a terminal."""
+    """Return the identified arm, and say how far it is."""
     pick_up = options.payload is True
-    with tqdm(total=len(STAGES), unit='stage', leave=False, disable=None) as bar:
+    names = NameMap.parse(options.map)
+    begun = (
+        f'identifying from {_listed(options.bags)}: some ten seconds for a minute of a few '
+        'joints, and up to some minutes where other loads or zeros have to be tried'
+    )
+    with closing(Stages(STAGES, begun)) as stages:
 
         def begin(stage: str) -> None:
             if stage == STAGES[1]:  # URDF and recordings have been read, and are right
                 _refuse_no_output(options)
-            bar.set_description(stage)
-            bar.update(STAGES.index(stage) - bar.n)
+            stages.begin(stage)
 
         return identify_bag(
             options.bags,
             robot,
             options.namespace,
-            NameMap.parse(options.map),
+            names,
             options.effort,
             options.gains,
             None if pick_up else options.payload,

@@ -39,6 +39,7 @@ from blf_dsc_controller.configuration.plant import PlantConfig, Truth
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateDecoder
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints, plan_start
 from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.simulation.loop import simulate_into_bag
@@ -54,11 +55,6 @@ STOPPED = 5
 
 _ANY_TIMEOUT = 1.0  # s
 _DURATION = 60.0  # s, if neither the file nor an option sets it
-
-
-def print_notice(notice: str) -> None:
-    """Print a notice to stderr, since it is not part of the results."""
-    print(notice, file=sys.stderr, flush=True)
 
 
 def run(options: Namespace) -> int:
@@ -80,6 +76,7 @@ def run(options: Namespace) -> int:
     config = config._replace(recorder=change(config.recorder, recorder))
     dump(out / 'config.yaml', config.by_node)
     completed = True
+    print_notice(_begun(config.plant, offline=options.offline))
     if options.offline:
         with announced_compilation(print_notice):
             simulate_into_bag(
@@ -103,6 +100,15 @@ def run(options: Namespace) -> int:
     if not completed:
         return INTERRUPTED
     return STOPPED if stopped else 0
+
+
+def _begun(plant: PlantConfig, *, offline: bool) -> str:
+    """Return what begins, and how long it takes."""
+    if offline:
+        return f'simulating {plant.duration:g} s, at some ten times real time'
+    length = f'{plant.duration:g} s' if plant.duration else 'until Ctrl-C'
+    clock = 'as fast as it goes' if plant.mode == 'lockstep' else 'by the wall clock'
+    return f'starting the nodes, some seconds; then they run {length}, {clock}'
 
 
 def loop_configuration(options: Namespace) -> LoopConfig:
@@ -185,7 +191,7 @@ def _report(out: Path) -> bool:
     from blf_dsc_controller.analysis.metrics_table import format_table
     from blf_dsc_controller.analysis.output import write_json
 
-    print_notice('reading the bag and drawing the pictures')
+    print_notice('reading the bag and drawing the pictures: some seconds')
     content = read_content(out / BAG)
     recorded = recorded_run(content)
     metrics = measure(recorded)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from argparse import Namespace
 from concurrent.futures import Executor
 from pathlib import Path
@@ -13,12 +14,12 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.output import write_json
 from blf_dsc_controller.cli.result_folder import make_folder
-from blf_dsc_controller.cli.run import print_notice
 from blf_dsc_controller.compiled.announcement import announced_compilation
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.studies import laws, report, runs
 from blf_dsc_controller.studies.monte_carlo import load_study
 
-_PAUSE_IN_A_LOG = 10.0  # s between two updates of the bar
+_PAUSE_IN_A_LOG = 10.0  # s between two lines
 
 
 def arms(options: Namespace) -> None:
@@ -84,12 +85,15 @@ def _compute(store: runs.Store, chunks: list[range], executor: Executor) -> None
     if done:
         print(f'{done} of {total} runs are done already', file=sys.stderr)
     lost = 0
-    pause = 0.5 if sys.stderr.isatty() else _PAUSE_IN_A_LOG
-    with tqdm(
-        total=total, initial=done, unit='run', desc='monte carlo', mininterval=pause
-    ) as bar:
+    print_notice(f'simulating {total - done} runs: the slower, the more joints')
+    told = time.monotonic()
+    with tqdm(total=total, initial=done, unit='run', disable=None) as bar:
         for chunk, columns in runs.compute(store.study, chunks, executor):
             store.keep(chunk, columns)
             lost += int(np.count_nonzero(columns['outcome'] != runs.KEPT))
             bar.set_postfix_str(f'{lost} did not keep the bound', refresh=False)
             bar.update(len(chunk))
+            done += len(chunk)
+            if bar.disable and time.monotonic() - told > _PAUSE_IN_A_LOG:
+                told = time.monotonic()
+                print_notice(f'{done} of {total} runs, {lost} did not keep the bound')

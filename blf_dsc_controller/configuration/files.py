@@ -101,7 +101,7 @@ def parse(text: str) -> tuple[Section, ...]:
     sections: dict[tuple[str, ...], Section] = {}
     for names, node in _leaves(root, ()):
         if _MARK not in names:
-            raise _error(node, _outside(names))
+            raise _error(node, _of_xml(text) or _outside(names))
         at = names.index(_MARK)
         pattern = f'/{"/".join(names[:at]).removeprefix("/")}'
         name = '.'.join(names[at + 1 :])
@@ -119,10 +119,17 @@ def parse(text: str) -> tuple[Section, ...]:
     return tuple(sections.values())
 
 
+def _of_xml(text: str) -> str:
+    """Return what to do about XML in the place of a parameter file; empty: it is none."""
+    if not text.lstrip().startswith('<'):
+        return ''
+    return 'it is XML: give a parameter file that names it as robot.urdf'
+
+
 def _remedy(text: str, error: yaml.MarkedYAMLError) -> str:
     """Return what to do about frequent mistakes in YAML."""
-    if text.lstrip().startswith('<'):
-        return '; it is XML: give a parameter file that names it as robot.urdf'
+    if xml := _of_xml(text):
+        return f'; {xml}'
     mark = error.problem_mark
     if mark is not None and mark.buffer and mark.buffer[mark.pointer :][:1] == '\t':
         return ': indent with spaces, not with tabs'
@@ -207,7 +214,10 @@ def _value(node: yaml.Node, name: str) -> object:
 
 def _scalar(node: yaml.Node, name: str) -> object:
     if not isinstance(node, yaml.ScalarNode):
-        raise _error(node, f'{name} has a list in a list, which ROS rejects')
+        raise _error(
+            node,
+            f'{name} has a list in a list, which ROS rejects: write one list, row after row',
+        )
     if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
         return node.value
     if not node.value:

@@ -499,10 +499,12 @@ def _is_of_others(section: Section) -> bool:
 def with_tables(page: str) -> str:
     """Return the page of all parameters; what is above its tables stays."""
     above = page.partition('\n## ')[0]
-    sections = (
-        _section(node, parameters(cls)) + (_optional() if node == CONTROLLER else '')
+    tables: dict[str, str] = {}
+    sections = [
+        _section(node, parameters(cls), tables)
+        + (_optional() if node == CONTROLLER else '')
         for node, cls in NODES.items()
-    )
+    ]
     return above + ''.join(sections)
 
 
@@ -529,17 +531,50 @@ def _of_group(heading: str, text: str, group: str, cls: type) -> str:
     return f'\n### {heading}\n\n{text}\n\n{_table(params)}'
 
 
-def _section(node: str, params: Iterable[Parameter]) -> str:
-    """Return a node's section: a table of its parameters for each group."""
+def _section(node: str, params: Iterable[Parameter], earlier: dict[str, str]) -> str:
+    """Return a node's section: a table of its parameters for each group.
+
+    One that is among the `earlier` tables, each with its heading, is linked to instead.
+    """
     groups: dict[str, list[Parameter]] = {}
     for param in params:
         group, _, _ = param.name.rpartition('.')
         groups.setdefault(group, []).append(param)
     tables = [f'\n## {node}\n']
     for group, members in groups.items():
-        heading = f'\n### {node}: {group}\n' if group else ''
-        tables.append(f'{heading}\n{_table(members)}')
+        title = f'{node}: {group}'
+        heading = f'\n### {title}\n' if group else ''
+        table = _table(members)
+        if other := earlier.get(table):
+            table = f'As [{other}](#{_anchor(other)}).\n'
+        earlier.setdefault(table, title)
+        tables.append(f'{heading}\n{table}')
     return ''.join(tables)
+
+
+_SHORT = (
+    (' array', 's'),
+    ('; entries: joints', ' per joint'),
+    ('; may be empty', ' or []'),
+    ('at least ', '≥ '),
+    ('at most ', '≤ '),
+    ('above ', '> '),
+    ('below ', '< '),
+    (' and ', ', '),
+    ('one of ', ''),
+)
+"""Shorter words for types and ranges, as the head of the page explains them."""
+
+
+def _shortened(kind: str) -> str:
+    for long, short in _SHORT:
+        kind = kind.replace(long, short)
+    return kind
+
+
+def _anchor(heading: str) -> str:
+    """Return how the site links to a heading."""
+    return heading.lower().replace(': ', '-').replace('_', '-')
 
 
 def _table(params: Iterable[Parameter]) -> str:
@@ -555,7 +590,7 @@ def _row(param: Parameter) -> str:
         param.unit,
         '' if param.read_only else '•',
         f'{param.description}{symbol}',
-        kind,
+        _shortened(kind),
     )
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
 

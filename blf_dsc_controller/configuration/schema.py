@@ -110,7 +110,9 @@ class Parameter:
         article = 'an' if self.type is int and not self.is_array else 'a'
         expected = f'but {article} {self.kind} is expected'
         if self.is_array and not isinstance(given, _ARRAYS):
-            expected += f': write a list, like {format_value(self.default)}'
+            example = self.default or ((given,) if isinstance(given, self.type) else ())
+            each = '' if self.default else ', an entry for each'
+            expected += f': write a list, like {format_value(example)}{each}'
             yield f'{self.name}: got {format_value(given)}, {expected}'
             return
         entries = list(given) if self.is_array else [given]
@@ -316,8 +318,28 @@ def unknown_names(
             )
 
 
+_ELSEWHERE = {
+    'kp': 'feedback.joint_stiffness',
+    'kd': 'feedback.joint_damping',
+    'end_effector': 'robot.tip',
+    'ee_link': 'robot.tip',
+    'tip_link': 'robot.tip',
+    'base_link': 'robot.base',
+    'urdf': 'robot.urdf',
+    'robot_description': 'robot.urdf',
+    'effort_limits': 'torque.limit',
+    'update_rate': 'sample_time',
+    'rate': 'sample_time',
+}
+"""What other packages call a parameter, by the last part of its name there."""
+
+
 def unknown(name: str, known: Iterable[str]) -> str:
     """Return the problem for an unknown name, suggesting the closest known one."""
+    known = [*known]
+    ours = _ELSEWHERE.get(name.rpartition('.')[2].lower())
+    if ours in known:
+        return f'{name}: unknown parameter, did you mean {ours}?'
     return f'{name}: unknown parameter{suggestion(name, known)}'
 
 

@@ -18,7 +18,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from blf_dsc_controller.arms.friction import slidings
 from blf_dsc_controller.arms.model import regressors_at
@@ -28,6 +27,7 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.estimate import prior_covariance
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.recording import Recording
+from blf_dsc_controller.progress import steps
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
 
@@ -320,7 +320,8 @@ def search(problem: ExcitationProblem, seed: int, starts: int) -> np.ndarray:
     random = np.random.default_rng(seed)
     best: np.ndarray | None = None
     most = -np.inf
-    for _ in tqdm(range(starts), desc='searching', unit='start', disable=None):
+    begun = f'searching from {starts} starts: up to a minute or two for each'
+    for _ in steps(range(starts), starts, 'start', begun):
         x = minimize(
             cost,
             problem.start(random),

@@ -68,7 +68,7 @@ def read_table(
     tree = Tree.of(text)
     others = dict(names.joints)
     given = {kind: others.pop(kind, '') for kind in KINDS}
-    trunk = tuple(joints) or tree.trunk()
+    trunk = tuple(joints) or tree.trunk() or tree.only_chain()
     theirs = NameMap(joints=others).joints_of(trunk)
     columns = choose_columns(path, table.names, given, theirs, planned=planned)
     if joints:

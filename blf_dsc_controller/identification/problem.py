@@ -67,7 +67,7 @@ def problem_of(
     """Return the problem of a recording; arguments and errors are those of `identify_arm`."""
     if recording.duration < _SHORTEST:
         raise BlfDscError(
-            f'the bag holds {recording.duration:.3g} s; record at least {_SHORTEST:g} s'
+            f'the recording lasts {recording.duration:.3g} s; record at least {_SHORTEST:g} s'
         )
     problem = _as_recorded(recording, robot, effort, load=picked_up is not None)
     if effort != 'without-gravity':

@@ -163,6 +163,8 @@ def text_table(path: Path) -> TextTable:
     if first is None:
         for number, line in enumerate(head, 1):
             _check_groups(path, number, _layout_of(line).cells(line))
+        if not head:
+            raise BlfDscError(f'{path} is empty: it has neither names nor numbers')
         raise BlfDscError(
             f'{path} has no numbers in its first {len(head)} lines, so it is no table: a '
             'row begins with a number, and dates and lists in cells are not read'

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -27,6 +26,7 @@ from blf_dsc_controller.configuration.schema import change, suggestion
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.inertia import joint_inertia
 from blf_dsc_controller.law.samples import sample_columns
+from blf_dsc_controller.progress import steps
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import (
@@ -347,7 +347,8 @@ def compare(
     with ProcessPoolExecutor(
         cores(), initializer=chosen_laws, initargs=(laws,)
     ) as pool:
-        for arm, name in tqdm(rows, unit='law'):
+        begun = f'tuning and running {len(rows)} laws: some minutes for each'
+        for arm, name in steps(rows, len(rows), 'law', begun):
             results[arm][name] = _tuned_and_run(arm, name, pool)
     write_json(results, folder / 'figures.json')
     return results

@@ -131,7 +131,8 @@ class SafeStop:
         return (
             f'the torque of joint {self._joints[worst]!r} has changed by '
             f'{change[worst]:+.4g} N m since, but the arm has not accelerated: release the brakes, '
-            'activate the effort controller, or free the arm'
+            'activate the effort controller, or free the arm; a joint that sticks does so, too, if '
+            'its drive gives less than it is sent'
         )
 
     def _load_at_stop(self, reason: Reason) -> Vector:

@@ -14,6 +14,7 @@ from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.not_sensors import is_off
 from blf_dsc_controller.supervision.stop_cause import StopCause
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
@@ -25,6 +26,7 @@ Vector = NDArray[np.float64]
 _LACKS, _LACKS_NOW = 0.05, 0.1
 _LIGHT = 0.5  # of the assumed inertia: less is worth saying
 _NOTHING = 0.02  # of it: no drive has so little
+_AGAINST = 0.1  # of the torque limit, beyond the torque of the model at rest
 # s without saturation that make up for one with it: more than a fifth adds up
 _RELIEF = 4
 
@@ -175,7 +177,9 @@ class SampleCheck:
         worst = int(np.argmax(np.abs(change) / limit))
         text = (
             f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} N m, '
-            'but no joint has moved: release the brakes, and activate the effort controller'
+            'but no joint has moved: release the brakes, and activate the effort controller; if '
+            'neither is it, the drives give less than they are sent, or the joints stick: correct '
+            'torque constant or gear ratio, or give robot.coulomb'
         )
         return Fault(Reason.NO_EFFECT, text)
 
@@ -230,7 +234,7 @@ class SampleCheck:
             text += f'; {in_words(at_tool)}'
         given = self._with_cause(text)
         if given == text:
-            given += self._lightness(worst)
+            given += self._lightness(worst) or self._imbalance(worst)
         return Fault(Reason.OUTSIDE_BOUND, given)
 
     def _with_cause(self, text: str) -> str:
@@ -255,6 +259,33 @@ class SampleCheck:
             f'; its drive seems to have {assumed + error:.2g} kg m^2 instead of the assumed '
             f'{assumed:.2g}, too little for these gains: give robot.rotor_inertia, or a wider '
             'bound'
+        )
+
+    def _imbalance(self, joint: int) -> str:
+        """Return what may be wrong if a joint leaves against the torque that it is sent.
+
+        A weak drive and a load look alike, unless efforts show what the drive gives.
+        """
+        controller = self._controller
+        sample = controller.sample
+        rest = np.zeros(len(self._joints))
+        q = sample.qr + sample.xi1
+        model = needed_torque(controller.settings, self.estimate, q, rest, rest)[joint]
+        sent = sample.torque[joint]
+        least = _AGAINST * controller.settings.torque.limit[joint]
+        is_against = -np.sign(sample.xi1[joint]) * (sent - model) > least
+        if not is_against or (sent - model) * model < -least * abs(model):
+            return ''
+        drive = (
+            ''
+            if controller.checks.effect.compares[0] == 1.0
+            else ', its drive gives less than it is sent (torque constant, gear ratio, '
+            'current limit)'
+        )
+        return (
+            f'; it is sent {sent:.3g} N m, where the model needs {model:.3g} N m at rest, and '
+            f'leaves all the same: it carries more than the model knows{drive}, or something '
+            'holds it'
         )
 
     def _saturated(self, dt: float) -> Fault | None:

@@ -92,7 +92,7 @@ class StopCause:
                 f'{demands}, and torque.rate_limit delays what it gets: raise it to what the drive '
                 'bears, or lower the gains'
             )
-        return (
-            f'{demands}: follow a slower reference, carry less, or give the true limit as '
-            'torque.limit'
-        )
+        remedies = 'follow a slower reference, carry less, or give the true limit as torque.limit'
+        if self._controller.checks.effect.compares[0] == 0.0:  # no effort shows it
+            remedies += '; a drive that gives less than it is sent demands more, too'
+        return f'{demands}: {remedies}'
