@@ -258,6 +258,7 @@ UNLIMITED = URDF.replace('effort="12"', 'effort="0"')
 PLACEHOLDERS = re.sub('effort="[0-9.]+"', 'effort="2000"', URDF)
 STICKY = URDF.replace('<limit', '<dynamics damping="1" friction="4" /><limit')
 BARE = {'robot.viscous': [], 'robot.coulomb': []}
+DRIVES = {'robot.rotor_inertia': [0.2175] * 4 + [0.03] * 3}  # known to be as guessed
 
 
 @pytest.mark.parametrize(
@@ -305,7 +306,7 @@ def gains(stiffness, damping):
 
 def test_the_bound_that_a_warning_asks_for_is_wide_enough():
     """Friction that nobody stated moves the arm beyond the bound, before any load does."""
-    light = {'robot.payload': 0.01, **gains(50.0, 5.0), **BARE}
+    light = {'robot.payload': 0.01, **gains(50.0, 5.0), **BARE, **DRIVES}
     given = {**light, 'barrier.bound': [0.01] * 7}
     (text,) = config_warnings(arm_of('panda_rigid', changes=given))
     assert 'alone are expected to move' in text
@@ -323,11 +324,35 @@ def test_the_bound_that_a_warning_asks_for_is_wide_enough():
     ],
 )
 def test_a_wide_bound_of_soft_gains_is_not_taken_for_degrees(changes, remedy):
-    given = {**gains(50.0, 5.0), 'barrier.bound': [1.1] * 7, **changes}
+    given = {**gains(50.0, 5.0), 'barrier.bound': [1.1] * 7, **DRIVES, **changes}
     found = config_warnings(arm_of('panda_rigid', changes=given))
     (text,) = [each for each in found if ' rad is ' in each]
     assert text.startswith('barrier.bound: 1.1 rad is 63 degrees and bounds nothing')
     assert remedy in text
+
+
+def test_drives_may_be_heavier_than_guessed_if_nothing_hides_or_tells_them():
+    guessed = load_loop('ur5e').controller
+    guess = guessed.robot.rotors(guessed.robot.chain(guessed.joints)).tolist()
+    told = change(guessed, {'robot.rotor_inertia': guess})
+    hidden = change(guessed, {'robot.torque_loop': True})
+    expected, *others = (
+        expected_errors(each, settings_of_config(each))
+        for each in (guessed, told, hidden)
+    )
+    # on UR5es with five times the guess, the last joint was 6.8 to 7.7 mrad off
+    assert 6.8e-3 < expected.unmodelled[-1] < 9e-3
+    for each in others:
+        np.testing.assert_array_equal(each.pick_up, expected.pick_up)
+        assert (each.unmodelled < 0.7 * expected.unmodelled).all()
+    assert 'drives heavier than guessed' in expectation(guessed)
+    assert 'drives' not in expectation(told)
+    narrow, known = (
+        change(each, {'barrier.bound': [0.005] * 6}) for each in (guessed, told)
+    )
+    heavy = 'drives up to 7 times as heavy as guessed (without robot.rotor_inertia)'
+    assert heavy in '\n'.join(config_warnings(narrow))
+    assert 'drives' not in '\n'.join(config_warnings(known))
 
 
 def test_neither_gains_nor_the_residual_floor_rest_on_placeholders():
