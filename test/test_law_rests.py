@@ -42,6 +42,16 @@ def test_first_stop_of_an_arm_whose_drives_are_heavier_than_guessed_is_no_change
     assert run_of(study, 'ur5e', motion, seed, 0.0).changes.size == 0
 
 
+def test_load_of_such_an_arm_is_found_although_it_has_moved_for_a_second_only(
+    study, monkeypatch
+):
+    """1.5 kg.  No change was found within 3.5 s: the wrong drives had raised the noise."""
+    monkeypatch.setattr(study, 'DURATION', 2.5)
+    monkeypatch.setattr(study, 'PICK_UP', 1.0)
+    run = run_of(study, 'ur5e', 'sinusoids', 1, 1.5)
+    assert run.changes == pytest.approx([study.PICK_UP + 0.3], abs=0.1)
+
+
 def test_true_load_is_found_as_soon_in_the_same_insertion(study):
     """It was found after 0.13 s, among seven changes that were none."""
     run = run_of(study, 'ur5e_rigid', 'insertion', 10, study.LOAD)

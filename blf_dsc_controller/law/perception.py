@@ -168,7 +168,7 @@ def weigh(
         settings.weighing,
         state.weighing,
         signals.weighing,
-        Prior(settings.initial_estimate, settings.information),
+        Prior(settings.initial_estimate, settings.row_information),
         signals.row.Xu,
         signals.weighing.shapes,
         state.friction.shape_lags[0, 2],
