@@ -10,6 +10,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -27,6 +28,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.drive import script_process
 from blf_dsc_controller.drive.arguments import checked_overrides
 from blf_dsc_controller.drive.driver import ReflexError, disagreements
 from blf_dsc_controller.drive.script import Script
@@ -37,8 +39,9 @@ from blf_dsc_controller.errors import (
     MotionFailedError,
     NotInTimeError,
 )
-from blf_dsc_controller.messages import script_link
+from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.topics import TARGETS
 
 # rad: the bound of the preset, to which any error of the arm adds up
@@ -485,6 +488,24 @@ def test_a_start_that_fails_says_why(config, robot, message):
     with pytest.raises(DriveError) as raised:
         blf.Drive(config, robot=robot)
     assert message in str(raised.value)
+
+
+def test_a_mistake_that_nobody_foresaw_is_told_to_the_script(monkeypatch):
+    """Before its process ends with the traceback."""
+
+    def fail(*_):
+        raise ZeroDivisionError('a mistake')
+
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr(script_process, '_awaited', fail)
+    monkeypatch.setattr(sys, 'argv', ['script_process', str(theirs.detach())])
+    with pytest.raises(ZeroDivisionError):
+        script_process.main()
+    link = Link(ours)
+    ((kind, content),) = link.messages()
+    link.close()
+    assert kind == script_link.FAILED
+    assert 'ZeroDivisionError: a mistake' in topic_link.decode(content)
 
 
 # Without a function or a guard, as in a notebook.
