@@ -19,7 +19,7 @@ from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import next_record
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.bad_values import _sizes
+from blf_dsc_controller.identification.bad_values import _apart, _sizes
 from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.reading import read_recording
 
@@ -775,3 +775,12 @@ def test_sizes_of_torques_are_those_of_both_signs_but_for_zero():
     torque = np.array([[0.0, -3.0], [-2.0, 0.0], [1.0, -5.0]])
     least, most = _sizes(torque, 3)
     assert (least.tolist(), most.tolist()) == ([1.0, 3.0], [2.0, 5.0])
+
+
+@pytest.mark.parametrize('centre', [0.0, 2000.0, -2000.0])
+def test_value_far_from_all_others_is_found_wherever_they_are(centre):
+    """Nothing, for instance, among encoder counts."""
+    others = centre + np.array([1.0, -1.0, 0.5, 0.0])
+    found = _apart(np.append(others, centre - 1500.0))
+    assert found.value == centre - 1500.0
+    assert found.distance == pytest.approx(1500.0, abs=1.0)
