@@ -31,7 +31,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive import script_process
 from blf_dsc_controller.drive.arguments import checked_overrides
 from blf_dsc_controller.drive.driver import ReflexError, disagreements
-from blf_dsc_controller.drive.script import Script
+from blf_dsc_controller.drive.script import Script, _far_beyond
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
     DriveError,
@@ -207,6 +207,30 @@ def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):
     )
     assert caplog.text.count('deg2rad') == 1
     assert not arm.ended
+
+
+@pytest.mark.parametrize(
+    ('positions', 'named'),
+    [
+        ([0.5, 0.05], ''),
+        ([-3.0, 0.2], ''),  # past the limits: braked on the way there
+        ([30.0, 0.05], 'a is to be at 30 rad'),
+        ([0.5, -45.0], 'b is to be at -45 rad'),
+    ],
+)
+def test_only_what_may_be_degrees_is_no_target_of_a_stream(positions, named):
+    limits = SimpleNamespace(position_lower=(-2.0, 0.0), position_upper=(1.0, 0.1))
+    config = SimpleNamespace(joints=('a', 'b'), limits=limits)
+    found = _far_beyond(np.array(positions), config)
+    assert bool(found) == bool(named)
+    assert named in found
+
+
+def test_next_loop_answers_no_stop_of_the_one_before():
+    """Its time begins anew, and the stop has been an error there."""
+    script = SimpleNamespace(_braking=[(0.5, 3)])
+    Script.begin(script, loop=None)
+    assert not script._braking
 
 
 def test_a_pose_that_is_none_is_refused(arm):

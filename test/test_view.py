@@ -186,6 +186,21 @@ def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
     page.draw_arm(ControllerConfig(), {})
 
 
+@pytest.mark.parametrize(
+    ('external', 'touched', 'joint'),
+    [
+        ([-1.0, 2.0], True, 0),  # five of its intervals, and two
+        ([0.3, 2.0], True, 1),
+        ([-1.0, 2.0], False, None),
+        ([np.nan, 2.0], True, None),
+    ],
+)
+def test_contact_is_felt_where_model_and_noise_explain_least(external, touched, joint):
+    given = {'external': np.array(external), 'interval': np.array([0.2, 1.0])}
+    shown = moving(0.1)[0]._replace(**given, touched=touched)
+    assert shown.felt_at == joint
+
+
 def test_run_that_has_ended_is_replayed_by_a_slider(page):
     run = moving(30.0)
     page.offer_replay(run)
