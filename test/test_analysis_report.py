@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
@@ -22,7 +23,15 @@ from blf_dsc_controller.analysis import figures
 from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
-from blf_dsc_controller.analysis.panels import ALARM, COLOURS, envelope, panels
+from blf_dsc_controller.analysis.panels import (
+    _AXIS_MARGIN,
+    ALARM,
+    COLOURS,
+    _span,
+    _torque,
+    envelope,
+    panels,
+)
 from blf_dsc_controller.analysis.report import plots, read_bag, write_report
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
@@ -124,6 +133,44 @@ def test_violation_is_marked_and_errors_stay_visible_beside_the_wide_start_of_a_
     )
     assert (none, red > 100) == (0, True)
     assert beside > 0.8 * blue
+
+
+@pytest.mark.parametrize(
+    ('errors', 'largest'),
+    [
+        ([0.1, -0.4], 2.0),
+        ([0.1, -4.0], 4.0),
+        ([3.0, -1e101], 3.0),
+        ([np.nan, 1e101], 2.0),
+    ],
+)
+def test_axis_of_a_funnel_has_room_for_its_errors_but_not_for_absurd_ones(
+    errors, largest
+):
+    """Of either sign, in mrad; its bound narrows from 9 mrad to 2 mrad."""
+    span = _span(np.array([9e-3, 2e-3]), np.array(errors))
+    assert span == pytest.approx(_AXIS_MARGIN * largest)
+    assert _span(np.array([2e-3, 2e-3]), np.array(errors)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ('limit', 'names'),
+    [
+        (None, ['torque']),
+        ([np.nan, np.nan], ['torque']),
+        ([9.0, np.nan], ['torque', 'limit']),
+    ],
+)
+def test_torque_is_drawn_with_its_limit_if_that_is_known(limit, names):
+    columns = {'torque': np.array([1.0, -3.0]), 'torque_limit': limit}
+    run = SimpleNamespace(
+        joints=('a',),
+        column=lambda name, _: columns[name],
+        units=lambda _: SimpleNamespace(torque='N m'),
+    )
+    (panel,) = _torque(run, np.arange(2.0), 0)
+    assert [line.name for line in panel.lines] == names
+    assert panel.note == 'peak 3'
 
 
 def test_missing_series_and_a_single_sample_are_drawn(run, drawn, tmp_path):

@@ -455,6 +455,25 @@ def lines_of(stiffness, noise):
     )
 
 
+@pytest.mark.parametrize(
+    ('direction', 'joint'),
+    [([-0.9, 0.1], 0), ([0.3, -0.9], 1), ([0.3, 0.9j], 1), ([-0.9j, 0.3], 0)],
+)
+def test_joint_of_a_margin_is_the_one_that_moves_most_in_any_phase(direction, joint):
+    """At the frequency where least is left, of those that count."""
+    response = SimpleNamespace(
+        seen=np.array([True, True, False]),
+        frequency=np.array([30.0, 40.0, 50.0]),
+        rest=(np.array([0.7, 0.5, 0.1]), np.array([0.0, 0.1, 0.0])),
+    )
+    directions = np.array([[1.0, 0.0], direction, [1.0, 0.0]])
+    loops = SimpleNamespace(
+        responses=[response], _least=lambda of, _: (*of.rest, directions)
+    )
+    assert Loops.margin(loops, None) == pytest.approx((0.4, 40.0, 0, joint))
+    assert Loops.margin(loops, None, noise=False)[0] == 0.5
+
+
 def test_noise_of_velocities_is_counted_as_that_of_positions_is():
     """The doubt is linear in each, and neither is left out."""
     response = lines_of(lambda f: 300.0 * np.broadcast_to(np.eye(2), (f.size, 2, 2)), 1)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import importlib.util
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -92,6 +94,18 @@ def test_full_and_read_only_disks_are_named(capsys, monkeypatch):
     monkeypatch.setattr(computer.os, 'access', lambda *_: False)
     _, found = diagnosed(capsys)
     assert 'cannot be written' in found['disk'][0][1]
+
+
+@pytest.mark.parametrize(
+    ('size', 'level', 'text'),
+    [(4_900_000_000, 'note', '5 GB free'), (7_100_000_000, 'ok', '7 GB free')],
+)
+def test_disk_is_enough_for_an_hour_from_5_gb_on(monkeypatch, size, level, text):
+    monkeypatch.setattr(
+        computer.shutil, 'disk_usage', lambda _: SimpleNamespace(free=size)
+    )
+    found = computer._disk(Path())
+    assert (found.level, found.text.partition(' in ')[0]) == (level, text)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -27,9 +28,10 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.drive import script_process
 from blf_dsc_controller.drive.arguments import checked_overrides
 from blf_dsc_controller.drive.driver import ReflexError, disagreements
-from blf_dsc_controller.drive.script import Script
+from blf_dsc_controller.drive.script import Script, _far_beyond
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
     DriveError,
@@ -37,8 +39,9 @@ from blf_dsc_controller.errors import (
     MotionFailedError,
     NotInTimeError,
 )
-from blf_dsc_controller.messages import script_link
+from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.topics import TARGETS
 
 # rad: the bound of the preset, to which any error of the arm adds up
@@ -204,6 +207,30 @@ def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):
     )
     assert caplog.text.count('deg2rad') == 1
     assert not arm.ended
+
+
+@pytest.mark.parametrize(
+    ('positions', 'named'),
+    [
+        ([0.5, 0.05], ''),
+        ([-3.0, 0.2], ''),  # past the limits: braked on the way there
+        ([30.0, 0.05], 'a is to be at 30 rad'),
+        ([0.5, -45.0], 'b is to be at -45 rad'),
+    ],
+)
+def test_only_what_may_be_degrees_is_no_target_of_a_stream(positions, named):
+    limits = SimpleNamespace(position_lower=(-2.0, 0.0), position_upper=(1.0, 0.1))
+    config = SimpleNamespace(joints=('a', 'b'), limits=limits)
+    found = _far_beyond(np.array(positions), config)
+    assert bool(found) == bool(named)
+    assert named in found
+
+
+def test_next_loop_answers_no_stop_of_the_one_before():
+    """Its time begins anew, and the stop has been an error there."""
+    script = SimpleNamespace(_braking=[(0.5, 3)])
+    Script.begin(script, loop=None)
+    assert not script._braking
 
 
 def test_a_pose_that_is_none_is_refused(arm):
@@ -485,6 +512,24 @@ def test_a_start_that_fails_says_why(config, robot, message):
     with pytest.raises(DriveError) as raised:
         blf.Drive(config, robot=robot)
     assert message in str(raised.value)
+
+
+def test_a_mistake_that_nobody_foresaw_is_told_to_the_script(monkeypatch):
+    """Before its process ends with the traceback."""
+
+    def fail(*_):
+        raise ZeroDivisionError('a mistake')
+
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr(script_process, '_awaited', fail)
+    monkeypatch.setattr(sys, 'argv', ['script_process', str(theirs.detach())])
+    with pytest.raises(ZeroDivisionError):
+        script_process.main()
+    link = Link(ours)
+    ((kind, content),) = link.messages()
+    link.close()
+    assert kind == script_link.FAILED
+    assert 'ZeroDivisionError: a mistake' in topic_link.decode(content)
 
 
 # Without a function or a guard, as in a notebook.

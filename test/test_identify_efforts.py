@@ -204,6 +204,17 @@ def test_friction_shows_a_sign_only_if_both_of_its_parts_agree(viscous, coulomb,
     assert _sign(fit, [0, 1], 1.0) == sign
 
 
+@pytest.mark.parametrize(
+    ('residual', 'length', 'sign'),
+    [(100.0, 1.0, 1.0), (300.0, 1.0, 0.0), (100.0, 16.0, 0.0)],
+)
+def test_friction_shows_a_sign_if_it_is_five_deviations_long(residual, length, sign):
+    """Of 1; its deviation is 1e-3 of the residual, times the root of the length."""
+    z = np.array([2.0, 1.0, 0.0])
+    fit = _Fit(np.ones(3), z, 1e3 * np.eye(3), 1.0, residual, 1.0)
+    assert _sign(fit, [0, 1], length) == sign
+
+
 def test_errors_of_joints_alone_are_what_their_values_and_delays_leave():
     random = np.random.default_rng(4)
     X, rate = random.normal(size=(9, 2, 3)), random.normal(size=(9, 2))

@@ -19,6 +19,7 @@ from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import next_record
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.bad_values import _apart, _sizes
 from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.reading import read_recording
 
@@ -768,3 +769,18 @@ def test_hole_in_a_bag_is_no_record():
     """Nine zeros would be a record without content: two gigabytes are read for hours."""
     with pytest.raises(ValueError, match='zeros instead of a record'):
         next_record(BytesIO(bytes(100)), 100, {})
+
+
+def test_sizes_of_torques_are_those_of_both_signs_but_for_zero():
+    torque = np.array([[0.0, -3.0], [-2.0, 0.0], [1.0, -5.0]])
+    least, most = _sizes(torque, 3)
+    assert (least.tolist(), most.tolist()) == ([1.0, 3.0], [2.0, 5.0])
+
+
+@pytest.mark.parametrize('centre', [0.0, 2000.0, -2000.0])
+def test_value_far_from_all_others_is_found_wherever_they_are(centre):
+    """Nothing, for instance, among encoder counts."""
+    others = centre + np.array([1.0, -1.0, 0.5, 0.0])
+    found = _apart(np.append(others, centre - 1500.0))
+    assert found.value == centre - 1500.0
+    assert found.distance == pytest.approx(1500.0, abs=1.0)

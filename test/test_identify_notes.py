@@ -39,7 +39,10 @@ from blf_dsc_controller.identification.summary import (
     notes_of,
 )
 from blf_dsc_controller.identification.values import base_matrix
-from blf_dsc_controller.identification.wider_model import _deviation_of_mean
+from blf_dsc_controller.identification.wider_model import (
+    _deviation_of_mean,
+    _linearised,
+)
 from blf_dsc_controller.identification.windows import Carried
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
@@ -300,3 +303,21 @@ def test_load_is_in_kilograms_and_its_centre_in_millimetres():
         r'-20\.0 \+- 2, 100\.0 \+- 2 mm in hand',
         text,
     )
+
+
+def test_columns_of_gains_are_linear_about_a_solution():
+    """The torque over its gain g is that of `narrow` + (1 + g) z, of three values and a gain."""
+    random = np.random.default_rng(0)
+    narrow, z, step = random.normal(size=(3, 5))
+    k, of_gains = 3, np.array([3, 4])
+
+    def parts(z, at):
+        found = narrow + z
+        found[:k] += z[at] * z[:k]
+        return np.append(found, -1.0)
+
+    for at, T in zip(of_gains, _linearised(narrow, z, k, of_gains), strict=True):
+        for size in (0.0, 1e-5):  # of which the square is no part
+            near = z + size * step
+            got = T @ np.append(near, -1.0)
+            np.testing.assert_allclose(got, parts(near, at), rtol=0.0, atol=1e-8)

@@ -209,6 +209,24 @@ def test_noise_is_measured_while_nothing_touches(state, phase):
     assert state.noise[1, 0] == 0.3  # of reversals
 
 
+def test_noise_is_a_mean_at_first_and_that_of_the_last_window_later(state):
+    """The mean square of r = 0.5 N m, and then of 1 N m; a hundredth of a window is assumed."""
+    work = part(Work)
+    window = SETTINGS.window * SETTINGS.row_interval
+    state.noise[:] = 0.9
+    state.torque[:] = 0.5
+    assumed, few = 0.01 * window, window // 10
+    for _ in range(few):
+        external_torque.update_noise(SETTINGS, state, work)
+    mean = (assumed * 0.9 + few * 0.25) / (assumed + few)
+    assert state.noise[0, 0] == pytest.approx(mean)
+    state.samples[:] = 10.0 * window
+    state.torque[:] = 1.0
+    for _ in range(window):
+        external_torque.update_noise(SETTINGS, state, work)
+    assert state.noise[0, 0] == pytest.approx(1.0 + (mean - 1.0) / np.e, rel=1e-3)
+
+
 def test_noise_is_measured_from_the_first_window_on(state):
     state.latch_time[0] = 0.0
     external_torque.update_noise(SETTINGS, state, part(Work))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import exp, nan
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,12 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law import disturbance, load_observer
+from blf_dsc_controller.law import (
+    absorbed_friction,
+    disturbance,
+    learning,
+    load_observer,
+)
 from blf_dsc_controller.law.load_observer import Settings, State, Work
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.runs import run_chunk
@@ -251,6 +257,31 @@ def test_torque_is_the_same_while_it_becomes_known_what_is_absorbed():
     after = run(state, work, sensed, DT, absorbed=share)
     assert np.abs(after - before).max() > 0.1
     np.testing.assert_allclose(after + d3, before, atol=1e-9)
+
+
+def test_torque_is_the_same_while_the_law_lets_what_is_absorbed_follow():
+    """In a step of the learning whose gains bring all of the solution at once."""
+    state, work = settled()
+    sensed = X[:, :P] @ LINKS + [1.0, 0.5]
+    before = run(state, work, sensed, 1.0)
+    sizes = {'n': N, 'p': P, 'm': M, 'observer': SETTINGS}
+    absorbed = part(absorbed_friction.State, **sizes)
+    scratch = part(absorbed_friction.Work, **sizes)
+    absorbed.solution[:] = 0.05, 0.1, 0.0
+    gains = SimpleNamespace(weight=2.0, adaptation_gain=np.full(M, 0.5 / DT))
+    now = SimpleNamespace(
+        observer=state, absorbed=absorbed, disturbance=np.zeros(N), estimate=THETA
+    )
+    learning.follow_absorbed(
+        SimpleNamespace(observer=SETTINGS, adaptation=gains),
+        now,
+        SimpleNamespace(absorbed=scratch),
+        DT,
+    )
+    np.testing.assert_allclose(absorbed.absorbed, absorbed.solution)
+    after = run(state, work, sensed, DT, absorbed=absorbed.absorbed)
+    assert np.abs(after - before).max() > 0.1
+    np.testing.assert_allclose(after + now.disturbance, before, atol=1e-9)
 
 
 @pytest.mark.parametrize(

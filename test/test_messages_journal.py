@@ -184,3 +184,14 @@ def test_content_that_was_encoded_beforehand_gives_the_same_message():
     journal.add(EventType.TRAJECTORY, content)
     content['points'] = [object()]  # which has no JSON
     assert decode(journal.pending[0].encode()).content == given
+
+
+def test_journal_begins_before_the_first_state_message_and_torque():
+    """Bags of any version are replayed by these counts."""
+    journal = Journal()
+    journal.note(EventType.ACTIVATE)
+    journal.note(EventType.DEACTIVATE)
+    assert list(journal.pending) == [
+        Event(0, EventType.ACTIVATE, -1, 0, 0, {}),
+        Event(1, EventType.DEACTIVATE, -1, 0, 0, {}),
+    ]

@@ -80,6 +80,7 @@ def event(kind):
             ({}, event(kind), 1e-5)
             for kind in ('payload', 'force', 'torque', 'viscous', 'offset')
         ),
+        ({}, {'disturbance.phase': [0.7, -0.4]}, 1e-5),
         # dry friction in MuJoCo, smoothed by tanh in ours
         ({}, event('coulomb'), 1.3e-3),
         (

@@ -30,6 +30,7 @@ from blf_dsc_controller.configuration.nodes import dump, load_loop
 from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.nodes import endpoints
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import PollingTimer
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -509,3 +510,16 @@ def test_nodes_without_work_poll_rarely_and_at_once_often_again(ros):
         # resets of a timer must not add up
         assert polls[-1] - polls[0] > 0.75 * 100 * 0.002
         work.clear()
+
+
+def test_node_polls_often_until_it_has_found_no_work_for_a_while(ros, monkeypatch):
+    """Else each gap between two messages would cost the time of a rare poll."""
+    now = [0.0]
+    monkeypatch.setattr(endpoints, 'time', SimpleNamespace(monotonic=lambda: now[0]))
+    work = [True]
+    timer = PollingTimer(ros.tester, 60.0, lambda: bool(work))  # called by hand here
+    for at, is_idle in ((5.0, False), (5.09, False), (5.11, True)):
+        now[0] = at
+        timer._poll_often()
+        work.clear()
+        assert timer._timer.is_canceled() == is_idle

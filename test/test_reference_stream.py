@@ -80,11 +80,12 @@ def test_another_rate_is_found_within_fifteen_messages(factor):
     np.testing.assert_allclose(targets[-1].velocities, SLOPE, rtol=1e-3)
 
 
-def test_step_of_the_targets_is_no_velocity():
+@pytest.mark.parametrize('step', [0.03, -0.03])
+def test_step_of_the_targets_is_no_velocity(step):
     """0.03 rad in 10 ms are 3 rad/s, twice as fast as the arm: only its other joint moves on."""
     stream = TargetStream()
     receive(stream, 0.01 * np.arange(50))
-    stepped = SLOPE * 0.5 + (0.03, 0.0)
+    stepped = SLOPE * 0.5 + (step, 0.0)
     target = stream.target(0.5, stepped, timeout=TIMEOUT, fastest=FASTEST)
     assert target.velocities[0] == 0.0
     assert target.velocities[1] == pytest.approx(SLOPE[1])

@@ -395,6 +395,18 @@ def test_replay_ends_where_the_recorder_missed_what_it_needs(
     assert result.compared < 1.0
 
 
+def test_replay_that_has_ended_takes_no_further_state(tmp_path):
+    """Nor the one of a stop, which is another sample: a state before it is missing."""
+    rig = Recorder(DAMPED)
+    rig.step(50)
+    rig.base -= 20 * MILLISECOND
+    rig.step(5)
+    of(rig.entries, JOINT_STATES)[40][3] = None
+    result = rig.verify(tmp_path)
+    assert (result.difference, result.samples, result.skipped) == (None, 40, 0)
+    assert 'was used but is not in the bag' in result.remarks[0]
+
+
 @pytest.mark.parametrize('drops', [(), (40,)])
 def test_second_controller_in_a_bag_is_not_replayed(tmp_path, drops):
     """In lock-step the plant sends the state that killed a controller until another answers."""

@@ -16,6 +16,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.messages.journal import decode_change
+from blf_dsc_controller.messages.topics import CHANGES
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import (
     _run_supervised,
@@ -72,6 +74,27 @@ def test_bag_written_while_simulating_has_the_same_messages(tmp_path, given):
     assert recorded_run.read(tmp_path / 'while') == recorded_run.read(
         tmp_path / 'after'
     )
+
+
+def test_run_that_ends_in_command_leaves_a_torque_behind_as_its_replay_does(tmp_path):
+    """As a node does for a drive that holds the last torque."""
+    config = build(ControllerConfig, {})
+    record = simulate(config, build(PlantConfig, {'duration': 0.05}))
+    assert np.isfinite(record.left).all()
+    write_bag(tmp_path / 'bag', record)
+    result = verify(tmp_path / 'bag')
+    assert (result.difference, result.incomplete) == (None, ())
+
+
+def test_bag_of_a_run_begins_with_the_configuration_of_its_plant(tmp_path):
+    """As that of a node, by which reports and the view know the true arm."""
+    plant = build(PlantConfig, {'duration': 0.01, 'seed': 3})
+    record = simulate(build(ControllerConfig, {}), plant)
+    write_bag(tmp_path / 'bag', record, plant)
+    topic, _, _, raw = recorded_run.messages(tmp_path / 'bag')[0]
+    found = decode_change(raw)
+    assert (topic, found.configured) == (CHANGES.resolved, True)
+    assert build(PlantConfig, dict(found.parameters)) == plant
 
 
 def test_memory_of_a_run_into_a_bag_does_not_grow_with_its_length(tmp_path):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from fault_table import JOINTS, MILLISECOND, Rig, jammed, sparse
@@ -27,6 +29,7 @@ from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import LatePlanError
 from blf_dsc_controller.supervision.retuning import apply, apply_bumpless
 from blf_dsc_controller.supervision.running_reference import RunningReference
+from blf_dsc_controller.supervision.safe_stop import SafeStop
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.stop_cause import chatter_of
@@ -776,3 +779,30 @@ def test_approach_is_over_once_another_reference_is_followed(settled, expected):
     reference.settled = settled
     reference.follow(controller.reference_vector)
     assert reference.settled == pytest.approx(expected)
+
+
+AFTER_WINDING_UP = {
+    Reason.OUTSIDE_BOUND,
+    Reason.SATURATED,
+    Reason.VELOCITY,
+    Reason.CONTACT,
+    Reason.OSCILLATION,
+    Reason.NO_EFFECT,
+}
+
+
+@pytest.mark.parametrize('reason', list(Reason))
+@pytest.mark.parametrize('gap', [False, True])
+def test_stop_that_winds_the_estimates_up_holds_with_those_from_before(reason, gap):
+    """Unless the states had a gap: then the torque that holds the arm shows its load."""
+    stop = SimpleNamespace(
+        _held=SimpleNamespace(
+            command=lambda: None,
+            after_gap=np.zeros(2) if gap else None,
+            load=lambda: 'of the torque that holds it',
+        ),
+        _samples=SimpleNamespace(disturbance='from before'),
+    )
+    winds_up = reason in AFTER_WINDING_UP and not gap
+    expected = 'from before' if winds_up else 'of the torque that holds it'
+    assert SafeStop._load_at_stop(stop, reason) == expected

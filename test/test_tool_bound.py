@@ -37,7 +37,7 @@ from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.tool.errors import ANGLE, ANGLE_BOUND, BOUND, ERROR, Tool
-from blf_dsc_controller.tool.postures import axes_of, ways_to_tip
+from blf_dsc_controller.tool.postures import _angle, axes_of, ways_to_tip
 
 TRAVEL = 2.5  # m, limit of the prismatic joints of random arms
 ROUNDING = 1e-13  # m and rad, of placements
@@ -150,6 +150,30 @@ def test_bound_at_every_posture_is_tight(name):
         worst = tool.at_postures(q, k).max(axis=0)
         assert (worst <= 1.01 * tool.everywhere(k)).all()  # but for their remainder
         assert (tool.everywhere(k) <= 1.3 * worst).all()
+
+
+@pytest.mark.parametrize('turn', [0.0, 0.2, 1.5, 1.7, 3.0, np.pi])
+def test_angle_of_two_lines_is_a_right_one_at_most(turn):
+    """Axes have no sense of direction here: with an obtuse one the bound would be wider."""
+    across = np.array([np.cos(turn), np.sin(turn), 0.0])
+    found = _angle(np.array([1.0, 0.0, 0.0]), across)
+    assert found == pytest.approx(min(turn, np.pi - turn), abs=1e-15)
+
+
+@pytest.mark.parametrize('name', ['two', 'six', 'nine'])
+def test_bound_grows_by_the_remainder_of_joint_errors(name):
+    """By k^T C k / 2 and k^T T k / 2, where the linear part is twice as large for 2 k."""
+    chain = arm(name)
+    n = len(chain.joints)
+    tool = Tool(chain, np.full(n, TRAVEL))
+    random = np.random.default_rng(4)
+    q, k = random.uniform(-2.0, 2.0, (2, n))
+    k = 0.01 * np.abs(k)
+    bounds = [tool.at_postures(q[np.newaxis], scale * k)[0] for scale in (1.0, 2.0)]
+    remainder = 0.5 * (bounds[1] - 2.0 * bounds[0])
+    links = tool._links
+    expected = [0.5 * k @ C @ k for C in (links.curvature, links.turning)]
+    np.testing.assert_allclose(remainder, expected, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize('name', ['two', 'six', 'nine'])

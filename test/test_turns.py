@@ -30,6 +30,7 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.reference.turns import short_way
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
+from blf_dsc_controller.supervision.wraps import Wraps
 from sim_plant.plant import plant_of
 
 BOUNDED = (share_folder() / 'config' / 'two_link.urdf').read_text()
@@ -66,6 +67,20 @@ def rig_of(urdf=ENDLESS, wrap=None, start=START, **law):
 
 
 # Positions that wrap.
+
+
+@pytest.mark.parametrize(
+    ('turns', 'counted'), [(1, True), (-1, True), (1001, False), (-1001, False)]
+)
+def test_a_position_more_than_a_thousand_turns_away_is_no_wrap(turns, counted):
+    """It is no position: counted on, it would hide what the sensor says."""
+    wraps = Wraps(build(ControllerConfig, {**ARM, **SWING}))
+    rest = np.zeros(6)
+    wraps.counted(rest, 0.0, 3.0)
+    away = rest + np.array([turns * tau, 0.0, 0.0, 0.0, 0.0, 0.0])
+    got, fault = wraps.counted(away, 1e-3, 3.0)
+    assert fault is None
+    assert got[0] == pytest.approx(0.0 if counted else turns * tau, abs=1e-9)
 
 
 @pytest.mark.parametrize('velocity', ['measured', 'estimated'])

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from subprocess import PIPE, STDOUT
+from types import SimpleNamespace
 from urllib.error import URLError
 from urllib.request import urlopen
 
@@ -40,7 +41,9 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
+from blf_dsc_controller.view import node as view_node
 from blf_dsc_controller.view import page as pages
+from blf_dsc_controller.view.model_error import shares
 from blf_dsc_controller.view.node import ViewNode, plant_events
 from blf_dsc_controller.view.page import Page, ShownArm, Snapshot, known_model
 
@@ -118,6 +121,30 @@ def test_plots_show_the_share_of_the_bound_and_a_caption_what_is_held(page):
     assert [line[-1] for line in weight[1:4]] == pytest.approx([2.0, 1.95, 2.05])  # kg
 
 
+@pytest.mark.parametrize(
+    ('frames', 'learned'),
+    [(2, [10.0, 10.0, 50.0, 70.7107]), (9, [10.0, 10.0, 41.2311, 50.4975])],
+)
+def test_error_of_a_model_is_that_of_the_last_frames(frames, learned):
+    """Of four frames; the squares of the true torques are 1, 1, 1, 1."""
+    squares = np.ones((4, 3))
+    squares[:, 0] = [0.01, 0.01, 0.49, 0.51]
+    got = shares(squares, frames)
+    np.testing.assert_allclose(got[0], learned, rtol=1e-4)
+    np.testing.assert_allclose(got[1], 100.0)
+    assert np.isnan(shares(squares * 0.0, frames)).all()
+
+
+def test_snapshots_of_a_long_run_are_evenly_spaced():
+    """Of numbered ones, three times as many as are kept."""
+    most = view_node._KEPT
+    shown = SimpleNamespace(run=[], _stride=1, _taken=0)
+    for k in range(3 * most):
+        ViewNode._keep_for_replay(shown, k)
+    assert set(np.diff(shown.run)) == {4}
+    assert most / 2 < len(shown.run) <= most
+
+
 def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
     past = moving(2.0)
     page.events([(1.0, 'plant', '2 kg picked up')])
@@ -157,6 +184,21 @@ def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
     assert not node(page, '/contact').visible
     assert 'external' not in page.caption.content
     page.draw_arm(ControllerConfig(), {})
+
+
+@pytest.mark.parametrize(
+    ('external', 'touched', 'joint'),
+    [
+        ([-1.0, 2.0], True, 0),  # five of its intervals, and two
+        ([0.3, 2.0], True, 1),
+        ([-1.0, 2.0], False, None),
+        ([np.nan, 2.0], True, None),
+    ],
+)
+def test_contact_is_felt_where_model_and_noise_explain_least(external, touched, joint):
+    given = {'external': np.array(external), 'interval': np.array([0.2, 1.0])}
+    shown = moving(0.1)[0]._replace(**given, touched=touched)
+    assert shown.felt_at == joint
 
 
 def test_run_that_has_ended_is_replayed_by_a_slider(page):

@@ -17,6 +17,7 @@ pytest.importorskip('viser', reason='needs viser: pip install .[view]')
 import trimesh
 from diagnostic_msgs.msg import DiagnosticStatus
 from page_visitor import get, refusal, visitor
+from rclpy.serialization import serialize_message
 from ros_rig import RosRig
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -28,6 +29,7 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, Journal
+from blf_dsc_controller.nodes.endpoints import RawMessage
 from blf_dsc_controller.view.node import ViewNode
 from blf_dsc_controller.view.page import Page, ShownArm
 
@@ -203,6 +205,23 @@ def test_bound_from_before_the_view_was_started_is_shown(watched):
 
     sender.ros.until(has_bound)
     late.close()
+
+
+def test_bound_that_comes_before_the_journal_waits_for_it(ros, monkeypatch):
+    """The journal says which joints it is of."""
+    view = ros.add(ViewNode, port=18410)
+    given = [
+        (topics.BOUND, states(JOINTS, [0.5, 0.25])),
+        (topics.JOURNAL, text(configure()._asdict())),
+        (topics.JOINT_STATES, states(JOINTS, [0.1, 0.2], 1.0)),
+    ]
+    messages = [RawMessage(at, serialize_message(each), 0, 0, 0) for at, each in given]
+    subscriptions = view._raw_subscriptions
+    for message in messages:
+        monkeypatch.setattr(subscriptions, 'take', lambda message=message: [message])
+        view.update()
+    assert view.past[-1].bound.tolist() == [0.5, 0.25]
+    view.close()
 
 
 def test_comment_that_another_encoding_makes_a_document_type_stays_one():

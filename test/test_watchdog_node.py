@@ -343,11 +343,23 @@ def test_watchdog_stands_down_when_silence_is_meant_until_the_next_command(ros, 
     assert loop.watchdog.takeovers == 1
 
 
-def test_watchdog_takes_over_from_a_controller_that_ends_in_motion(ros):
+def test_watchdog_takes_over_from_a_controller_that_ends_in_motion(ros, monkeypatch):
+    """It says so once, sends a torque for each sample, and looks less often when it watches."""
     loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    change_command, periods = loop.node._change_command, []
+
+    def noted(watchdog):
+        change_command(watchdog)
+        periods.append(loop.node._timer.period)
+
+    monkeypatch.setattr(loop.node, '_change_command', noted)
     loop.go_on(0.02, commands=True)
     loop.note(EventType.RELEASE, resting=False)
     assert np.abs(loop.torque()).min() > 0.5
+    loop.restart(loop.config)
+    loop.go_on(0.01, commands=True)
+    ros.until(lambda: len(periods) > 1)
+    assert periods == [0.001, 0.004]
 
 
 REFUSED = EventType.STOP, {'reason': 'start rejected', 'text': 'of the test'}
