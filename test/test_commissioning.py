@@ -1255,11 +1255,11 @@ def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
 def test_a_posture_is_measured_twice_at_most_and_motion_that_is_hidden_is_an_error():
     commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=1e-5)
     (weak,) = commissioning.motions
-    hidden = simulated.measured(weak, coarse(5e-5))
+    hidden = simulated.measured(weak, coarse(1e-4))
     assert shown_by(*hidden).factor == MOST
     again = commissioning.stronger(weak, hidden[0])
     assert again.excitation.travel <= 1e-5
-    still = simulated.measured(again, coarse(5e-5))
+    still = simulated.measured(again, coarse(1e-4))
     assert commissioning.stronger(again, still[0]) is None
     with pytest.raises(BlfDscError, match='positions do not show the motion'):
         commissioning.result([still])
