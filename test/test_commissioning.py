@@ -1168,13 +1168,13 @@ def test_proof_has_the_largest_error_of_its_whole_run_or_the_reason_of_a_stop():
 
 
 def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
-    """Encoders of 0.07 mrad, whose velocities are differences."""
+    """Encoders of 0.05 mrad, whose velocities are differences."""
     commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=0.05)
     (weak,) = commissioning.motions
     clear = simulated.measured(weak, ARM)
     assert shown_by(*clear).factor == 1.0
     assert commissioning.stronger(weak, clear[0]) is None
-    run = simulated.measured(weak, coarse(7e-5))
+    run = simulated.measured(weak, coarse(5e-5))
     factor = shown_by(*run).factor
     assert 2.0 < factor < MOST
     again = commissioning.stronger(weak, run[0])
@@ -1182,7 +1182,7 @@ def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
     assert commissioning.motion(POSTURE).torque == again.torque == factor * 0.01
     shares = again.excitation.amplitude / weak.excitation.amplitude
     np.testing.assert_allclose(shares[:, :-2], factor, rtol=1e-9)
-    assert shown_by(*simulated.measured(again, coarse(7e-5))).factor == 1.0
+    assert shown_by(*simulated.measured(again, coarse(5e-5))).factor == 1.0
 
 
 def coarse(resolution):
@@ -1274,11 +1274,11 @@ def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
 def test_a_posture_is_measured_twice_at_most_and_motion_that_is_hidden_is_an_error():
     commissioning = blf.Commissioning(CONFIG, [POSTURE], torque=0.01, travel=1e-5)
     (weak,) = commissioning.motions
-    hidden = simulated.measured(weak, coarse(7e-5))
+    hidden = simulated.measured(weak, coarse(1e-4))
     assert shown_by(*hidden).factor == MOST
     again = commissioning.stronger(weak, hidden[0])
     assert again.excitation.travel <= 1e-5
-    still = simulated.measured(again, coarse(7e-5))
+    still = simulated.measured(again, coarse(1e-4))
     assert commissioning.stronger(again, still[0]) is None
     with pytest.raises(BlfDscError, match='positions do not show the motion'):
         commissioning.result([still])

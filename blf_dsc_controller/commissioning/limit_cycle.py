@@ -101,4 +101,5 @@ def _spectrum(error: Floats, T: float) -> tuple[Floats, Floats]:
     straight = np.polyval(np.polyfit(at, error, 1), at)
     window = np.hanning(error.size)
     amplitude = 2.0 * np.abs(np.fft.rfft(window * (error - straight))) / window.sum()
-    return np.fft.rfftfreq(error.size, T), np.asarray(amplitude**2 / _OF_WINDOW)
+    frequency = np.asarray(np.fft.rfftfreq(error.size, T), np.float64)
+    return frequency, np.asarray(amplitude**2 / _OF_WINDOW, np.float64)

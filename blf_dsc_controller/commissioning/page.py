@@ -277,8 +277,8 @@ def of_limit_cycle(cycle: LimitCycle) -> str:
     return (
         f'{cycle.joint} shakes by {1e3 * cycle.amplitude:.2g} m{cycle.unit} at '
         f'{two_digits(cycle.frequency)} Hz {cycle.when}: friction makes it stick and slip, '
-        'which no check stops. More feedback.joint_damping of this joint makes it smaller, at the cost of '
-        'the margin; softer gains make it larger'
+        'which no check stops. More feedback.joint_damping of this joint makes it smaller, at '
+        'the cost of the margin; softer gains make it larger'
     )
 
 
