@@ -8,18 +8,34 @@ pipe or the log of a CI, whose every redraw would be another line, each step is 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from tqdm import tqdm
 
 T = TypeVar('T')
 
+_LARGE = 10_000_000  # bytes, from which reading takes more than some seconds
+
 
 def print_notice(notice: str) -> None:
     """Print a notice to stderr, at once, since it is not part of the results."""
     sys.stderr.write(f'{notice}\n')
     sys.stderr.flush()
+
+
+def announce_reading(paths: Sequence[Path], what: str) -> None:
+    """Say what is done with files or folders, if they are so large that it takes seconds."""
+    files = [
+        file
+        for path in paths
+        for file in ([path] if path.is_file() else path.glob('*'))
+    ]
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    if size > _LARGE:
+        listed = ', '.join(map(str, paths))
+        print_notice(f'{listed}: {size / 1e6:.0f} MB are {what}')
 
 
 def steps(items: Iterable[T], total: int, unit: str, begun: str) -> Iterator[T]:
@@ -42,20 +58,25 @@ class Stages:
     """The named stages of a computation."""
 
     def __init__(self, names: tuple[str, ...], begun: str) -> None:
-        """Say what begins, and how long it takes."""
-        print_notice(begun)
+        """Take what is said as the first stage begins: what is done, and how long it takes."""
         self._names = names
-        self._bar = tqdm(total=len(names), unit='stage', leave=False, disable=None)
+        self._begun = begun
+        self._bar: tqdm[str] | None = None
 
     def begin(self, name: str) -> None:
         """Say which stage begins; one may begin again."""
+        total = len(self._names)
         k = self._names.index(name)
+        if self._bar is None:
+            print_notice(self._begun)
+            self._bar = tqdm(total=total, unit='stage', leave=False, disable=None)
         if self._bar.disable:
-            print_notice(f'stage {k + 1} of {len(self._names)}: {name}')
+            print_notice(f'stage {k + 1} of {total}: {name}')
             return
         self._bar.set_description(name)
         self._bar.update(k - self._bar.n)
 
     def close(self) -> None:
         """Take the bar away."""
-        self._bar.close()
+        if self._bar is not None:
+            self._bar.close()

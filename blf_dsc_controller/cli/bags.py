@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from blf_dsc_controller.bags import reader, recovery, table
@@ -15,7 +14,7 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.progress import print_notice
+from blf_dsc_controller.progress import announce_reading
 from blf_dsc_controller.run import Run
 
 if TYPE_CHECKING:
@@ -28,7 +27,6 @@ PARTIAL = 4
 """Exit code if all compared outputs are equal, but others could not be compared."""
 
 _PAGES = {'', '.html', '.htm'}
-_LARGE = 10_000_000  # bytes, from which a bag takes more than some seconds
 _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 
@@ -40,7 +38,7 @@ def report(options: Namespace) -> None:
         raise BlfDscError(f'{options.out}: the report is a page: give a name in .html')
     make_room(options.out, force=options.force)
     names = NameMap.parse(options.map)
-    _announce(options.bags, 'drawn')
+    announce_reading(options.bags, 'drawn')
     bags = [read_bag(path, options.namespace, names) for path in options.bags]
     write_report(bags, options.out)
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
@@ -59,7 +57,7 @@ def export(options: Namespace) -> None:
     """Write a bag as a table."""
     table.check_format(options.out)  # before a large bag is read
     make_room(options.out, force=options.force)
-    _announce([options.bag], 'written as a table')
+    announce_reading([options.bag], 'written as a table')
     run = _run(options)
     columns = table.export(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
@@ -74,7 +72,7 @@ def plot(options: Namespace) -> None:
 
     names = ('summary.json', *figures.NAMES)
     make_room(*(options.out / name for name in names), force=options.force)
-    _announce([options.bag], 'drawn')
+    announce_reading([options.bag], 'drawn')
     run = _run(options)
     metrics = measure(run)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -91,7 +89,7 @@ def recover(options: Namespace) -> int:
     """
     bag = options.bag.resolve()
     out = options.out or bag.with_name(f'{bag.stem}_recovered')
-    _announce([options.bag], 'read and written again')
+    announce_reading([options.bag], 'read and written again')
     messages, losses = recovery.recover(options.bag, out)
     for topic, count in messages.items():
         print(f'{topic}: {count} messages')
@@ -113,7 +111,7 @@ def replay(options: Namespace) -> int:
         return 0
     from blf_dsc_controller.replay.verify import verify
 
-    _announce([options.bag], 'run through the controller again')
+    announce_reading([options.bag], 'run through the controller again')
     begin = time.perf_counter()
     names = NameMap.parse(options.map)
     result = verify(options.bag, options.namespace, names, options.law)
@@ -130,17 +128,6 @@ def replay(options: Namespace) -> int:
 def speed_text(times: float) -> str:
     """Return how many times as fast as real time, with two digits below 10."""
     return f'{times:.0f}x real time' if times >= 9.5 else f'{times:.2g}x real time'
-
-
-def _announce(bags: Sequence[Path], what: str) -> None:
-    """Say what is done with bags, if that takes more than some seconds."""
-    files = [
-        file for bag in bags for file in ([bag] if bag.is_file() else bag.glob('*'))
-    ]
-    size = sum(file.stat().st_size for file in files if file.is_file())
-    if size > _LARGE:
-        listed = ', '.join(map(str, bags))
-        print_notice(f'{listed}: {size / 1e6:.0f} MB are {what}')
 
 
 def play(options: Namespace) -> None:

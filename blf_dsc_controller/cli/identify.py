@@ -46,7 +46,7 @@ from blf_dsc_controller.identification.summary import (
     notes_of,
     stiffness_table,
 )
-from blf_dsc_controller.progress import Stages, print_notice
+from blf_dsc_controller.progress import Stages, announce_reading, print_notice
 from blf_dsc_controller.writing import write_text
 
 UNUSABLE = 3
@@ -109,10 +109,14 @@ def _identified(options: Namespace, robot: Robot) -> Identified:
         f'identifying from {_listed(options.bags)}: some ten seconds for a minute of a few '
         'joints, and up to some minutes where other loads or zeros have to be tried'
     )
-    with closing(Stages(STAGES, begun)) as stages:
+    reading, *others = STAGES
+    announce_reading(options.bags, 'read')
+    with closing(Stages(tuple(others), begun)) as stages:
 
         def begin(stage: str) -> None:
-            if stage == STAGES[1]:  # URDF and recordings have been read, and are right
+            if stage == reading:
+                return
+            if stage == others[0]:  # URDF and recordings have been read, and are right
                 _refuse_no_output(options)
             stages.begin(stage)
 
