@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 from tqdm import tqdm
 
@@ -61,20 +61,23 @@ class Stages:
         """Take what is said as the first stage begins: what is done, and how long it takes."""
         self._names = names
         self._begun = begun
-        self._bar: tqdm[str] | None = None
+        self._bar: tqdm[NoReturn] | None = None
 
     def begin(self, name: str) -> None:
         """Say which stage begins; one may begin again."""
-        total = len(self._names)
+        bar = self._bar or self._first()
         k = self._names.index(name)
-        if self._bar is None:
-            print_notice(self._begun)
-            self._bar = tqdm(total=total, unit='stage', leave=False, disable=None)
-        if self._bar.disable:
-            print_notice(f'stage {k + 1} of {total}: {name}')
+        if bar.disable:
+            print_notice(f'stage {k + 1} of {bar.total}: {name}')
             return
-        self._bar.set_description(name)
-        self._bar.update(k - self._bar.n)
+        bar.set_description(name)
+        bar.update(k - bar.n)
+
+    def _first(self) -> tqdm[NoReturn]:
+        print_notice(self._begun)
+        total = len(self._names)
+        self._bar = tqdm(total=total, unit='stage', leave=False, disable=None)
+        return self._bar
 
     def close(self) -> None:
         """Take the bar away."""
