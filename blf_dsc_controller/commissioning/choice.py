@@ -7,12 +7,6 @@ singular value of I + L over the frequencies, less what noise may make of it.  W
 gains the loop is stable.  Raised step by step, they can only make it unstable where a
 singular value passes zero, so every step on the way must have the margin.
 
-Noise is judged in N m, or by the torque that each joint has in the motion, whichever shows less
-of it.  In N m, a wrist that is moved with little torque makes the strong joints look uncertain:
-their answer to it has their noise over its torque, although hardly anything comes back to it.
-By the torques of the motion each joint has its noise over its own torque alone.  Either unit
-bounds the changes of each joint by itself that the loop bears, which depend on no unit.
-
 First the stiffness and damping of all joints grow together, then those of each joint by
 itself, in turns, as far as the margin allows.
 
@@ -91,14 +85,6 @@ class RigidArm(NamedTuple):
         return Loop(M, joints, self.timing, linear(gains, inertia, 1)).margin().value
 
 
-class _Values(NamedTuple):
-    """The least singular values of a loop over f frequencies."""
-
-    value: Floats  # (f,)
-    doubt: Floats  # (f,) what noise may make of it
-    direction: Complex  # (f, n) of torques
-
-
 class Loops(NamedTuple):
     """Measured arms in k postures, and the law by its gains."""
 
@@ -107,7 +93,7 @@ class Loops(NamedTuple):
     sample_time: float  # s
 
     def singular_values(self, gains: JointGains) -> list[tuple[Floats, Floats]]:
-        """Return for each posture the least singular value of I + L (f,), and what noise takes."""
+        """Return for each posture the least singular value of I + L (f,), and its doubt."""
         return [self._least(each, gains)[:2] for each in self.responses]
 
     def margin(self, gains: JointGains, *, noise: bool = True) -> Margin:
@@ -126,42 +112,20 @@ class Loops(NamedTuple):
     def _least(
         self, response: Response, gains: JointGains
     ) -> tuple[Floats, Floats, Complex]:
-        """Return least singular values (f,), what noise takes (f,) and directions (f, n)."""
-        (value, doubt, direction), by_motion = self.in_units(response, gains)
-        left = np.maximum(value - doubt, by_motion[0] - by_motion[1])
-        return value, (value - left).clip(0.0), direction
-
-    def in_units(
-        self, response: Response, gains: JointGains
-    ) -> tuple[_Values, _Values]:
-        """Return the least singular values of I + L in N m, and by the torques of the motion."""
+        """Return least singular values (f,), their doubt (f,) and directions (f, n)."""
         n = len(self.inertia)
         s: Complex = np.asarray(2j * np.pi * response.frequency, complex)
         feedback = linear(gains, self.inertia, 1)
         C_y, C_v = (each[0] for each in law_responses(feedback, self.sample_time, s))
         L = C_y @ response.position + C_v @ response.velocity
-        # dL_ij has the deviation rows_i columns_j
+        left, values, right = np.linalg.svd(np.eye(n) + L)
+        # u^H (I + L) v changes by u^H dL v, dL_ij with the deviation rows_i columns_j
         rows = np.abs(np.diagonal(C_y, axis1=1, axis2=2)) * response.position_noise
         rows += np.abs(np.diagonal(C_v, axis1=1, axis2=2)) * response.velocity_noise
-        columns = response.columns  # about one over the torques of the motion
-        scaled = columns[:, :, None] * L / columns[:, None, :]
-        return (
-            _least_values(np.eye(n) + L, rows, columns),
-            _least_values(np.eye(n) + scaled, rows * columns, np.ones_like(columns)),
-        )
-
-
-def _least_values(loop: Complex, rows: Floats, columns: Floats) -> _Values:
-    """Return the least singular values of a loop (f, n, n).
-
-    Its elements i, j have the deviations rows_i columns_j, (f, n) each.
-    """
-    left, values, right = np.linalg.svd(loop)
-    # u^H (I + L) v changes by u^H dL v
-    of_rows = np.linalg.norm(left[:, :, -1] * rows, axis=1)
-    of_columns = np.linalg.norm(right[:, -1] * columns, axis=1)
-    doubt = DEVIATIONS * of_rows * of_columns
-    return _Values(values[:, -1], np.asarray(doubt), right[:, -1].conj())
+        of_rows = np.linalg.norm(left[:, :, -1] * rows, axis=1)
+        of_columns = np.linalg.norm(right[:, -1] * response.columns, axis=1)
+        doubt = DEVIATIONS * of_rows * of_columns
+        return values[:, -1], np.asarray(doubt), right[:, -1].conj()
 
 
 def choose(

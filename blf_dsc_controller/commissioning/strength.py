@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.linear_loop import SLOWEST
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning.choice import BARELY, Loops
 from blf_dsc_controller.commissioning.commissioning import measuring_gains
@@ -58,10 +57,7 @@ def shown_by(run: Run, config: ControllerConfig) -> Shown:
     gains = measuring_gains(arm)
     loops = Loops((response,), np.diagonal(M), config.sample_time)
     clean = loops.margin(gains, noise=False).value
-    # in N m, which shows more of the noise: stiffer gains than these have more of it to bear
-    values, doubt, _ = loops.in_units(response, gains)[0]
-    counts = response.seen & (response.frequency >= SLOWEST)
-    taken = clean - float((values - doubt)[counts].min())
+    taken = clean - loops.margin(gains).value
     return Shown(
         factor=float(np.clip(taken / LITTLE, 1.0, MOST)),
         rubs=rubs(response, gains.damping),
