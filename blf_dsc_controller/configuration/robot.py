@@ -61,7 +61,7 @@ _NEEDED = 0.5
 _MOST_FRICTION = 0.25  # of the effort
 UNKNOWN_FRICTION = 0.05
 """Friction to expect where none is known, over the rated torque: its standard deviation."""
-UNKNOWN_ROTOR = 6.0
+HEAVIER_DRIVE = 6.0
 """Inertia that a guessed drive may have beyond the guess, over it: geared arms have up to seven."""
 _SLOWEST = {'revolute': 2.0, 'prismatic': 0.5}  # rad/s or m/s, of the drives of arms
 # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
@@ -272,7 +272,7 @@ class Robot:
         A loop at joint torque sensors hides it.
         """
         counts = not (self.torque_loop or self.known_rotors(chain))
-        return UNKNOWN_ROTOR * self.rotors(chain) * counts
+        return HEAVIER_DRIVE * self.rotors(chain) * counts
 
 
 @lru_cache(maxsize=16)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.tuning import SAMPLES, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION, UNKNOWN_ROTOR
+from blf_dsc_controller.configuration.robot import HEAVIER_DRIVE, UNKNOWN_FRICTION
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.supervision.expected_errors import (
     ExpectedErrors,
@@ -123,7 +123,7 @@ def _guessed_rotors(config: ControllerConfig) -> str:
     if not guesses_rotors(config):
         return ''
     return (
-        f', and drives up to {1.0 + UNKNOWN_ROTOR:g} times as heavy as guessed '
+        f', and drives up to {1.0 + HEAVIER_DRIVE:g} times as heavy as guessed '
         '(without robot.rotor_inertia),'
     )
 
