@@ -41,6 +41,8 @@ from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.weighing import DEVIATION, MASS
 from blf_dsc_controller.messages.journal import Journal
+from blf_dsc_controller.progress import print_notice
+from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,
     TrajectoryPoint,
@@ -274,10 +276,14 @@ def pairs(arms: Iterable[str], runs: int) -> Iterator[Pair]:
         if arm not in names:
             continue
         motion = motions[(k + k // len(ARMS)) % len(motions)]
-        both = (
-            found(recorded(loop_of(arm, k, load), motion, k), load)
-            for load in (0.0, LOAD)
-        )
+        try:
+            both = [
+                found(recorded(loop_of(arm, k, load), motion, k), load)
+                for load in (0.0, LOAD)
+            ]
+        except TrajectoryError as error:  # drawn too near a limit
+            print_notice(f'{arm} {motion} {k} is left out: {error}')
+            continue
         yield Pair(arm, motion, k, *both)
 
 
