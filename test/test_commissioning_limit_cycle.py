@@ -51,6 +51,18 @@ def test_wave_that_lasts_is_found_with_its_amplitude_and_frequency(frequency, wh
     assert of_limit_cycle(cycle).startswith(said)
 
 
+@pytest.mark.parametrize('when', [AT_REST, IN_MOTION])
+@pytest.mark.parametrize('rows', [1, 2, 150, 1000])
+def test_run_that_is_too_short_for_slow_waves_shows_none(rows, when):
+    run = SimpleNamespace(
+        joints=('wrist',),
+        time=T[:rows],
+        error=wave(2.6e-3, 6.0)[:rows, None],
+        units=lambda _: TURNING,
+    )
+    assert limit_cycles(run, when) == []
+
+
 def test_stick_and_slip_whose_frequency_wanders_is_found():
     """As that of an arm in motion: 5.7 to 6.7 Hz."""
     phase = 2.0 * np.pi * (6.2 * T + 0.4 * np.sin(2.0 * np.pi * 0.2 * T))

@@ -121,7 +121,7 @@ def test_joint_whose_torque_is_hardly_explained_is_named_also_if_it_is_small(pla
     found = identified(states)
     assert found.score.total[2] < 2.0
     assert mentions(found, f' % of the torque of {PANDA[6]} are not explained')
-    assert found.other_counting.counting.unlike.tolist() == [6]
+    assert found.other_convention.convention.unlike.tolist() == [6]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from random_arm import (
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification import zeros
+from blf_dsc_controller.identification import conventions
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import is_usable, problems_of
 from blf_dsc_controller.identification.windows import rows_of
@@ -56,24 +56,24 @@ def test_zeros_that_are_quarter_turns_off_are_named_and_not_applied(states, offs
     right = np.zeros(7)
     for joint, offset in offsets.items():
         right[joint - 1] = -offset
-    np.testing.assert_allclose(found.other_counting.counting.offsets, right)
-    np.testing.assert_array_equal(found.other_counting.counting.signs, 1.0)
+    np.testing.assert_allclose(found.other_convention.convention.offsets, right)
+    np.testing.assert_array_equal(found.other_convention.convention.signs, 1.0)
     assert not is_usable(found)
     (problem,) = problems_of(found, 'torque')
     assert problem.startswith('OTHER ZEROS:')
     for joint, offset in offsets.items():
         assert f'{-offset:+.5g} rad to panda_joint{joint}' in problem
     # 1 % of noise, which windows smooth; bodies that no arm has explain much as it is
-    assert found.other_counting.score.total[2] < 1.0
+    assert found.other_convention.score.total[2] < 1.0
     assert found.score.total[2] > 5.0
 
 
 def test_a_joint_that_counts_the_other_way_from_another_zero_is_named(states):
     found = identified(states, {4: QUARTER}, [4])
-    counting = found.other_counting.counting
-    np.testing.assert_array_equal(counting.signs, [1, 1, 1, -1, 1, 1, 1])
+    convention = found.other_convention.convention
+    np.testing.assert_array_equal(convention.signs, [1, 1, 1, -1, 1, 1, 1])
     # recorded: quarter - q
-    np.testing.assert_allclose(counting.offsets, [0, 0, 0, QUARTER, 0, 0, 0])
+    np.testing.assert_allclose(convention.offsets, [0, 0, 0, QUARTER, 0, 0, 0])
     (problem,) = problems_of(found, 'torque')
     assert problem.startswith('OTHER DIRECTIONS AND ZEROS:')
     assert 'negated of panda_joint4, and if then there is added' in problem
@@ -85,9 +85,9 @@ def test_a_last_joint_that_counts_the_other_way_is_named(states):
     found = identified(states, reversed_joints=[7])
     assert found.score.total[2] < 2.0
     np.testing.assert_array_equal(
-        found.other_counting.counting.signs, [1, 1, 1, 1, 1, 1, -1]
+        found.other_convention.convention.signs, [1, 1, 1, 1, 1, 1, -1]
     )
-    np.testing.assert_array_equal(found.other_counting.counting.offsets, 0.0)
+    np.testing.assert_array_equal(found.other_convention.convention.offsets, 0.0)
     assert not is_usable(found)
     (problem,) = problems_of(found, 'torque')
     assert problem.startswith('OTHER DIRECTIONS:')
@@ -99,15 +99,15 @@ def test_friction_explains_the_torques_of_its_own_windows(states, monkeypatch):
     chain = ROBOT.chain(recording.joints)
     rows = rows_of(recording, base_parameters(chain, ROBOT.gravity).model)
     seen = []
-    monkeypatch.setattr(zeros, '_POSTURES', 20)  # one in several windows
+    monkeypatch.setattr(conventions, '_POSTURES', 20)  # one in several windows
 
     def keep(*given):
         seen.append(given)
         raise LookupError
 
-    monkeypatch.setattr(zeros, '_Gravity', keep)
+    monkeypatch.setattr(conventions, '_Gravity', keep)
     with pytest.raises(LookupError):
-        zeros.likely_countings(recording, ROBOT, ())
+        conventions.likely_conventions(recording, ROBOT, ())
     ((_, _, _, u, friction),) = seen
     assert len(u) >= 20
     for own, columns in zip(u, friction, strict=True):
@@ -118,7 +118,7 @@ def test_friction_explains_the_torques_of_its_own_windows(states, monkeypatch):
 
 def test_right_joints_are_not_doubted(states):
     found = identified(states)
-    assert found.other_counting is None
+    assert found.other_convention is None
     assert is_usable(found)
 
 
@@ -126,5 +126,5 @@ def test_efforts_in_another_order_are_not_taken_for_other_joints(states):
     efforts = states[:, TORQUE][:, [0, 3, 2, 1, 4, 5, 6]]
     other = np.stack((states[:, 0], states[:, 1], efforts), axis=1)
     found = identified(other)
-    assert found.other_counting is None
+    assert found.other_convention is None
     assert not is_usable(found)

@@ -92,7 +92,7 @@ def proven_on(
 ) -> tuple[list[Errors], list[LimitCycle]]:
     """Prove the gains of a configuration on a robot.
 
-    Return the errors of each step, and the limit cycles while the arm holds still.
+    Return the errors of each step, and the limit cycles at rest and in the last step.
 
     Raises as `measured_on`.
     """

@@ -56,10 +56,12 @@ def limit_cycles(run: Run, when: str) -> list[LimitCycle]:
     if run.error is None:
         return []
     times = run.time
+    if times[-1] - times[0] < 0.5 * _SEEN[when]:  # too short for such frequencies
+        return []
     rows = times >= times[-1] - _SEEN[when]
     rows &= np.isfinite(run.error).all(axis=1)
     count = 2 * (int(rows.sum()) // 2)
-    if count < 100:  # a run that has hardly begun
+    if count < 100:  # hardly any errors are known
         return []
     even = np.linspace(times[rows][0], times[rows][-1], count)
     found = []

@@ -9,10 +9,10 @@ import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.identification.conventions import Convention
 from blf_dsc_controller.identification.stiffness import Compliance
 from blf_dsc_controller.identification.values import Parts, indices, parts
 from blf_dsc_controller.identification.windows import Carried
-from blf_dsc_controller.identification.zeros import Counting
 from blf_dsc_controller.run import Floats
 
 IDLE = 0.01
@@ -45,10 +45,10 @@ class Score(NamedTuple):
         return np.asarray(self.errors[2] / np.maximum(self.torque, least))
 
 
-class OtherCounting(NamedTuple):
+class OtherConvention(NamedTuple):
     """Directions and zeros of joints with which the torques are explained far better."""
 
-    counting: Counting
+    convention: Convention
     score: Score  # with them
 
 
@@ -88,8 +88,8 @@ class Identified(NamedTuple):
     inertia: float  # share of its other inertial torque, likewise
     # (3,) gravity that explains the torques far better than the given one, m/s^2
     other_gravity: Floats | None
-    other_counting: (
-        OtherCounting | None
+    other_convention: (
+        OtherConvention | None
     )  # that explains the torques, if the URDF's does not
     other_load: (
         OtherLoad | None

@@ -17,10 +17,15 @@ import numpy as np
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.conventions import (
+    Convention,
+    converted,
+    likely_conventions,
+)
 from blf_dsc_controller.identification.foresight import Foresight, foresee
 from blf_dsc_controller.identification.identified import (
     Identified,
-    OtherCounting,
+    OtherConvention,
     OtherLoad,
 )
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
@@ -37,11 +42,6 @@ from blf_dsc_controller.identification.stiffness import Compliance, compliance_o
 from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
 from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
-from blf_dsc_controller.identification.zeros import (
-    Counting,
-    converted,
-    likely_countings,
-)
 from blf_dsc_controller.run import Floats
 
 STAGES = (
@@ -190,13 +190,13 @@ def identify_arm(
     if effort == 'without-gravity':
         return found
 
-    def identified_as(counting: Counting) -> Identified:
-        other = converted(recording, counting)
+    def identified_as(convention: Convention) -> Identified:
+        other = converted(recording, convention)
         return _identified(other, robot, effort, picked_up, find_signs, _tell_nobody)
 
-    likely = likely_countings(recording, robot, unexplained.tolist())
-    counting = _better_counting(found, likely, identified_as)
-    return found._replace(other_counting=counting)
+    likely = likely_conventions(recording, robot, unexplained.tolist())
+    convention = _better_convention(found, likely, identified_as)
+    return found._replace(other_convention=convention)
 
 
 def _better_load(found: Identified, changing: Identified) -> OtherLoad | None:
@@ -210,34 +210,34 @@ def _better_load(found: Identified, changing: Identified) -> OtherLoad | None:
     return OtherLoad(changing.carried, mass, error)
 
 
-def _better_counting(
+def _better_convention(
     found: Identified,
-    likely: Sequence[Counting],
-    identified_as: Callable[[Counting], Identified],
-) -> OtherCounting | None:
+    likely: Sequence[Convention],
+    identified_as: Callable[[Convention], Identified],
+) -> OtherConvention | None:
     """Return the first of likely ones that explains the torques far better, or None."""
-    for counting in likely:
-        other = identified_as(counting)
+    for convention in likely:
+        other = identified_as(convention)
         if _left(other) < _BETTER * _left(found) and is_usable(other):
-            return _simplest(OtherCounting(counting, other.score), identified_as)
+            return _simplest(OtherConvention(convention, other.score), identified_as)
     return None
 
 
 def _simplest(
-    best: OtherCounting, identified_as: Callable[[Counting], Identified]
-) -> OtherCounting:
-    """Return the counting without signs and offsets that are not needed."""
+    best: OtherConvention, identified_as: Callable[[Convention], Identified]
+) -> OtherConvention:
+    """Return the convention without signs and offsets that are not needed."""
     most = _AS_GOOD * _left(best)
-    for i in best.counting.unlike:
-        for simpler in best.counting.simpler(i):
+    for i in best.convention.unlike:
+        for simpler in best.convention.simpler(i):
             other = identified_as(simpler)
             if _left(other) < most:
-                best = OtherCounting(simpler, other.score)
+                best = OtherConvention(simpler, other.score)
                 break
     return best
 
 
-def _left(found: Identified | OtherCounting) -> float:
+def _left(found: Identified | OtherConvention) -> float:
     """Return what is left of the torques held back, each joint by its own torque."""
     return float(np.sqrt(np.mean(found.score.shares**2)))
 
@@ -290,7 +290,7 @@ def _identified(
         gravity=size.gravity,
         inertia=size.inertia,
         other_gravity=problem.other_gravity,
-        other_counting=None,
+        other_convention=None,
         other_load=None,
         carried=problem.carried,
         compliance=compliance,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.identification.identified import (
     IDLE,
     Identified,
-    OtherCounting,
+    OtherConvention,
     OtherLoad,
 )
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
@@ -29,8 +29,8 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
     if found.other_load is not None:
         yield _load_problem(found, found.other_load)
         return
-    if found.other_counting is not None:
-        yield _counting_problem(found, found.other_counting)
+    if found.other_convention is not None:
+        yield _convention_problem(found, found.other_convention)
         return
     if found.other_gravity is not None:
         words = ' '.join(f'{value:.3g}' for value in found.other_gravity)
@@ -58,9 +58,9 @@ def _load_problem(found: Identified, load: OtherLoad) -> str:
     )
 
 
-def _counting_problem(found: Identified, other: OtherCounting) -> str:
+def _convention_problem(found: Identified, other: OtherConvention) -> str:
     """Return which zeros and directions of joints would explain the torques."""
-    signs, offsets = other.counting
+    signs, offsets = other.convention
     reversed_joints = [found.joints[i] for i in np.flatnonzero(signs < 0.0)]
     moved = ', '.join(
         f'{offset:+.5g} rad to {name}'

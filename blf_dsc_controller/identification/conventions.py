@@ -46,7 +46,7 @@ _Ways = tuple[_Way, ...]
 _AS_IS: _Way = (1, 0)
 
 
-class Counting(NamedTuple):
+class Convention(NamedTuple):
     """How n joints count: those of the URDF are at signs q + offsets."""
 
     signs: Floats  # (n,) 1 or -1, of positions and efforts
@@ -57,20 +57,20 @@ class Counting(NamedTuple):
         """Numbers of the joints that count otherwise than the URDF."""
         return np.flatnonzero((self.signs < 0.0) | (self.offsets != 0.0))
 
-    def simpler(self, i: int) -> Iterator[Counting]:
-        """Yield other ways of counting, in which joint i is as in the URDF, or has its zero."""
+    def simpler(self, i: int) -> Iterator[Convention]:
+        """Yield other ways of convention, in which joint i is as in the URDF, or has its zero."""
         for sign in dict.fromkeys((1.0, float(self.signs[i]))):
             signs, offsets = self.signs.copy(), self.offsets.copy()
             signs[i], offsets[i] = sign, 0.0
-            simpler = Counting(signs, offsets)
+            simpler = Convention(signs, offsets)
             is_other = sign != self.signs[i] or self.offsets[i] != 0.0
             if is_other and simpler.unlike.size:
                 yield simpler
 
 
-def converted(recording: Recording, counting: Counting) -> Recording:
+def converted(recording: Recording, convention: Convention) -> Recording:
     """Return the recording as if it had been counted as the URDF does."""
-    signs, offsets = counting
+    signs, offsets = convention
 
     def negated(values: Samples) -> Samples:
         return mapped(recording.gap.size, lambda rows: signs * values[rows])
@@ -83,9 +83,9 @@ def converted(recording: Recording, counting: Counting) -> Recording:
     )
 
 
-def likely_countings(
+def likely_conventions(
     recording: Recording, robot: Robot, unexplained: Sequence[int]
-) -> list[Counting]:
+) -> list[Convention]:
     """Return ways in which the joints may count, the best first.
 
     `unexplained` are joints, the worst first, that may count the other way round
@@ -105,12 +105,12 @@ def likely_countings(
     likely = (each for each in gravity.best() if gravity.cost(each) < most)
     turned = (gravity.turned(as_is, i) for i in unexplained if i in turning)
     ways = chain(islice(likely, _CANDIDATES), islice(turned, _CANDIDATES))
-    return [_counting(each) for each in dict.fromkeys(ways)]
+    return [_convention(each) for each in dict.fromkeys(ways)]
 
 
-def _counting(ways: _Ways) -> Counting:
+def _convention(ways: _Ways) -> Convention:
     signs, quarters = np.array(ways, dtype=float).T
-    return Counting(signs, 0.25 * TURN * quarters)
+    return Convention(signs, 0.25 * TURN * quarters)
 
 
 def _with(ways: _Ways, i: int, way: _Way) -> _Ways:
@@ -137,7 +137,7 @@ class _Gravity:
     def cost(self, ways: _Ways) -> float:
         """Return the squares that remain if joints count in other ways."""
         if ways not in self._known:
-            signs, offsets = _counting(ways)
+            signs, offsets = _convention(ways)
             weight = gravity_columns(self._chain, signs * self._q + offsets) @ self._g
             left = (self._u - signs * weight) / self._scale
             explained = [Q.T @ own for Q, own in zip(self._bases, left.T, strict=True)]
