@@ -5,7 +5,8 @@
 
 Links are up to 30 % heavier or lighter than the URDF's.  Friction is drawn for each joint, 0.2 to
 1.8 times what the law assumes, with up to 0.7 more at low speed, which fades over 0.02 to 0.2
-rad/s.  The motions are those that people have, with rests:
+rad/s.  The rigid FR3 has no torque loop, and efforts with friction, as its law is told.
+The motions are those that people have, with rests:
 
     trapezoids  from posture to posture, with trapezoidal velocities
     pick        pick and place, by way of postures above, the same ones in every cycle
@@ -205,10 +206,16 @@ def loop_of(arm: str, seed: int, load: float, **more: Any) -> LoopConfig:
         'events.payload': held,
     }
     plant |= {f'disturbance.{name}': value for name, value in more.items()}
+    controller: dict[str, Any] = {'contact.enabled': True}
     if arm in RIGID:
         plant['joint.stiffness'] = []
         plant |= {'actuator.loop_gain': 0.0, 'actuator.loop_damping': 0.0}
-    return load_loop(preset, {PLANT: plant, CONTROLLER: {'contact.enabled': True}})
+        controller |= {
+            'robot.torque_loop': False,
+            'robot.viscous': list(usual.viscous),
+            'robot.coulomb': list(usual.coulomb),
+        }
+    return load_loop(preset, {PLANT: plant, CONTROLLER: controller})
 
 
 def recorded(loop: LoopConfig, motion: str, seed: int) -> Record:
