@@ -28,7 +28,7 @@ from blf_dsc_controller.arms.linear_loop import (
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load, locate
+from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.controller import controller_of
 
@@ -220,10 +220,19 @@ def test_gains_of_the_law_add_up_to_stiffness_and_damping():
 def test_the_integral_is_smaller_where_a_heavy_arm_is_hardly_damped():
     gains = JointGains(np.array([600.0]), np.array([30.0]))
     light, heavy = (gains.integral(np.array([J])) for J in (0.5, 20.0))
-    assert light == pytest.approx(0.15 * gains.rate * gains.damping)
+    assert light == pytest.approx(0.45 * gains.rate * gains.damping)
     # stable without friction: d (1.8 r d) > J 1.5 c r^2 d, three times over
     slow = 1.5 * gains.rate * heavy
     assert 20.0 * slow * 3.0 == pytest.approx(gains.damping * 1.8 * gains.rate * 30.0)
+
+
+@pytest.mark.parametrize('preset', ['ur5e', 'ur5e_driver', 'panda', 'fr3'])
+def test_the_integral_is_weaker_beside_the_load_observer_of_a_torque_loop(preset):
+    config = load_loop(preset).controller
+    rate = config.surface.gain[-2] / 0.4
+    share = config.disturbance.gain[-2] / (rate * config.feedback.gain[-2])
+    most = 0.15 if config.robot.torque_loop else 0.45
+    assert share == pytest.approx(most, rel=1e-3)
 
 
 def test_a_law_of_joints_does_not_multiply_its_feedback_by_inertias():

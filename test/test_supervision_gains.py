@@ -340,8 +340,8 @@ def test_drives_may_be_heavier_than_guessed_if_nothing_hides_or_tells_them():
         expected_errors(each, settings_of_config(each))
         for each in (guessed, told, hidden)
     )
-    # on UR5es with five times the guess, the last joint was 6.8 to 7.7 mrad off
-    assert 6.8e-3 < expected.unmodelled[-1] < 9e-3
+    # on 20 UR5es with five times the guess, the last joint was 2.6 to 6.5 mrad off
+    assert 5.5e-3 < expected.unmodelled[-1] < 7e-3
     for each in others:
         np.testing.assert_array_equal(each.pick_up, expected.pick_up)
         assert (each.unmodelled < 0.7 * expected.unmodelled).all()

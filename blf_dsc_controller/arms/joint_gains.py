@@ -10,10 +10,11 @@ stiffness k and the damping d of a joint follow the gains of the law (28),
     r = k / (1.8 d),    K = 0.4 r,  mu = 1.3 r,  K_p = d,  w = 0.3 r d,  gamma = c r d
 
 so that near the reference the torque is - d xi1' - (1.8 + c) r d xi1 - 1.5 c r^2 d int xi1.
-The integral's share c is at most 0.15, and less where the damping is small for the
-inertia J of the outstretched, loaded arm: d (1.8 r d) > J 1.5 c r^2 d keeps the slow
-oscillation damped, here by a factor of three.  What the tracking error adapts is an
-integral as well, so its gain is bounded by the same share.
+The integral's share c is at most 0.45, or 0.15 where drives have a torque loop: there a
+load observer integrates beside it, and play in the gears bears no more.  It is less where
+the damping is small for the inertia J of the outstretched, loaded arm: d (1.8 r d) >
+J 1.5 c r^2 d keeps the slow oscillation damped, here by a factor of three.  What the
+tracking error adapts is an integral beside it as well.
 
 Of an arm about which nothing but its URDF is known, the gears may have any stiffness,
 the encoders may be on either side of them, and drives may have a torque loop that hides
@@ -36,7 +37,6 @@ _BARRIER = 0.3  # w / (r d)
 _STEEPEST = 0.9  # likewise, of the barrier's slope near the bound
 _FILTERED = 0.4, 1.3  # K / r and mu / r
 _RATE = _FILTERED[0] / 2.0 + _FILTERED[1]  # of xi1 in xi2, over r
-_INTEGRAL = 0.15  # c
 _DAMPED = 0.4  # of d (1.8 r d) / (J 1.5 r^2 d), for c
 _FUNNEL = 0.1  # times r: the integral is as fast
 
@@ -48,11 +48,19 @@ SURFACE = 0.004
 """Least time constant of the surface filter [s]: noise of alpha2'."""
 
 
-class JointGains(NamedTuple):
-    """Stiffness (n,) [N m/rad] and damping (n,) [N m s/rad] of each joint's feedback."""
+ALONE, BESIDE = 0.45, 0.15
+"""Largest share c of an integral by itself, and beside another one."""
 
-    stiffness: Floats
-    damping: Floats
+GIVEN = 'stiffness', 'damping'
+"""Fields of `JointGains` that a configuration gives as `feedback.joint_*`."""
+
+
+class JointGains(NamedTuple):
+    """Stiffness and damping of each joint's feedback, and the largest share of its integral."""
+
+    stiffness: Floats  # (n,) N m/rad
+    damping: Floats  # (n,) N m s/rad
+    share: float = ALONE
 
     @property
     def rate(self) -> Floats:
@@ -61,12 +69,14 @@ class JointGains(NamedTuple):
 
     def integral(self, inertia: Floats) -> Floats:
         """Return gamma (n,) [N m/rad] for the largest inertia of each joint (n,) [kg m^2]."""
-        share = _DAMPED * self.damping / (self.rate * inertia)
-        return self.rate * self.damping * np.minimum(share, _INTEGRAL)
+        damped = _DAMPED * self.damping / (self.rate * inertia)
+        return self.rate * self.damping * np.minimum(damped, self.share)
 
     def scaled(self, factor: float | Floats) -> JointGains:
         """Return stiffness and damping times a factor."""
-        return JointGains(factor * self.stiffness, factor * self.damping)
+        return self._replace(
+            stiffness=factor * self.stiffness, damping=factor * self.damping
+        )
 
 
 def unknown_arm(motors: Floats) -> JointGains:

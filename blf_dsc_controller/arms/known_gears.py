@@ -20,7 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, linear
+from blf_dsc_controller.arms.joint_gains import (
+    ALONE,
+    BESIDE,
+    JointGains,
+    damped_arm,
+    linear,
+)
 from blf_dsc_controller.arms.linear_loop import (
     Feedback,
     Joints,
@@ -88,9 +94,11 @@ class GearedArm(NamedTuple):
 
     def joint_gains(self) -> JointGains:
         """Return the stiffest gains of joints, each on its own, with the margin."""
+        share = BESIDE if self.gears.has_torque_loop else ALONE
 
         def gains(rate: float) -> JointGains:
-            return damped_arm(rate * self.gears.motors, self.inertia)
+            gains = damped_arm(rate * self.gears.motors, self.inertia)
+            return gains._replace(share=share)
 
         def feedback(rate: float) -> Feedback:
             return linear(gains(rate), self.inertia, len(self.links))

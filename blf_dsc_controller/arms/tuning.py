@@ -28,6 +28,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters, prior_factor
 from blf_dsc_controller.arms.joint_gains import (
+    BESIDE,
     SURFACE,
     JointGains,
     funnel_rate,
@@ -156,7 +157,8 @@ def _of_joints(
     usual_bound = np.maximum(sag, _BOUND)
     start = np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
     inertia = postures.inertia
-    Gamma = adaptation_gain(gains.integral(inertia), postures.gravity)
+    beside = gains._replace(share=BESIDE).integral(inertia)
+    Gamma = adaptation_gain(beside, postures.gravity)
     law = {name: _listed(each) for name, each in law_gains(gains, inertia).items()}
     return {
         **law,
@@ -189,10 +191,10 @@ def linear_surface_gains(arm: Design) -> Mapping[str, Value]:
 
 
 def adaptation_gain(integral: np.ndarray, deviation: np.ndarray) -> float:
-    """Return a Gamma with which the tracking error adapts no faster than d^3.
+    """Return a Gamma with which the tracking error adapts no faster than an integral.
 
-    `integral` (n,) [N m/rad] is gamma, and `deviation` (n,) [N m] the standard deviation
-    of the modelled torque: where d^3 integrates gamma xi2, adaptation integrates
+    `integral` (n,) [N m/rad] is the gain gamma of that, and `deviation` (n,) [N m] the standard
+    deviation of the modelled torque: where d^3 integrates gamma xi2, adaptation integrates
     Gamma deviation^2 xi2.  It grows with the square of the payload, and nothing else
     bounds it on slow or soft loops.
     """

@@ -11,7 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.arms.joint_gains import JointGains, damped_arm, unknown_arm
+from blf_dsc_controller.arms.joint_gains import (
+    JointGains,
+    damped_arm,
+    unknown_arm,
+)
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
@@ -339,7 +343,12 @@ def _gains_by_factors(
     """
     if config.feedback.joint_stiffness:
         return start.scaled
-    return lambda factors: damped_arm(factors * start.damping, inertia)
+
+    def gains(factors: Floats) -> JointGains:
+        damped = damped_arm(factors * start.damping, inertia)
+        return damped._replace(share=start.share)
+
+    return gains
 
 
 def _expected_friction(found: Findings, start: JointGains) -> Floats:

@@ -10,7 +10,13 @@ import numpy as np
 
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.base_parameters import BaseParameters
-from blf_dsc_controller.arms.joint_gains import JointGains, unknown_arm
+from blf_dsc_controller.arms.joint_gains import (
+    ALONE,
+    BESIDE,
+    GIVEN,
+    JointGains,
+    unknown_arm,
+)
 from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration import tool_bound
@@ -96,6 +102,7 @@ def stated_design(
     usual = 'whole' if not is_own or (gears and gears.has_torque_loop) else 'none'
     is_whole = given.get('feedback.inertia', usual) != 'none'
     gains = _given_gains(given, len(motors)) or unknown_arm(motors)
+    gains = gains._replace(share=BESIDE if robot.torque_loop else ALONE)
     arm = tuning.Design(
         chain,
         base,
@@ -132,11 +139,9 @@ def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:
 
 def _given_gains(given: Mapping[str, Any], n: int) -> JointGains | None:
     """Return the given gains of n joints; None: not given, or not valid (`problems`)."""
-    gains = JointGains(
-        *(
-            np.array(given.get(f'feedback.joint_{each}', ()))
-            for each in JointGains._fields
-        )
+    stiffness, damping = (
+        np.array(given.get(f'feedback.joint_{each}', ())) for each in GIVEN
     )
+    gains = stiffness, damping
     is_valid = all(each.shape == (n,) and (each > 0.0).all() for each in gains)
-    return gains if is_valid else None
+    return JointGains(stiffness, damping) if is_valid else None
