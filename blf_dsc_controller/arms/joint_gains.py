@@ -79,6 +79,11 @@ class JointGains(NamedTuple):
         )
 
 
+def largest_share(*, has_torque_loop: bool) -> float:
+    """Return the largest share of the integral of an arm."""
+    return BESIDE if has_torque_loop else ALONE
+
+
 def unknown_arm(motors: Floats) -> JointGains:
     """Return gains that hold an arm of which only motors (n,) [kg m^2] are guessed."""
     damping = _HELD * motors

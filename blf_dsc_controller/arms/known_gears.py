@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import (
-    ALONE,
-    BESIDE,
     JointGains,
     damped_arm,
+    largest_share,
     linear,
 )
 from blf_dsc_controller.arms.linear_loop import (
@@ -94,7 +93,7 @@ class GearedArm(NamedTuple):
 
     def joint_gains(self) -> JointGains:
         """Return the stiffest gains of joints, each on its own, with the margin."""
-        share = BESIDE if self.gears.has_torque_loop else ALONE
+        share = largest_share(has_torque_loop=self.gears.has_torque_loop)
 
         def gains(rate: float) -> JointGains:
             gains = damped_arm(rate * self.gears.motors, self.inertia)

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.arms.joint_gains import (
+    BESIDE,
     JointGains,
     damped_arm,
+    largest_share,
     unknown_arm,
 )
 from blf_dsc_controller.arms.model import inertia_matrices
@@ -341,12 +343,13 @@ def _gains_by_factors(
     Where the configuration gives a stiffness, it grows with the damping; else it follows
     from the damping and the inertia (n,) [kg m^2].
     """
-    if config.feedback.joint_stiffness:
-        return start.scaled
+    follow = not config.feedback.joint_stiffness
+    share = largest_share(has_torque_loop=config.robot.torque_loop)
 
     def gains(factors: Floats) -> JointGains:
-        damped = damped_arm(factors * start.damping, inertia)
-        return damped._replace(share=start.share)
+        scaled = start.scaled(factors)
+        found = damped_arm(scaled.damping, inertia) if follow else scaled
+        return found._replace(share=share)
 
     return gains
 
@@ -381,7 +384,7 @@ def _unseen(found: Findings, assumed: Floats) -> Floats:
 def measuring_gains(arm: Design) -> JointGains:
     """Return the gains with which an arm is measured."""
     gains = arm.joints or unknown_arm(arm.rotors)
-    return gains.scaled(arm.stiffness)
+    return gains.scaled(arm.stiffness)._replace(share=BESIDE)
 
 
 def _check_posture(config: ControllerConfig, posture: Floats) -> None:

@@ -11,10 +11,9 @@ import numpy as np
 from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.joint_gains import (
-    ALONE,
-    BESIDE,
     GIVEN,
     JointGains,
+    largest_share,
     unknown_arm,
 )
 from blf_dsc_controller.arms.known_gears import Gears
@@ -102,7 +101,7 @@ def stated_design(
     usual = 'whole' if not is_own or (gears and gears.has_torque_loop) else 'none'
     is_whole = given.get('feedback.inertia', usual) != 'none'
     gains = _given_gains(given, len(motors)) or unknown_arm(motors)
-    gains = gains._replace(share=BESIDE if robot.torque_loop else ALONE)
+    share = largest_share(has_torque_loop=robot.torque_loop)
     arm = tuning.Design(
         chain,
         base,
@@ -111,7 +110,7 @@ def stated_design(
         robot.unknown_friction(chain),
         robot.payload,
         robot.lag,
-        None if is_whole else gains,
+        None if is_whole else gains._replace(share=share),
         given.get('feedback.stiffness', Feedback().stiffness),
         given.get('sample_time', ArmConfig.sample_time),
     )
