@@ -227,7 +227,7 @@ def test_lack_by_a_wrong_model_of_the_drive_counts_once_it_changes_at_rest():
             begins = moves and k == 0
             now = sample([5.0, 0.0], effort=[4.0, 0.0], **told, begins=begins)
             assert not effect.compare_effort(limits, state, now, moves)
-    np.testing.assert_allclose(state.lack, [2.0, 0.0])
+    np.testing.assert_allclose(state.shortfall, [2.0, 0.0])
     now = sample([5.0, 0.0], effort=[2.0, 0.0], **told)
     found = [effect.compare_effort(limits, state, now, moves=False) for _ in range(500)]
     assert found[-1]

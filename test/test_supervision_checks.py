@@ -138,7 +138,7 @@ def test_only_an_effort_that_lacks_more_than_usual_explains_an_error(
     given = {'robot.effort': 'whole', 'safety.error_ratio': 1.0}
     check = sample_check(build(ControllerConfig, given), law)
     law.checks.effect.usual[0] = 1.8
-    law.checks.effect.lack[0] = lack
+    law.checks.effect.shortfall[0] = lack
     law.checks.repeats.used[4:] = law.sample.torque - [now, 0.0]
     law.sample.xi1[0] = 2.0 * law.sample.bound[0]
     law.flags = verdict(law)
@@ -157,7 +157,7 @@ def test_what_drives_add_is_no_lack_of_a_whole_effort():
     added, limit = law.signals.saturation.added, law.settings.torque.limit
     i = int(np.argmax(np.abs(added) / limit))
     assert abs(added[i]) > 0.1 * limit[i]
-    law.checks.effect.lack[i] = -np.sign(added[i]) * limit[i] / 3.0
+    law.checks.effect.shortfall[i] = -np.sign(added[i]) * limit[i] / 3.0
     law.checks.repeats.used[14:] = law.sample.torque + added
     law.sample.xi1[i] = 2.0 * law.sample.bound[i]
     law.flags = verdict(law)

@@ -15,12 +15,11 @@ SUSPECT = 1
 OUTSIDE = 2
 """An error outside its bound."""
 
-NO_EFFECT = 8
-"""Commands that do not reach the arm, or an arm that is held: see `effect`."""
-
 INVALID = 4
 """A joint state that is not finite or too fast; the law did not use it."""
 
+NO_EFFECT = 8
+"""Commands that do not reach the arm, or an arm that is held: see `effect`."""
 
 CONTRADICTION = 16
 """Velocities that are not those of the positions; the law did not use them. Goes with INVALID."""

@@ -212,7 +212,7 @@ def check_sensors(
     limit = settings.torque.limit
     for i in range(settings.n):
         work.differences[0, i] = of.filtered[i, settings.p] - now.command[i]
-        if now.is_told[0] == 0.0:
+        if now.is_distinct[0] == 0.0:
             work.differences[1, i] = load_observer.residual(
                 settings.observer, of, i, state.estimate, state.absorbed.absorbed
             )

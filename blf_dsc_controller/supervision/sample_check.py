@@ -21,9 +21,9 @@ from blf_dsc_controller.supervision.supervisor import Fault, Reason
 from blf_dsc_controller.tool.errors import in_words
 
 Vector = NDArray[np.float64]
-# of the torque limit: what an effort lacks, on average and now, that explains an error
-# past the bound
-_LACKS, _LACKS_NOW = 0.05, 0.1
+# of the torque limit: an effort that is so much below its command, on average and now,
+# explains an error past the bound
+_SHORT, _SHORT_NOW = 0.05, 0.1
 _LIGHT = 0.5  # of the assumed inertia: less is worth saying
 _NOTHING = 0.02  # of it: no drive has so little
 _AGAINST = 0.1  # of the torque limit, beyond the torque of the model at rest
@@ -170,9 +170,11 @@ class SampleCheck:
             return Fault(Reason.OSCILLATION, shaking)
         if saturation := self._cause.saturation(self.saturated_time):
             return Fault(Reason.SATURATED, f'{saturation}; no joint moves any more')
-        if checks.effect.lacking[0] > 0.0:
-            lack = checks.effect.lack - checks.effect.lack_in_motion
-            return self._lacking(int(np.argmax(np.abs(lack) / limit)), lack)
+        if checks.effect.short_for[0] > 0.0:
+            shortfall = checks.effect.shortfall - checks.effect.shortfall_in_motion
+            return self._falling_short(
+                int(np.argmax(np.abs(shortfall) / limit)), shortfall
+            )
         change = checks.effect.recent - checks.effect.before
         worst = int(np.argmax(np.abs(change) / limit))
         text = (
@@ -183,10 +185,10 @@ class SampleCheck:
         )
         return Fault(Reason.NO_EFFECT, text)
 
-    def _lacking(self, joint: int, lack: Vector) -> Fault:
-        """Return the fault of a joint whose effort lacks `lack` (n,) [N m]."""
+    def _falling_short(self, joint: int, shortfall: Vector) -> Fault:
+        """Return the fault of a joint whose effort is `shortfall` (n,) [N m] below its command."""
         text = (
-            f'the effort of joint {self._joints[joint]!r} lacks {lack[joint]:+.4g} N m of '
+            f'the effort of joint {self._joints[joint]!r} lacks {shortfall[joint]:+.4g} N m of '
             'what is commanded: release the brakes, and activate the effort controller; if the '
             'effort is not a torque in N m, set robot.effort to current or unknown; if the joint '
             'moves, its drive gives less than it is sent: correct its torque constant, gear ratio '
@@ -200,18 +202,20 @@ class SampleCheck:
         checks = self._controller.checks
         if checks.effect.compares[0] == 0.0 or self._cause.oscillation:
             return None
-        lack = checks.effect.lack - checks.effect.usual
+        shortfall = checks.effect.shortfall - checks.effect.usual_shortfall
         now = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
         if settings.torque.drive > 0 and settings.torque.effort_is_whole == 1:
             now += self._controller.signals.saturation.added
-        now -= checks.effect.usual
-        share = np.abs(lack) / settings.torque.limit
+        now -= checks.effect.usual_shortfall
+        share = np.abs(shortfall) / settings.torque.limit
         share_now = np.abs(now) / settings.torque.limit
-        lacks = (share > _LACKS) & (share_now > _LACKS_NOW) & (lack * now > 0.0)
-        if not lacks.any():
+        is_short = (share > _SHORT) & (share_now > _SHORT_NOW) & (shortfall * now > 0.0)
+        if not is_short.any():
             return None
         self.return_to_consistent()
-        return self._lacking(int(np.argmax(np.where(lacks, share, 0.0))), lack)
+        return self._falling_short(
+            int(np.argmax(np.where(is_short, share, 0.0))), shortfall
+        )
 
     def _outside(self) -> Fault | None:
         safety = self._safety
