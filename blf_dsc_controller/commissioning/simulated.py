@@ -102,7 +102,7 @@ def _strongest(
     planned = commissioning.motion(posture)
     run = measured(planned, plant)
     for _ in range(REPEATS):
-        again = commissioning.stronger(planned, run[0])
+        again = commissioning.plan_repeat(planned, run[0])
         if again is None:
             break
         planned, run = again, measured(again, plant)
