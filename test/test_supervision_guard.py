@@ -441,8 +441,10 @@ def test_gains_that_a_running_law_cannot_adopt_are_rejected(start, given, messag
     rig.step(400 if start else 200)
     assert rig.guard.controller.state.latch.latched[0] == bool(start)
     candidate = change(rig.guard.config, given)
+    signals = rig.guard.controller.signals_vector.copy()
     found = rig.guard.problems(candidate)
     assert [problem.startswith(message) for problem in found] == [True] * bool(message)
+    np.testing.assert_array_equal(rig.guard.controller.signals_vector, signals)
     rig.guard.deactivate()
     assert rig.guard.problems(candidate) == []
 

@@ -360,9 +360,7 @@ class Controller:
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
-        signals = self.signals
-        barrier.update_bound(self.settings.barrier, signals.barrier, t, signals.bound)
-        return np.array(self.signals.bound)
+        return barrier.bound_at(self.settings.barrier, t)
 
     def reference_at(self, t: float) -> Array:
         """Return the reference qr, dqr, ddqr (3, n) at time t [s] since the start."""

@@ -139,13 +139,15 @@ class SampleCheck:
             self.relax(dt)
             return None
         if flags & NO_EFFECT:
-            return self._without_effect()
-        fault = self._not_finite() or self._outside() or self._saturated(dt)
+            return self._stop_without_effect()
+        fault = (
+            self._check_numbers() or self._check_error() or self._count_saturated(dt)
+        )
         if fault is None:
             self.keep()
         return fault
 
-    def _not_finite(self) -> Fault | None:
+    def _check_numbers(self) -> Fault | None:
         state = self._controller.state
         demand = self._controller.signals.demand
         if not (
@@ -161,8 +163,8 @@ class SampleCheck:
             return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
         return None
 
-    def _without_effect(self) -> Fault:
-        """Return to the estimates from before the commands had no effect."""
+    def _stop_without_effect(self) -> Fault:
+        """Keep the estimates of when a joint last moved; return the fault."""
         checks = self._controller.checks
         limit = self._controller.settings.torque.limit
         self._kept[:] = checks.estimates.moved
@@ -196,8 +198,11 @@ class SampleCheck:
         )
         return Fault(Reason.NO_EFFECT, text)
 
-    def _unreached(self) -> Fault | None:
-        """Return the fault if efforts show that commands do not reach a moving arm."""
+    def _check_reach(self) -> Fault | None:
+        """Return the fault if efforts show that commands do not reach a moving arm.
+
+        The kept estimates are then those from before the error grew.
+        """
         settings = self._controller.settings
         checks = self._controller.checks
         if checks.effect.compares[0] == 0.0 or self._cause.oscillation:
@@ -217,7 +222,7 @@ class SampleCheck:
             int(np.argmax(np.where(is_short, share, 0.0))), shortfall
         )
 
-    def _outside(self) -> Fault | None:
+    def _check_error(self) -> Fault | None:
         safety = self._safety
         if safety.error_ratio == 0.0 or self._controller.settings.has_barrier == 0:
             return None
@@ -227,7 +232,7 @@ class SampleCheck:
         worst = int(np.argmax(ratio))
         if ratio[worst] < safety.error_ratio:
             return None
-        if (unreached := self._unreached()) is not None:
+        if (unreached := self._check_reach()) is not None:
             return unreached
         share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
         text = (
@@ -292,8 +297,8 @@ class SampleCheck:
             'holds it'
         )
 
-    def _saturated(self, dt: float) -> Fault | None:
-        """Count a sample with a torque at its limit."""
+    def _count_saturated(self, dt: float) -> Fault | None:
+        """Count a sample with a torque at its limit; return the fault if there are too many."""
         signals = self._controller.signals
         limit = self._controller.settings.torque.limit
         demand, added = signals.demand, signals.saturation.added
