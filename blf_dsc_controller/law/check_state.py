@@ -6,8 +6,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.law import effect, kept_estimates, repeats, sensor
-from blf_dsc_controller.law.oscillation import Oscillation
+from blf_dsc_controller.law import effect, kept_estimates, oscillation, repeats, sensor
 
 SUSPECT = 1
 """A value that is not finite, a torque demand past its limit, or too large an error."""
@@ -42,7 +41,7 @@ class Checks(NamedTuple):
     repeats: repeats.State
     sensor: sensor.State
     effect: effect.State
-    oscillation: Oscillation
+    oscillation: oscillation.State
 
 
 checks_of = view_of(Checks)

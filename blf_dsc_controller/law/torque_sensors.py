@@ -38,7 +38,6 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.lag import filter_gain
-from blf_dsc_controller.law.oscillation import Oscillation
 
 NONE, SHAKES, COMMANDS, OFF = range(4)
 """What is wrong with the efforts, if anything."""
@@ -72,7 +71,7 @@ class State(NamedTuple):
     # (N m)^2 s, integrals of the squares of what is faster
     square: Annotated[Array, '2 * observer.enabled', 'n']
     lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
-    shaking: Oscillation  # of r
+    shaking: oscillation.State  # of r
 
 
 class Work(NamedTuple):

@@ -57,7 +57,7 @@ class Work(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The whole of it."""
+    """A window: its settings, its rows, and its equations."""
 
     settings: Settings
     state: State
