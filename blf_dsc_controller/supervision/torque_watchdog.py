@@ -136,7 +136,7 @@ class TorqueWatchdog:
         """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
         limit = self.config.safety.velocity_limit
         gap = (stamp - self.stamp) * 1e-9
-        measurement, _ = self._wraps.counted(measurement, gap, limit)
+        measurement, _ = self._wraps.count(measurement, gap, limit)
         q = measurement[: self._settings.n]
         self._sensor.take(q, gap, self.config.sample_time)
         self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
@@ -179,7 +179,7 @@ class TorqueWatchdog:
 
     def name_swings(self) -> str:
         """Return a text about joints that swing under its torque, each once; or empty."""
-        return self._swings.text(self._safe.has_swung)
+        return self._swings.name(self._safe.has_swung)
 
     def leave(self) -> Vector | None:
         """Return the torque to leave behind, None if the controller commands."""
