@@ -141,7 +141,8 @@ def test_a_load_that_nobody_tells_the_drives_is_warned_of(ros, log):
 
 def test_findings_of_a_running_law_are_warned_of_once_each():
     told = []
-    log = ControllerLog(SimpleNamespace(warning=told.append), '/blf_dsc_controller')
+    logger = SimpleNamespace(warning=told.append)
+    log = ControllerLog(SimpleNamespace(get_logger=lambda: logger))
     contacts = SimpleNamespace(count=0, last=None)
     guard = SimpleNamespace(
         findings=SimpleNamespace(contacts=contacts, untrusted=''),

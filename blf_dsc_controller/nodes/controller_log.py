@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rclpy.impl.rcutils_logger import RcutilsLogger
-
 from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
+from blf_dsc_controller.nodes.process import PlainNode
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.supervisor import Phase
@@ -21,11 +20,11 @@ class ControllerLog:
         warns_of_gains: whether to warn, once, of gains whose margin nobody has measured.
     """
 
-    def __init__(self, log: RcutilsLogger, node: str) -> None:
-        """Write to the log of a node, by its full name."""
+    def __init__(self, node: PlainNode) -> None:
+        """Write to the log of a node."""
         self.warns_of_gains = True
-        self._log = log
         self._node = node
+        self._log = node.get_logger()
         self._phase = Phase.INACTIVE, 0, False, ''  # stops, silenced, text of a stop
         self._turned_at = -1  # ns, start of the last reference shifted by turns
         self._columns = b''  # those that are estimated, and whether they were checked
@@ -53,7 +52,8 @@ class ControllerLog:
             self._log.warning(supervisor.text)
         elif is_stopped:
             stop = f'{guard.config.safety.torque} torque: {supervisor.text}'
-            self._log.fatal(f'{stop}; {self._node}/reset starts again')
+            reset = f'{self._node.get_fully_qualified_name()}/reset'
+            self._log.fatal(f'{stop}; {reset} starts again')
         elif supervisor.phase is Phase.APPROACHING:
             left = guard.reference.settled - guard.reference.time
             self._log.info(f'approaching the reference, for {left:.3g} s')

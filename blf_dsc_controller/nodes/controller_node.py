@@ -76,7 +76,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         # whether the tracking errors had subscribers at the last count
         self._errors_subscribed = False
         self.warned_at = -1
-        self.log = ControllerLog(self.get_logger(), self.get_fully_qualified_name())
+        self.log = ControllerLog(self)
         # After a signal:
         self._ends_at = 0.0  # s, at the latest
         self._last_seen = 0, 0.0  # joint states processed by then, and s, the last

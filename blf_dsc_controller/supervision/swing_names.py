@@ -20,8 +20,8 @@ class SwingNames:
         """Begin a stop."""
         self._named[:] = False
 
-    def name(self, has_swung: NDArray[np.bool_]) -> str:
-        """Name joints (n,) that are not named yet, in a text; or empty."""
+    def text(self, has_swung: NDArray[np.bool_]) -> str:
+        """Return a text about joints (n,) that are not named yet; or empty."""
         new = has_swung & ~self._named
         if not new.any():
             return ''
