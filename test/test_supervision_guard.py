@@ -461,6 +461,14 @@ def test_gains_can_change_while_the_projection_holds_the_estimate():
     )
 
 
+def test_trial_that_cannot_be_made_leaves_the_checks_on():
+    law = Rig().guard.controller
+    limit = law.checks.velocity_limit[0]
+    with pytest.raises(BlfDscError, match='positions, velocities and torques'):
+        law.trial(0.0, 1e-3, np.zeros(3))
+    assert law.checks.velocity_limit[0] == limit > 0.0
+
+
 def test_plan_keeps_one_in_force_that_has_not_begun():
     """Two within the lead of the first: the reference continues until each of them begins."""
     rig = Rig()
