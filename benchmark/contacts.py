@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,10 +36,12 @@ from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.analysis.panels import BLUE, MUTED, ORANGE
 from blf_dsc_controller.cli.result_folder import make_folder
 from blf_dsc_controller.compiled.announcement import announced_compilation
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.law.samples import sample_columns
+from blf_dsc_controller.law.state import Sample
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import FIRST_STAMP, Floats
@@ -71,9 +73,8 @@ class Trial(NamedTuple):
 
     arm: str
     free: Mapping[str, Floats]  # (k,) from FREE to the push
-    pushed: Mapping[
-        str, Floats
-    ]  # (WATCHED,) since the push; NaN once the law has stopped
+    # (WATCHED,) since the push; NaN once the law has stopped
+    pushed: Mapping[str, Floats]
     rms: Floats  # (n,) N m, of the URDF's residual in free motion
     # of the detector as it is set by default, with loads expected:
     pick_up_alarms: int
@@ -111,56 +112,61 @@ def run(arm: str, seed: int, force: float) -> Trial | None:
     """
     loop = loop_of(arm, seed, force)
     begin = loop.plant.events.begin[1]
-    unlearned = [0.0] * len(loop.controller.learning.initial_estimate)
-    variants: dict[str, dict[str, Any]] = {
-        LEARNED: {'contact.loads': False},
-        TOLD: {'learning.weight': 0.0, 'learning.adaptation_gain': unlearned},
-        '': {},
-    }
-    records = {
-        name: simulate(change(loop.controller, given), loop.plant)
-        for name, given in variants.items()
-    }
-    residuals = external(records[TOLD])
-    t = records[TOLD].stamps * 1e-9
+    alone, of_urdf, expecting = (
+        simulate(controller, loop.plant) for controller in variants(loop.controller)
+    )
+    residuals = np.asarray(telemetry(of_urdf).external)
+    learned = telemetry(alone).contact[:, DISTANCE]
+    t = of_urdf.stamps * 1e-9
     free = (t >= FREE) & (t < begin)
+    watched = np.flatnonzero(t >= begin)[: round(WATCHED / loop.plant.sample_time)]
     known = residuals[free]
-    learned = sample_columns(
-        records[LEARNED].samples, records[LEARNED].controller.settings
-    ).contact[:, DISTANCE]
     if np.isnan(known).any() or np.isnan(learned[free]).any():
         return None
-    spread = known.T @ known / len(known)
-    told = np.sqrt(
-        np.einsum('ki,ij,kj->k', residuals, np.linalg.inv(spread), residuals)
-    )
-    count = round(WATCHED / loop.plant.sample_time)
-    distances = {LEARNED: learned, TOLD: told}
-    alarms = np.array(
-        [
-            (event.stamp - FIRST_STAMP) * 1e-9
-            for event in records[''].journal.pending
-            if event.type is EventType.CONTACT
-        ]
-    )
+    distances = {
+        LEARNED: learned,
+        TOLD: whitened(residuals, known),
+        USUAL: np.abs(residuals),
+    }
+    alarms = contact_times(expecting)
     found = alarms[alarms >= begin]
     return Trial(
         arm,
-        {name: each[free].astype(np.float32) for name, each in distances.items()}
-        | {USUAL: np.abs(known).astype(np.float32)},
-        {name: each[t >= begin][:count] for name, each in distances.items()}
-        | {USUAL: np.abs(residuals[t >= begin][:count])},
+        {name: each[free].astype(np.float32) for name, each in distances.items()},
+        {name: each[watched] for name, each in distances.items()},
         np.sqrt((known**2).mean(axis=0)),
-        int(((alarms >= PICK_UP) & (alarms < FREE)).sum()),
-        int(((alarms >= FREE) & (alarms < begin)).sum()),
-        float(found[0] - begin) if found.size else np.inf,
+        pick_up_alarms=int(((alarms >= PICK_UP) & (alarms < FREE)).sum()),
+        false_alarms=int(((alarms >= FREE) & (alarms < begin)).sum()),
+        delay=float(found[0] - begin) if found.size else np.inf,
     )
 
 
-def external(record: Record) -> Floats:
-    """Return r (k, n) [N m] of all samples; NaN after a stop."""
-    samples = sample_columns(record.samples, record.controller.settings)
-    return np.asarray(samples.external)
+def variants(config: ControllerConfig) -> Iterator[ControllerConfig]:
+    """Yield the law that expects no loads, that does not learn, and as it is set by default."""
+    unlearned = [0.0] * len(config.learning.initial_estimate)
+    yield change(config, {'contact.loads': False})
+    yield change(
+        config, {'learning.weight': 0.0, 'learning.adaptation_gain': unlearned}
+    )
+    yield config
+
+
+def telemetry(record: Record) -> Sample:
+    """Return the samples of a run as columns; NaN after a stop."""
+    return sample_columns(record.samples, record.controller.settings)
+
+
+def whitened(residuals: Floats, known: Floats) -> Floats:
+    """Return the lengths (k,) of residuals (k, n) by the mean square matrix of those `known`."""
+    inverse = np.linalg.inv(known.T @ known / len(known))
+    squares = np.einsum('ki,ij,kj->k', residuals, inverse, residuals)
+    return np.asarray(np.sqrt(squares))
+
+
+def contact_times(record: Record) -> Floats:
+    """Return when contacts were reported [s since the first sample]."""
+    found = (e for e in record.journal.pending if e.type is EventType.CONTACT)
+    return np.array([(event.stamp - FIRST_STAMP) * 1e-9 for event in found])
 
 
 def with_usual_limits(trials: Sequence[Trial]) -> list[Trial]:

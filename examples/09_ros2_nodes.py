@@ -31,27 +31,25 @@ def started(name: str, *parameters: str) -> subprocess.Popen:
 
 
 mode = sys.argv[1] if len(sys.argv) > 1 else 'realtime'
-processes = [
-    started('blf_dsc_controller', 'reference.type:=hold'),
-    started('sim_plant', f'mode:={mode}'),
-]
-if rviz := shutil.which('rviz2'):
-    view = str(blf.share_folder() / 'config' / 'arm.rviz')
-    processes.append(subprocess.Popen([rviz, '-d', view]))
-
-rclpy.init()
-node = Node('example')
-told, states = [], []
-latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-node.create_subscription(
-    DiagnosticStatus, 'blf_dsc_controller/state', told.append, latched
-)
-node.create_subscription(JointState, 'joint_states', states.append, 1)
-sender = node.create_publisher(
-    JointTrajectory, 'blf_dsc_controller/joint_trajectory', 1
-)
+processes = []
+rclpy.init()  # before the nodes: from here on, Ctrl-C and SIGTERM end in `finally`
 try:
-    while not (told and 'tracking' in told[-1].message and states):
+    processes.append(started('blf_dsc_controller', 'reference.type:=hold'))
+    processes.append(started('sim_plant', f'mode:={mode}'))
+    if rviz := shutil.which('rviz2'):
+        view = str(blf.share_folder() / 'config' / 'arm.rviz')
+        processes.append(subprocess.Popen([rviz, '-d', view]))
+    node = Node('example')
+    status, states = [], []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(
+        DiagnosticStatus, 'blf_dsc_controller/state', status.append, latched
+    )
+    node.create_subscription(JointState, 'joint_states', states.append, 1)
+    sender = node.create_publisher(
+        JointTrajectory, 'blf_dsc_controller/joint_trajectory', 1
+    )
+    while not (status and 'tracking' in status[-1].message and states):
         rclpy.spin_once(node, timeout_sec=0.1)
     names, begin = states[-1].name, states[-1].position
     point = JointTrajectoryPoint(positions=[q + 0.1 for q in begin])

@@ -212,12 +212,10 @@ class Elastic(NamedTuple):
     dtheta: Annotated[Array, 'springs']
     torque: Annotated[Array, 'springs']  # of the motors, behind their loop, N m
     hysteresis: Annotated[Array, 'springs']  # N m
-    transmitted: Annotated[
-        Array, 'springs'
-    ]  # by the springs, mean over the sample, N m
-    preload: Annotated[
-        Array, 'mounts'
-    ]  # of the base's springs, by the weight of the arm
+    # by the springs, mean over the sample, N m
+    transmitted: Annotated[Array, 'springs']
+    # of the base's springs, by the weight of the arm
+    preload: Annotated[Array, 'mounts']
 
 
 class ElasticMemory(NamedTuple):

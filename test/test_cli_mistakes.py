@@ -260,7 +260,11 @@ def test_mapping_that_is_none_is_told_before_work_is_announced(capsys):
 
 @pytest.mark.parametrize(
     ('command', 'what'),
-    [('report', 'drawn'), ('replay', 'run through the controller again')],
+    [
+        ('report', 'drawn'),
+        ('replay', 'run through the controller again'),
+        ('commission --config ur5e', 'read'),
+    ],
 )
 def test_work_on_a_large_bag_is_announced(tmp_path, monkeypatch, capsys, command, what):
     monkeypatch.chdir(tmp_path)
@@ -269,7 +273,7 @@ def test_work_on_a_large_bag_is_announced(tmp_path, monkeypatch, capsys, command
     for size, lines in ((9_000_000, 1), (12_000_000, 2)):
         with large.open('wb') as file:
             file.truncate(size)  # takes no space on the disk
-        assert main([command, 'long']) == 1  # it is no bag
+        assert main([*command.split(), 'long']) == 1  # it is no bag
         told = capsys.readouterr().err.splitlines()
         assert len(told) == lines
     assert told[0] == f'long: 12 MB are {what}'

@@ -358,11 +358,11 @@ def test_friction_does_not_hide_where_the_loop_is_unstable():
     stuck = commissioned(CONFIG, [(run, config)])
     assert stuck.has_margin
     assert true_loop(stuck.choice.gains, stuck.loops.inertia).margin().value == 0.0
-    again = commissioning.stronger(first, run)
+    again = commissioning.plan_repeat(first, run)
     assert not first.excitation.sliding
     assert commissioning.motion(POSTURE).excitation.sliding  # from the start, by then
     run, _ = simulated.measured(again, rubbing)
-    again = commissioning.stronger(again, run)
+    again = commissioning.plan_repeat(again, run)
     seen = commissioned(CONFIG, [simulated.measured(again, rubbing)])
     assert seen.has_margin
     gains = seen.choice.gains
@@ -704,7 +704,7 @@ def rubbing():
     (motion,) = commissioning.motions
     run, _ = simulated.measured(motion, STUCK)
     for _ in range(REPEATS):
-        motion = commissioning.stronger(motion, run)
+        motion = commissioning.plan_repeat(motion, run)
         run, config = simulated.measured(motion, STUCK)
     return commissioning.result([(run, config)])
 
@@ -848,7 +848,7 @@ def strongest(commissioning, arm):
     """Return the last motion that measures a simulated arm, and its run."""
     motion = commissioning.motion(POSTURE)
     run, _ = simulated.measured(motion, arm)
-    while again := commissioning.stronger(motion, run):
+    while again := commissioning.plan_repeat(motion, run):
         motion = again
         run, _ = simulated.measured(motion, arm)
     return motion, run
@@ -1125,11 +1125,11 @@ def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
     (weak,) = commissioning.motions
     clear = simulated.measured(weak, ARM)
     assert shown_by(*clear).factor == 1.0
-    assert commissioning.stronger(weak, clear[0]) is None
+    assert commissioning.plan_repeat(weak, clear[0]) is None
     run = simulated.measured(weak, coarse(5e-5))
     factor = shown_by(*run).factor
     assert 2.0 < factor < MOST
-    again = commissioning.stronger(weak, run[0])
+    again = commissioning.plan_repeat(weak, run[0])
     # the next posture begins with it
     assert commissioning.motion(POSTURE).torque == again.torque == factor * 0.01
     shares = again.excitation.amplitude / weak.excitation.amplitude
@@ -1149,7 +1149,7 @@ def test_the_second_motion_shows_a_margin_that_noise_had_hidden():
     (weak,) = commissioning.motions
     runs = [simulated.measured(weak, coarse(4e-4))]
     runs.append(
-        simulated.measured(commissioning.stronger(weak, runs[0][0]), coarse(4e-4))
+        simulated.measured(commissioning.plan_repeat(weak, runs[0][0]), coarse(4e-4))
     )
     found = [commissioning.result([each]) for each in runs]
     assert [each.has_margin for each in found] == [False, True]
@@ -1176,7 +1176,7 @@ def test_posture_after_one_that_nearly_oscillated_has_softer_gains(
 ):
     """Also if another process has found that it oscillates."""
     softer = iter([plan(CONFIG, POSTURE[None], share=0.5)[0], None, None])
-    monkeypatch.setattr(postures, 'stronger_by_bag', lambda *_: next(softer))
+    monkeypatch.setattr(postures, 'plan_repeat_by_bag', lambda *_: next(softer))
     monkeypatch.setattr(postures, 'better_known_by_bag', lambda *_: None)
     robot = _Elsewhere(blf.Commissioning(CONFIG, [POSTURE]), tmp_path)
     names = [name for name, _ in robot.runs(np.stack((POSTURE, POSTURE)))]
@@ -1210,9 +1210,9 @@ def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
         result.parameters()
     assert any('a smaller feedback.stiffness' in each for each in sentences(result))
     # friction and coarse encoders look alike, but for what the controller reports
-    assert commissioning.stronger(first, run[0]).share == 1.0
+    assert commissioning.plan_repeat(first, run[0]).share == 1.0
     reported = Oscillation(FIRST_STAMP, 'joint2', 25.0, 8.0, 1.0, 'it oscillates')
-    again = commissioning.stronger(first, replace(run[0], oscillations=(reported,)))
+    again = commissioning.plan_repeat(first, replace(run[0], oscillations=(reported,)))
     assert (first.share, again.share) == (1.0, 0.5)
     assert again.config.feedback.gain == tuple(0.5 * stiff.damping)
     assert (
@@ -1228,10 +1228,10 @@ def test_a_posture_is_measured_twice_at_most_and_motion_that_is_hidden_is_an_err
     (weak,) = commissioning.motions
     hidden = simulated.measured(weak, coarse(1e-4))
     assert shown_by(*hidden).factor == MOST
-    again = commissioning.stronger(weak, hidden[0])
+    again = commissioning.plan_repeat(weak, hidden[0])
     assert again.excitation.travel <= 1e-5
     still = simulated.measured(again, coarse(1e-4))
-    assert commissioning.stronger(again, still[0]) is None
+    assert commissioning.plan_repeat(again, still[0]) is None
     with pytest.raises(BlfDscError, match='positions do not show the motion'):
         commissioning.result([still])
 

@@ -160,7 +160,7 @@ def test_status_is_told_every_second_and_as_soon_as_the_state_changes(monkeypatc
     beside._reported = 100.0, 3
     beside._tell_status = lambda _: told.append((now[0], state.revision))
     for now[0], state.revision in ((100.5, 3), (100.6, 4), (100.7, 4), (101.7, 4)):
-        beside._report_now_and_then()
+        beside._tell_changes()
     assert told == [(100.6, 4), (101.7, 4)]
 
 

@@ -439,11 +439,11 @@ def test_a_script_is_told_that_the_arm_runs_once_the_law_has_its_first_sample():
     beside._goals = SimpleNamespace(watch=lambda _: None)
     beside._loop = beside._loading = None
     beside._braking, beside._tells_running = [], True
-    beside._report_now_and_then()
+    beside._tell_changes()
     assert told == []
     guard.has_sample = True
     for _ in range(3):
-        beside._report_now_and_then()
+        beside._tell_changes()
     assert told == [script_link.RUNNING]
 
 

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from law_part import part
 
-from blf_dsc_controller.law import effect, kept_estimates, repeats, sensor, torque
-from blf_dsc_controller.law.oscillation import Oscillation
+from blf_dsc_controller.law import (
+    effect,
+    kept_estimates,
+    oscillation,
+    repeats,
+    sensor,
+    torque,
+)
 
 N = 2
 DT = 1e-3  # s
@@ -30,8 +36,8 @@ def contradicted(velocity_of, waves=0.0, duration=2.0):
 
     `velocity_of` returns what is measured (N,) at a time, given position and velocity.
     """
-    state, oscillation = part(sensor.State, n=N), part(Oscillation, n=N)
-    oscillation.waves[:], oscillation.half[:] = waves, 0.01
+    state, shaking = part(sensor.State, n=N), part(oscillation.State, n=N)
+    shaking.waves[:], shaking.half[:] = waves, 0.01
     w = 2.0 * np.pi
     found = False
     for k in range(round(duration / DT)):
@@ -39,7 +45,7 @@ def contradicted(velocity_of, waves=0.0, duration=2.0):
         q = 0.2 * np.sin(w * t) * np.ones(N)
         measured = velocity_of(t, 0.2 * w * np.cos(w * t) * np.ones(N))
         reading = np.concatenate((q, measured, NOTHING))
-        found = found or sensor.compare_velocities(state, oscillation, DT, DT, reading)
+        found = found or sensor.compare_velocities(state, shaking, DT, DT, reading)
     return found
 
 
@@ -69,11 +75,11 @@ def test_velocity_is_that_of_its_positions(velocity_of, expected):
 def test_mismatch_that_a_lag_explains_counts_where_nothing_oscillates_fast(
     mismatch, waves, expected
 ):
-    state, oscillation = part(sensor.State, n=N), part(Oscillation, n=N)
+    state, shaking = part(sensor.State, n=N), part(oscillation.State, n=N)
     state.speed[:] = 1.0  # (rad/s)^2
     state.mismatch[1] = mismatch
-    oscillation.waves[1], oscillation.half[1] = waves, 0.01  # s: 50 Hz
-    assert sensor.is_contradicted(state, oscillation, 1, 0.03) == expected
+    shaking.waves[1], shaking.half[1] = waves, 0.01  # s: 50 Hz
+    assert sensor.is_contradicted(state, shaking, 1, 0.03) == expected
 
 
 def test_noise_and_step_are_those_of_the_sensor():
@@ -227,7 +233,7 @@ def test_lack_by_a_wrong_model_of_the_drive_counts_once_it_changes_at_rest():
             begins = moves and k == 0
             now = sample([5.0, 0.0], effort=[4.0, 0.0], **told, begins=begins)
             assert not effect.compare_effort(limits, state, now, moves)
-    np.testing.assert_allclose(state.lack, [2.0, 0.0])
+    np.testing.assert_allclose(state.shortfall, [2.0, 0.0])
     now = sample([5.0, 0.0], effort=[2.0, 0.0], **told)
     found = [effect.compare_effort(limits, state, now, moves=False) for _ in range(500)]
     assert found[-1]

@@ -10,7 +10,7 @@ import pytest
 
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.law import oscillation
-from blf_dsc_controller.law.oscillation import FEW, WAVES, Oscillation
+from blf_dsc_controller.law.oscillation import FEW, WAVES, State
 
 LIMIT = 87.0  # N m, of a Panda's shoulder
 NOISE = 2e-6  # rad, of an encoder of 20 bits
@@ -20,7 +20,7 @@ RESOLUTION = 6e-6  # rad
 def watched(error, torque, rate=1000.0, noise=NOISE, resolution=RESOLUTION):
     """Return half waves, frequency [Hz], amplitude [N m], whether it is one, calm [s] (N, 5)."""
     one = SimpleNamespace(n=1)
-    now = view_of(Oscillation)(np.zeros(size_of(Oscillation)(one)), one)
+    now = view_of(State)(np.zeros(size_of(State)(one)), one)
     given = np.array([[LIMIT], [noise**2], [resolution]])
     oscillation.begin(now, error[:1], torque[:1])
     seen = []
@@ -164,7 +164,7 @@ def test_a_step_and_a_jump_are_none():
 def reports(waves, amplitude):
     """Return the samples, of 600 at 1 kHz, in which an oscillation is reported."""
     one = SimpleNamespace(n=1)
-    now = view_of(Oscillation)(np.zeros(size_of(Oscillation)(one)), one)
+    now = view_of(State)(np.zeros(size_of(State)(one)), one)
     oscillation.begin(now, np.zeros(1), np.zeros(1))
     limit = np.array([LIMIT])
     assert not oscillation.count_down(now, limit, 1e-3)

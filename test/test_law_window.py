@@ -265,10 +265,10 @@ def test_columns_match_their_names():
     t = 0.7
     q = np.array([0.2, -0.5])
     dq = np.array([0.3, -0.1])
-    rest = np.full((2, settings.m), np.nan)
-    columns.fill_columns(settings.columns, t, dq, rest)
+    rows = np.full((2, settings.m), np.nan)
+    columns.fill_columns(settings.columns, t, dq, rows)
     for i in range(2):
-        ripple.fill_ripple(settings.columns, i, q[i], rest)
+        ripple.fill_ripple(settings.columns, i, q[i], rows)
 
     value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': np.tanh(dq / 0.2)}
     for w in (1.5, 4.0):
@@ -282,7 +282,7 @@ def test_columns_match_their_names():
         f'{block} {joint}' for block in value for joint in config.joints
     )
     expected = np.hstack([np.diag(each) for each in value.values()])
-    np.testing.assert_allclose(rest[:, 3:], expected)
+    np.testing.assert_allclose(rows[:, 3:], expected)
 
 
 def learned(preset, duration, learning, arm):

@@ -31,6 +31,7 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.nodes.controller_log import ControllerLog
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.supervision.supervisor import Phase
@@ -140,8 +141,8 @@ def test_a_load_that_nobody_tells_the_drives_is_warned_of(ros, log):
 
 def test_findings_of_a_running_law_are_warned_of_once_each():
     told = []
-    node = SimpleNamespace(_contacts=0, _oscillations=0, _untrusted='')
-    node.get_logger = lambda: SimpleNamespace(warning=told.append)
+    logger = SimpleNamespace(warning=told.append)
+    log = ControllerLog(SimpleNamespace(get_logger=lambda: logger))
     contacts = SimpleNamespace(count=0, last=None)
     guard = SimpleNamespace(
         findings=SimpleNamespace(contacts=contacts, untrusted=''),
@@ -151,7 +152,7 @@ def test_findings_of_a_running_law_are_warned_of_once_each():
     def warned():
         told.clear()
         for _ in range(2):
-            ControllerNode._warn(node, guard)
+            log.warn_of_findings(guard)
         return told
 
     assert warned() == []

@@ -134,6 +134,12 @@ def test_replay_does_not_run_the_law_that_a_bag_names(bag, law, capsys):
     assert not law.has_run
 
 
+@pytest.mark.parametrize('digest', ['', f'@{"0" * 64}'])
+def test_law_that_may_not_run_is_refused_before_the_bag_is_read(digest, law, tmp_path):
+    with pytest.raises(BlfDscError, match=law.digest):  # the remedy
+        verify(tmp_path / 'no bag', law=f'{law.path}{digest}')
+
+
 def test_replay_runs_the_law_that_its_user_names_by_path_and_digest(tmp_path):
     """Which may be elsewhere by now."""
     loop = load_loop('recommended', {CONTROLLER: {'law': COMPUTED_TORQUE}})
@@ -153,7 +159,7 @@ def test_replay_runs_the_law_that_its_user_names_by_path_and_digest(tmp_path):
 def test_law_of_the_package_needs_no_word(tmp_path):
     bag = recorded_run.record(tmp_path / 'bag', 0.1)
     with pytest.raises(BlfDscError, match='the recorded one is of the package'):
-        verify(bag, law=f'{COMPUTED_TORQUE}@{"0" * 64}')
+        verify(bag, law=f'{COMPUTED_TORQUE}@{digest_of(COMPUTED_TORQUE)}')
     assert verify(bag).difference is None
 
 

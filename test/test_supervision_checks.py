@@ -137,8 +137,8 @@ def test_only_an_effort_that_lacks_more_than_usual_explains_an_error(
     """Of drives whose efforts always lack 1.8 N m, 9 % of the torque limit."""
     given = {'robot.effort': 'whole', 'safety.error_ratio': 1.0}
     check = sample_check(build(ControllerConfig, given), law)
-    law.checks.effect.usual[0] = 1.8
-    law.checks.effect.lack[0] = lack
+    law.checks.effect.usual_shortfall[0] = 1.8
+    law.checks.effect.shortfall[0] = lack
     law.checks.repeats.used[4:] = law.sample.torque - [now, 0.0]
     law.sample.xi1[0] = 2.0 * law.sample.bound[0]
     law.flags = verdict(law)
@@ -157,7 +157,7 @@ def test_what_drives_add_is_no_lack_of_a_whole_effort():
     added, limit = law.signals.saturation.added, law.settings.torque.limit
     i = int(np.argmax(np.abs(added) / limit))
     assert abs(added[i]) > 0.1 * limit[i]
-    law.checks.effect.lack[i] = -np.sign(added[i]) * limit[i] / 3.0
+    law.checks.effect.shortfall[i] = -np.sign(added[i]) * limit[i] / 3.0
     law.checks.repeats.used[14:] = law.sample.torque + added
     law.sample.xi1[i] = 2.0 * law.sample.bound[i]
     law.flags = verdict(law)
@@ -174,7 +174,7 @@ def test_usual_lack_of_an_effort_is_its_average_over_a_second():
         effort = law.signals.torque.copy()
         arm.step(effort)
     expected = [1.5 * (1.0 - np.exp(-1.0)), 0.0]
-    np.testing.assert_allclose(law.checks.effect.usual, expected, atol=0.02)
+    np.testing.assert_allclose(law.checks.effect.usual_shortfall, expected, atol=0.02)
 
 
 def test_estimates_of_before_a_restart_are_consistent_with_it(law):

@@ -441,8 +441,10 @@ def test_gains_that_a_running_law_cannot_adopt_are_rejected(start, given, messag
     rig.step(400 if start else 200)
     assert rig.guard.controller.state.latch.latched[0] == bool(start)
     candidate = change(rig.guard.config, given)
+    signals = rig.guard.controller.signals_vector.copy()
     found = rig.guard.problems(candidate)
     assert [problem.startswith(message) for problem in found] == [True] * bool(message)
+    np.testing.assert_array_equal(rig.guard.controller.signals_vector, signals)
     rig.guard.deactivate()
     assert rig.guard.problems(candidate) == []
 
@@ -457,6 +459,14 @@ def test_gains_can_change_while_the_projection_holds_the_estimate():
         rig.guard.problems(change(rig.guard.config, {'feedback.gain': (60.0, 25.0)}))
         == []
     )
+
+
+def test_trial_that_cannot_be_made_leaves_the_checks_on():
+    law = Rig().guard.controller
+    limit = law.checks.velocity_limit[0]
+    with pytest.raises(BlfDscError, match='positions, velocities and torques'):
+        law.trial(0.0, 1e-3, np.zeros(3))
+    assert law.checks.velocity_limit[0] == limit > 0.0
 
 
 def test_plan_keeps_one_in_force_that_has_not_begun():

@@ -65,17 +65,17 @@ def test_efforts_that_are_nearer_to_commands_than_to_the_links_torque_are_comman
 
 def test_efforts_that_motors_and_friction_separate_from_commands_are_sensors():
     state = compared(np.array([0.2, 0.4]), np.array([1.0, 0.4]))
-    assert (state.fault[0], state.is_told[0]) == (NONE, 1.0)
+    assert (state.fault[0], state.is_distinct[0]) == (NONE, 1.0)
 
 
 def test_what_lies_between_is_not_judged_yet():
     state = compared(np.array([0.2, 0.4]), np.array([1.0, 2.0]))
-    assert (state.fault[0], state.is_told[0]) == (NONE, 0.0)
+    assert (state.fault[0], state.is_distinct[0]) == (NONE, 0.0)
 
 
 def test_an_arm_at_rest_and_a_load_that_comes_later_say_nothing():
     still = compared(np.array([0.02, 0.1]), np.array([1.0, 2.0]), speed=0.05 * MOVES)
-    assert (still.fault[0], still.is_told[0]) == (NONE, 0.0)
+    assert (still.fault[0], still.is_distinct[0]) == (NONE, 0.0)
     state = compared(np.array([0.2, 0.4]), np.array([0.2, 0.4]))
     work = new()[1]
     for k in range(2000):  # s, a load, in which efforts are as commanded
@@ -219,7 +219,7 @@ def test_sensors_of_an_arm_that_starts_with_a_load_and_is_pushed_are_left_alone(
     record = simulate(loop.controller, loop.plant)
     assert said(record) == ([], [])
     state = record.controller.state
-    assert (state.observer.faded[0], state.sensors.is_told[0]) == (0.0, 1.0)
+    assert (state.observer.faded[0], state.sensors.is_distinct[0]) == (0.0, 1.0)
 
 
 class Failing:

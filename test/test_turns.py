@@ -76,9 +76,9 @@ def test_a_position_more_than_a_thousand_turns_away_is_no_wrap(turns, counted):
     """It is no position: counted on, it would hide what the sensor says."""
     wraps = Wraps(build(ControllerConfig, {**ARM, **SWING}))
     rest = np.zeros(6)
-    wraps.counted(rest, 0.0, 3.0)
+    wraps.count(rest, 0.0, 3.0)
     away = rest + np.array([turns * tau, 0.0, 0.0, 0.0, 0.0, 0.0])
-    got, fault = wraps.counted(away, 1e-3, 3.0)
+    got, fault = wraps.count(away, 1e-3, 3.0)
     assert fault is None
     assert got[0] == pytest.approx(0.0 if counted else turns * tau, abs=1e-9)
 

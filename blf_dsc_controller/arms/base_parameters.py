@@ -41,10 +41,14 @@ ROTORS = 0.5
 """Standard deviation of the inertia of a drive, relative to its value."""
 
 GUESSED_ROTORS = 4.0
-"""The same of the guess by the rated torque, where rows are compared with what is known.
+"""The same of a guess by the rated torque, where rows are compared with what is known.
 
-Those published for an FR3 (libfranka) are 2.1 to 6.9 times the guess: off by this, rms.
+The inertias published for an FR3 (libfranka) are 2.1 to 6.9 times the guess: this is their
+rms error, and `HEAVIER_DRIVE` the largest.
 """
+
+HEAVIER_DRIVE = 6.0
+"""What the inertia of a drive may have beyond such a guess, over the guess."""
 
 UNKNOWN_ROTOR = 0.01
 """The same where neither effort nor inertia is known, absolute [kg m^2, or kg]."""

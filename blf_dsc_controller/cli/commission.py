@@ -34,7 +34,7 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.progress import print_notice, steps
+from blf_dsc_controller.progress import announce_reading, print_notice, steps
 from blf_dsc_controller.supervision.digits import two_digits
 
 _WIDTH = 98
@@ -131,6 +131,7 @@ def _all_runs(
     if not (options.bags or options.robot or options.ros):
         return _simulated(path, commissioning)
     names = [str(bag) for bag in options.bags]
+    announce_reading(options.bags, 'read')
     runs = [measured_in(bag) for bag in options.bags]
     if not (options.robot or options.ros):
         return names, runs, []

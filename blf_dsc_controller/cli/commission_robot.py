@@ -179,26 +179,48 @@ def _limits(
     duration: float,
 ) -> Iterator[str]:
     """Yield what the arm is about to do at most."""
+    slid = [commissioning.sliding(each.posture) for each in planned]
+    again = REPEATS * sum(each.duration for each in slid)
+    again += commissioning.anew_left * (1 + REPEATS) * slid[0].duration
+    bound = ', '.join(f'{each:.2g}' for each in planned[0].config.barrier.bound)
+    yield from _of_motions(options, commissioning.config, planned)
+    yield from _of_repeats(options, commissioning, slid)
+    yield (
+        f'an error of {bound} rad, any other check of the controller, or Ctrl-C brings the arm to '
+        'rest and ends'
+    )
+    yield (
+        f'the arm moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
+        'every posture is measured as often as that'
+    )
+
+
+def _of_motions(
+    options: Namespace, config: ControllerConfig, planned: list[Planned]
+) -> Iterator[str]:
+    """Yield where the arm moves, and with what torques."""
     for k, each in enumerate(planned, 1):
         yield f'posture {k}: {page.description(each)}'
-    config = commissioning.config
-    rated = config.robot.efforts(config.robot.chain(config.joints))
-    shaking, shaken_most = (
-        ', '.join(f'{torque:.2g}' for torque in share * rated)
-        for share in (options.torque, MOST * options.torque)
-    )
     most = ', '.join(f'{torque:.3g}' for torque in config.torque.limit)
-    bound = ', '.join(f'{each:.2g}' for each in planned[0].config.barrier.bound)
     yield (
         f'to each posture the joints move straight, at {SPEED:g} rad/s at most: keep the way of '
         'the arm free'
     )
-    yield f'the motions add torques of {shaking} N m (rms); torque.limit is {most} N m'
     yield (
-        f'where noise hides too much, a posture is measured once more, with {shaken_most} N m at '
+        f'the motions add torques of {_rated(config, options.torque)} N m (rms); torque.limit is '
+        f'{most} N m'
+    )
+
+
+def _of_repeats(
+    options: Namespace, commissioning: Commissioning, slid: list[Planned]
+) -> Iterator[str]:
+    """Yield when a posture is measured again, and how; `slid` are the motions with swings."""
+    most = _rated(commissioning.config, MOST * options.torque)
+    yield (
+        f'where noise hides too much, a posture is measured once more, with {most} N m at '
         f'most; the tool then travels {1e3 * options.travel:.3g} mm at most'
     )
-    slid = [commissioning.sliding(each.posture) for each in planned]
     swing = np.max([each.excitation.swing for each in slid], axis=0)
     swings = ', '.join(f'{torque:.2g}' for torque in swing)
     yield (
@@ -206,19 +228,15 @@ def _limits(
         'N m, and friction, which keep all joints sliding'
     )
     yield 'where the arm nearly oscillates, likewise, with half of the gains of the file'
-    yield (
-        f'an error of {bound} rad, any other check of the controller, or Ctrl-C brings the arm to '
-        'rest and ends'
-    )
-    again = REPEATS * sum(each.duration for each in slid)
     if commissioning.anew_left:
-        again += commissioning.anew_left * (1 + REPEATS) * slid[0].duration
         yield (
             'of this arm only the URDF is known: where friction hides an inertia, posture 1 is '
             f'measured anew, up to {commissioning.anew_left} times, with half of the gains that it '
             'bears by then and the friction that it showed'
         )
-    yield (
-        f'the arm moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
-        'every posture is measured as often as that'
-    )
+
+
+def _rated(config: ControllerConfig, share: float) -> str:
+    """Return a share of the rated torques [N m] in words."""
+    rated = config.robot.efforts(config.robot.chain(config.joints))
+    return ', '.join(f'{torque:.2g}' for torque in share * rated)

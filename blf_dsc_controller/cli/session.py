@@ -150,8 +150,8 @@ class NodeProcess:
         """Whether the process is alive."""
         return self._process.poll() is None
 
-    def new_notices(self) -> list[str]:
-        """Return what the node newly reports of its kernels or its page."""
+    def take_notices(self) -> list[str]:
+        """Return what the node has reported of its kernels or its page since the last call."""
         lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()
         found = (re.search(f'({COMPILING}|{_PAGE}).*', line) for line in lines)
         notices = [each[0] for each in found if each]
@@ -249,7 +249,7 @@ def _run_nodes(
 def _show_notices(nodes: Iterable[NodeProcess]) -> None:
     """Print what nodes newly report, above the progress bar."""
     for node in nodes:
-        for notice in node.new_notices():
+        for notice in node.take_notices():
             tqdm.write(notice, file=sys.stderr)
 
 

@@ -64,9 +64,8 @@ class Planned(NamedTuple):
     """A motion to run, and how far it goes."""
 
     config: ControllerConfig
-    values: dict[
-        str, object
-    ]  # parameters of `config` that differ from those of the arm in use
+    # parameters of `config` that differ from those of the arm in use
+    values: dict[str, object]
     posture: Floats  # (n,) rad
     excitation: motion.Excitation
     share: float = 1.0  # of the gains of the arm in use

@@ -64,9 +64,8 @@ class Findings(NamedTuple):
     inertias: Floats  # (k, n) likewise in each run
     damping: Floats  # (n,) N m s/rad, the mean
     friction: Floats  # (n,) N m, the largest: constant, it takes as much power
-    hidden: (
-        Floats  # (k, n) kg m^2, inertias up to which one would not be seen; 0: it is
-    )
+    # (k, n) kg m^2, inertias up to which one would not be seen; 0: it is
+    hidden: Floats
     unfit: NDArray[np.bool_]  # (k, n) whether the longest lag that is tried fits best
     drive_lag: float  # s, from a torque to the motion, sampling included; nan likewise
     velocity_lag: float  # s, of velocities against positions

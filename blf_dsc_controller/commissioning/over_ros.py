@@ -171,9 +171,9 @@ class OverRos(PostureByPosture):
             self._spin()
             if self._requests:
                 return End.REQUESTED, ''
-            if trouble := self._stopped(guard) or self._lost(began):
+            if trouble := self._stopped(guard) or self._look_for_loss(began):
                 return trouble
-            if text := disturbed.text or self._of_others():
+            if text := disturbed.text or self._look_for_others():
                 return End.STOPPED, text
             passed = (guard.journal.stamp - guard.reference.start_stamp) * _NANO
             if guard.commanding and passed >= duration:
@@ -189,7 +189,7 @@ class OverRos(PostureByPosture):
         is_lost = supervisor.reason is Reason.STATE_TIMEOUT
         return (End.LOST if is_lost else End.STOPPED), supervisor.text
 
-    def _lost(self, began: float) -> tuple[End, str] | None:
+    def _look_for_loss(self, began: float) -> tuple[End, str] | None:
         """Return what a run that began at `began` [s] lacks: joint states, or who takes torques."""
         node = self._node
         now = time.monotonic()
@@ -202,7 +202,7 @@ class OverRos(PostureByPosture):
                 return End.LOST, f'nobody takes torques on {node.commands}'
         return None
 
-    def _of_others(self) -> str:
+    def _look_for_others(self) -> str:
         """Return that there are more other publishers of torques than before; or empty.
 
         One that was killed stays visible for some time.

@@ -130,7 +130,7 @@ class Commissioning:
     def motion(self, posture: ArrayLike) -> Planned:
         """Return the motion around a posture (n,) [rad], such as that of the arm at rest.
 
-        It has the torque, swings and gains that `stronger` has found earlier postures to need.
+        It has the torque, swings and gains that `plan_repeat` has found earlier postures to need.
 
         Raises:
             BlfDscError: the posture is not one of this arm, or too near its limits.
@@ -145,15 +145,15 @@ class Commissioning:
         """
         return self._motion(posture, self.torque, sliding=True)
 
-    def stronger(
+    def plan_repeat(
         self, motion: Planned, run: Run, posture: ArrayLike | None = None
     ) -> Planned | None:
-        """Return the motion to measure a posture with again; None: the run shows enough.
+        """Plan and return the motion that measures a posture again; None: the run shows enough.
 
         It has more torque, if noise hides much; swings, if friction damps a joint more than its
         gains do; half of the gains, if the arm nearly oscillates with them.  The next postures
-        begin with all of this.  It is around `posture` (n,) [rad], or that of the motion.  None
-        also if the travel of the tool and the speeds permit no larger motion.
+        begin with all of this (`go_on_with`).  It is around `posture` (n,) [rad], or that of the
+        motion.  None also if the travel of the tool and the speeds permit no larger motion.
 
         Raises:
             BlfDscError: the run does not show the response.
@@ -180,7 +180,7 @@ class Commissioning:
     def go_on_with(self, motion: Planned) -> None:
         """Let the first motions of the next postures have what this one needed.
 
-        `stronger` has done so, unless another process has computed it.
+        `plan_repeat` has done so, unless another process has computed it.
         """
         self.torque = max(self.torque, motion.torque)
         self.slides = self.slides or motion.excitation.sliding

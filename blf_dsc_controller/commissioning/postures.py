@@ -94,14 +94,14 @@ def move(
     return Move(change(config, values), duration + rest)
 
 
-def stronger_by_bag(
+def plan_repeat_by_bag(
     commissioning: Commissioning, planned: Planned, bag: Path, posture: Floats
 ) -> Planned | None:
-    """Return `Commissioning.stronger` for the bag of a motion, around a posture (n,) [rad].
+    """Return `Commissioning.plan_repeat` for the bag of a motion, around a posture (n,) [rad].
 
     Raises BlfDscError if it is None, and the bag does not show the response.
     """
-    again = commissioning.stronger(planned, measured_in(bag)[0], posture)
+    again = commissioning.plan_repeat(planned, measured_in(bag)[0], posture)
     if again is None:
         check(bag)
     return again
@@ -245,7 +245,7 @@ class PostureByPosture(ABC):
         for _ in range(REPEATS):
             with _named(name):
                 again = self._aside(
-                    stronger_by_bag,
+                    plan_repeat_by_bag,
                     self._commissioning,
                     planned,
                     bag,
@@ -255,7 +255,7 @@ class PostureByPosture(ABC):
                 return planned, bag
             _set_aside(bag, 'weak')
             planned = again
-            # `stronger` has set it, but of a copy if another process has computed it
+            # `plan_repeat` has set it, but of a copy if another process has computed it
             self._commissioning.go_on_with(again)
             bag = self._run(planned.config, planned.duration, name)
         with _named(name):

@@ -81,10 +81,10 @@ def runs_of(
     ]
     motions = []
     for k, posture in enumerate(postures, 1):
-        planned, run = _strongest(commissioning, posture, plant)
+        planned, run = _measure(commissioning, posture, plant)
         while k == 1 and (better := commissioning.better_known(planned, run[0])):
             commissioning = better
-            planned, run = _strongest(commissioning, posture, plant)
+            planned, run = _measure(commissioning, posture, plant)
         motions.append(planned)
         yield f'posture {k}', run
     payload = loop.controller.robot.payload
@@ -95,14 +95,14 @@ def runs_of(
         yield name, error
 
 
-def _strongest(
+def _measure(
     commissioning: Commissioning, posture: Floats, plant: PlantConfig
 ) -> tuple[Planned, Measured]:
-    """Return a motion around a posture (n,) [rad] that shows enough, or the last, and its run."""
+    """Measure around a posture (n,) [rad], again if need be; return the last motion and its run."""
     planned = commissioning.motion(posture)
     run = measured(planned, plant)
     for _ in range(REPEATS):
-        again = commissioning.stronger(planned, run[0])
+        again = commissioning.plan_repeat(planned, run[0])
         if again is None:
             break
         planned, run = again, measured(again, plant)

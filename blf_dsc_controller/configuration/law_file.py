@@ -80,6 +80,16 @@ def is_pinned(law: str) -> bool:
     return is_file(law) and bool(_File.of(law).wanted)
 
 
+def check_pinned(law: str) -> None:
+    """Raise BlfDscError unless `law` names a file with the digest that it has."""
+    found = digest(law)
+    if not _File.of(law).wanted:
+        raise BlfDscError(
+            f'got the law {law} without its digest. A file runs as code: read it, and if it may '
+            f'run, give {law}@{found}'
+        )
+
+
 def kept(law: str) -> str:
     """Return the parameter `law` as kept: a file by its absolute path."""
     if not is_file(law):

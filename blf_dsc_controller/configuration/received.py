@@ -64,15 +64,14 @@ def with_law(given: Mapping[str, Any], law: str, digest: str) -> dict[str, Any]:
             )
         return dict(given)
     if not law_file.is_pinned(law):
-        raise BlfDscError(_refusal(received, law, digest))
+        raise BlfDscError(_refusal(received, digest))
     return {**given, _LAW: law_file.kept(law)}
 
 
-def _refusal(received: str, law: str, digest: str) -> str:
+def _refusal(received: str, digest: str) -> str:
     known = f' with the SHA-256 {digest[:_SHOWN]}' if digest else ''
-    named = f'got the law {law} without its digest: ' if law else ''
     return (
-        f'{named}the recorded law is the file {received[:_SHOWN]!r}{known}. A file runs as code, '
+        f'the recorded law is the file {received[:_SHOWN]!r}{known}. A file runs as code, '
         'and a bag may come from anybody: read the file, and if it may run, name it with its '
         'digest, --law FILE@SHA256 (sha256sum FILE prints it)'
     )

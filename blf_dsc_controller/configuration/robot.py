@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import (
+    HEAVIER_DRIVE,
     PAYLOAD_SIZE,
     BaseParameters,
     base_parameters,
@@ -61,8 +62,6 @@ _NEEDED = 0.5
 _MOST_FRICTION = 0.25  # of the effort
 UNKNOWN_FRICTION = 0.05
 """Friction to expect where none is known, over the rated torque: its standard deviation."""
-HEAVIER_DRIVE = 6.0
-"""Inertia that a guessed drive may have beyond the guess, over it: geared arms have up to seven."""
 _SLOWEST = {'revolute': 2.0, 'prismatic': 0.5}  # rad/s or m/s, of the drives of arms
 # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 _ROUNDING = 1e-12

@@ -238,27 +238,19 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
         raise ConfigurationError([str(error)], source) from error
     known = {param.name: param for param in parameters(cls)}
     problems = list(unknown_names(cls, given, known))
-    valid: dict[str, Any] = {}
-    for name in (name for name in known if name in given):
-        param = known[name]
-        value = param.spelt(_plain(given[name]))
-        found = list(param.problems(value))
-        try:
-            if not found:
-                valid[name] = tuple(value) if param.is_array else param.kept(value)
-        except BlfDscError as error:
-            found = [f'{name}: {error}']
-        problems += found
-    if len(valid) < len(known.keys() & given.keys()):
+    valid, invalid = _checked(known, given)
+    problems += invalid
+    if invalid:
         raise ConfigurationError(problems, source)
+    fitting = {
+        name: value for name, value in valid.items() if _fits(known[name], value)
+    }
     try:
-        derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(
-            {name: value for name, value in valid.items() if _fits(known[name], value)}
-        )
+        derived: Mapping[str, Value] = getattr(cls, 'defaults', lambda _: {})(fitting)
     except ConfigurationError as error:
         raise ConfigurationError([*problems, *error.problems], source) from error
     values = (
-        {name: param.default for name, param in known.items()} | dict(derived) | valid
+        {name: param.default for name, param in known.items()} | {**derived} | valid
     )
     lengths = [
         problem
@@ -272,6 +264,29 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
         if not problems:
             return config
     raise ConfigurationError(problems, source)
+
+
+def _checked(
+    known: Mapping[str, Parameter], given: Mapping[str, Any]
+) -> tuple[dict[str, Any], list[str]]:
+    """Return those given values of known parameters that are valid, and what is wrong with others.
+
+    Each value is checked by itself.
+    """
+    valid: dict[str, Any] = {}
+    problems: list[str] = []
+    for name, param in known.items():
+        if name not in given:
+            continue
+        value = param.spelt(_plain(given[name]))
+        found = list(param.problems(value))
+        try:
+            if not found:
+                valid[name] = tuple(value) if param.is_array else param.kept(value)
+        except BlfDscError as error:
+            found = [f'{name}: {error}']
+        problems += found
+    return valid, problems
 
 
 def variant_of(cls: type[Config], given: Mapping[str, Any]) -> type[Config]:

@@ -178,15 +178,11 @@ class ArmController:
         if not math.isfinite(stamp):
             raise StateError(f'stamp: got {stamp}, but a finite time in s is needed')
         n = len(self.joints)
-        measurement = np.empty((3, n))
-        measurement[0] = self._checked('q', q)
-        measurement[1] = self._checked('dq', dq)
-        measurement[2] = math.nan if effort is None else self._checked('effort', effort)
+        values = self._measurement(q, dq, effort)
         of_motors = None
         if motors is not None:
             of_motors = self._checked('motors', motors, (2, n))
         nanoseconds = self._nanoseconds(stamp)
-        values = measurement.reshape(-1)
         torque = self._loop.guard.update(nanoseconds, values)
         answer = None if torque is None else np.array(torque)
         try:
@@ -226,6 +222,16 @@ class ArmController:
         elif self._shift is None:
             self._shift = 0 if nanoseconds > 0 else FIRST_STAMP - nanoseconds
         return nanoseconds + self._shift
+
+    def _measurement(
+        self, q: ArrayLike, dq: ArrayLike, effort: ArrayLike | None
+    ) -> Vector:
+        """Return [q, dq, effort] (3 n,); efforts are NaN where there are none."""
+        values = np.empty((3, len(self.joints)))
+        values[0] = self._checked('q', q)
+        values[1] = self._checked('dq', dq)
+        values[2] = math.nan if effort is None else self._checked('effort', effort)
+        return values.reshape(-1)
 
     def _checked(
         self, name: str, values: ArrayLike, shape: tuple[int, ...] = ()

@@ -41,6 +41,16 @@ class GuardedLoop:
         self.estimates = estimate_names(config)
         self.telemetry = ControllerTelemetry(config, self.estimates)
 
+    def retune(self, config: ControllerConfig) -> Message | None:
+        """Apply a configuration; return the bound by it, after the first sample of the law."""
+        guard = self.guard
+        guard.retune(config)
+        if guard.reference.last_stamp < 0:
+            return None
+        bound = guard.controller.bound_at(guard.reference.time)
+        limit = guard.controller.settings.torque.limit
+        return self.telemetry.bound(guard.journal.stamp, bound, limit)
+
     def messages(
         self, torque: Vector | None, *, errors_wanted: bool = True
     ) -> Iterator[Message]:

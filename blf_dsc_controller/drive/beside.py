@@ -35,7 +35,7 @@ class Beside(ABC):
         for kind, content in self._link.messages():
             self._take(kind, content)
         self._tell_untrusted()
-        self._report_now_and_then()
+        self._tell_changes()
         self._link.flush()
 
     def _tell_untrusted(self) -> None:
@@ -50,7 +50,7 @@ class Beside(ABC):
         """Do what a message wants."""
 
     @abstractmethod
-    def _report_now_and_then(self) -> None:
+    def _tell_changes(self) -> None:
         """Tell what has changed since the last state."""
 
 

@@ -89,7 +89,7 @@ class Drive:
         self._number = 0  # of the last request
         self._last = 0  # of the last motion
         self._hint = 0, ''  # of which motion, and what its error ends with
-        self._loop = self._started()
+        self._loop = self._start()
 
     def __setattr__(self, name: str, value: object) -> None:
         """Refuse what other packages have as settings: here it would change nothing."""
@@ -345,13 +345,13 @@ class Drive:
             self._loop.recover()
         else:
             self._loop.end()
-            self._loop = self._started()
+            self._loop = self._start()
 
     def close(self) -> None:
         """Bring the arm to rest, and end its loop; a second Ctrl-C ends it at once."""
         self._loop.close()
 
-    def _started(self) -> LoopProcess:
+    def _start(self) -> LoopProcess:
         """Return another process, which records into a folder of its own."""
         self._starts += 1
         record = self._record

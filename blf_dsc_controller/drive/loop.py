@@ -102,6 +102,7 @@ class DriveLoop:
         self._beside = beside
         self._requests = 0
         self._states = 0
+        self._received = 0.0  # s, when `read` returned last
         self._begin = math.nan  # s, stamp of the first state
         self._end: End | None = None
         self._end_at = math.nan  # s, stamp at which the end began

@@ -116,7 +116,7 @@ class RosTopics(Beside):
         elif kind == KINDS[topics.JOINT_POSITIONS]:
             self._inputs.take_positions(content)
 
-    def _report_now_and_then(self) -> None:
+    def _tell_changes(self) -> None:
         """Tell the status every second, and when the state changes."""
         guard = self._guard
         since, revision = self._reported

@@ -92,7 +92,8 @@ class Script(Beside):
         self._closes += 1
         if self._closes > 1:
             self._end_loop()
-        if self._closes > 1 or not self._guard.supervisor.running:
+            self._end_loop()  # a second request ends at once
+        elif not self._guard.supervisor.running:
             self._end_loop()
         else:
             self._rests_at = self._inputs.stop(self._guard, 'the end of the script')
@@ -179,7 +180,7 @@ class Script(Beside):
             self._tell_done(self._loading, problem)
             self._loading = None
 
-    def _report_now_and_then(self) -> None:
+    def _tell_changes(self) -> None:
         guard = self._guard
         self._follow_load()
         self._goals.watch(guard)

@@ -73,13 +73,12 @@ def read_table(
     columns = choose_columns(path, table.names, given, theirs, planned=planned)
     if joints:
         _check_count(path, columns, trunk)
-    arm = trunk[: len(columns.q)]
     groups = _groups(path, table, columns)
     clock = _clock(path, columns, groups)
     has_unit = bool(split_unit(given['q'], 'q').unit)
     motion = Motion(
         path=path,
-        joints=arm,
+        joints=trunk[: len(columns.q)],
         stamp=clock.stamp,
         q=groups['q'],
         tau=None if planned else groups['tau'],
@@ -88,18 +87,26 @@ def read_table(
         others='choose the columns that have it, as in --map tau=effort_*',
     )
     sound = checked(motion, tree)
-    rows = sound.rows & clock.known
+    source = '; '.join([f'{path.name}: {columns.text}', *clock.said, *sound.said])
+    recording = _resampled(motion, sound.rows & clock.known, tree, source)
+    return recording._replace(currents=columns.has_currents)
+
+
+def _resampled(
+    motion: Motion, rows: NDArray[np.bool_], tree: Tree, source: str
+) -> Recording:
+    """Return some rows (N,) of the motion of an arm as a recording; no torques are zero."""
+    joints = tuple(motion.joints)
     q = _scaled(motion.q)[rows]
-    recording = resampled(
-        arm,
-        clock.stamp[rows],
+    return resampled(
+        joints,
+        motion.stamp[rows],
         q,
         np.zeros_like(q) if motion.tau is None else _scaled(motion.tau)[rows],
-        '; '.join([f'{path.name}: {columns.text}', *clock.said, *sound.said]),
-        tree.turning(arm),
+        source,
+        tree.turning(joints),
         None if motion.theta is None else _scaled(motion.theta)[rows],
     )
-    return recording._replace(currents=columns.has_currents)
 
 
 def _check_count(path: Path, columns: Columns, arm: Sequence[str]) -> None:

@@ -88,16 +88,13 @@ class Identified(NamedTuple):
     inertia: float  # share of its other inertial torque, likewise
     # (3,) gravity that explains the torques far better than the given one, m/s^2
     other_gravity: Floats | None
-    other_convention: (
-        OtherConvention | None
-    )  # that explains the torques, if the URDF's does not
-    other_load: (
-        OtherLoad | None
-    )  # that explains the torques, if a constant one does not
+    # that explains the torques, if the URDF's does not
+    other_convention: OtherConvention | None
+    # that explains the torques, if a constant one does not
+    other_load: OtherLoad | None
     carried: Carried | None  # when the arm carried the load that was weighed
-    compliance: (
-        Compliance | None
-    )  # of gears, if positions of motors and links are known
+    # of gears, if positions of motors and links are known
+    compliance: Compliance | None
 
     @property
     def joints(self) -> list[str]:

@@ -27,6 +27,7 @@ from blf_dsc_controller.identification.identified import (
     Identified,
     OtherConvention,
     OtherLoad,
+    Score,
 )
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.on_disk import mapped
@@ -37,14 +38,14 @@ from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
-from blf_dsc_controller.identification.selection import select
+from blf_dsc_controller.identification.selection import Selected, select
 from blf_dsc_controller.identification.stiffness import Compliance, compliance_of
 from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
 from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
 from blf_dsc_controller.run import Floats
 
-STAGES = (
+STAGES = READING, CHECKING, SELECTING, FITTING, INTERVALS, OTHERS = (
     'reading',
     'checking efforts',
     'selecting terms',
@@ -89,7 +90,7 @@ def identify_bag(
         BlfDscError: a bag or the URDF cannot be read, or there are no torques of the arm, too
             little of it, or no motion; or they are currents, and there are no gains.
     """
-    begin(STAGES[0])
+    begin(READING)
     paths = [path] if isinstance(path, Path) else list(path)
     recordings = _read(
         [*paths, *([loaded] if loaded else [])],
@@ -176,7 +177,7 @@ def identify_arm(
         BlfDscError: the recording is too short or has no motion.
     """
     found = _identified(recording, robot, effort, picked_up, find_signs, begin)
-    begin(STAGES[5])
+    begin(OTHERS)
     unexplained = unexplained_joints(found)
     is_good = found.score.total[2] < _GOOD
     if is_good and not unexplained.size:
@@ -251,21 +252,19 @@ def _identified(
     begin: Callable[[str], None],
 ) -> Identified:
     """Return what `identify_arm` finds for the positions as they are recorded."""
-    begin(STAGES[1])
+    begin(CHECKING)
     problem = problem_of(recording, robot, effort, picked_up, find_signs=find_signs)
     rows = problem.rows
     windows = problem.windows
-    begin(STAGES[2])
+    begin(SELECTING)
     selected = select(rows, windows.fit, problem.G, problem.prior)
-    begin(STAGES[3])
-    trained = fitted(rows, windows.fit, problem.G, selected.prior, selected.found)
-    score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
-    alone = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
+    begin(FITTING)
+    score, alone = _held_back(problem, selected)
     final = fitted(rows, windows.moving, problem.G, selected.prior, selected.found)
     dynamics = nearest_friction(rows, windows, final.values)
     size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
     compliance = _compliance(problem, recording, final.values)
-    begin(STAGES[4])
+    begin(INTERVALS)
     doubted = doubt(problem, selected.prior, final, selected.distances)
     return Identified(
         source=recording.source,
@@ -279,7 +278,7 @@ def _identified(
         left_out=doubted.torques,
         dynamics=dynamics,
         score=score,
-        alone=errors_alone(rows, windows.test, alone),
+        alone=alone,
         distances=selected.distances,
         widths=selected.widths,
         still=_named(recording.joints, rows.speed < STILL),
@@ -295,6 +294,16 @@ def _identified(
         carried=problem.carried,
         compliance=compliance,
     )
+
+
+def _held_back(problem: Problem, selected: Selected) -> tuple[Score, Floats]:
+    """Return the score on torques held back from the fit, and errors (n,) of joints alone there."""
+    rows = problem.rows
+    windows = problem.windows
+    trained = fitted(rows, windows.fit, problem.G, selected.prior, selected.found)
+    score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
+    alone = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
+    return score, errors_alone(rows, windows.test, alone)
 
 
 def _compliance(

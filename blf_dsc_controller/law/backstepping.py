@@ -43,7 +43,8 @@ class Backstepping(NamedTuple):
         if settings.rotors.unsure == 1:
             measure_rotors(settings, state, signals, dt)
             correct_feedback(settings, state, signals)
-        begins, of = state.samples[0] == 0.0, settings.feedback
+        of = settings.feedback
+        begins = state.samples[0] == 0.0
         feedback.advance(of, state.feedback, signals.xi2, begins, dt)
         for i in range(settings.n):
             torque = of.gain[i] * feedback.damped(of, state.feedback, signals.xi2, i)

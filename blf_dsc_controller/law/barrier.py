@@ -120,6 +120,13 @@ def update_bound(settings: Settings, work: Work, t: float, bound: Array) -> None
         work.narrowing[i] = -settings.funnel_rate * above / bound[i]
 
 
+def bound_at(settings: Settings, t: float) -> Array:
+    """Return k(t) (n,) [rad] at time t [s], as `update_bound` computes it."""
+    above = (settings.initial_bound - settings.bound) * exp(-settings.funnel_rate * t)
+    bound: Array = settings.bound + above
+    return bound
+
+
 @inner
 def joint_gradient(
     settings: Settings, work: Work, xi: float, bound: float, i: int

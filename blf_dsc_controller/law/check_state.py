@@ -6,8 +6,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
-from blf_dsc_controller.law import effect, kept_estimates, repeats, sensor
-from blf_dsc_controller.law.oscillation import Oscillation
+from blf_dsc_controller.law import effect, kept_estimates, oscillation, repeats, sensor
 
 SUSPECT = 1
 """A value that is not finite, a torque demand past its limit, or too large an error."""
@@ -15,12 +14,11 @@ SUSPECT = 1
 OUTSIDE = 2
 """An error outside its bound."""
 
-NO_EFFECT = 8
-"""Commands that do not reach the arm, or an arm that is held: see `effect`."""
-
 INVALID = 4
 """A joint state that is not finite or too fast; the law did not use it."""
 
+NO_EFFECT = 8
+"""Commands that do not reach the arm, or an arm that is held: see `effect`."""
 
 CONTRADICTION = 16
 """Velocities that are not those of the positions; the law did not use them. Goes with INVALID."""
@@ -43,7 +41,7 @@ class Checks(NamedTuple):
     repeats: repeats.State
     sensor: sensor.State
     effect: effect.State
-    oscillation: Oscillation
+    oscillation: oscillation.State
 
 
 checks_of = view_of(Checks)

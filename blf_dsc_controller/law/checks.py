@@ -32,7 +32,9 @@ def is_valid_state(checks: Checks, measurement: Array) -> bool:
 def watch_oscillation(
     settings: Settings, checks: Checks, signals: Signals, begins: bool, dt: float
 ) -> bool:
-    """Return whether an oscillation of the arm is to be reported."""
+    """Follow the half waves of the joints, if checked; return whether to report an oscillation."""
+    if checks.velocity_limit[0] <= 0.0 or checks.sample_time[0] <= 0.0:
+        return False
     now = checks.oscillation
     limit = settings.torque.limit
     if begins:

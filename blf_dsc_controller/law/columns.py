@@ -32,29 +32,29 @@ class Settings(NamedTuple):
 
 
 @inner
-def set_block(rest: Array, at: int, i: int, value: float) -> None:
-    """Set entry (i, i) of the block that starts at column `at`; zero the rest of its row."""
-    for k in range(rest.shape[0]):
-        rest[i, at + k] = 0.0
-    rest[i, at + i] = value
+def set_block(Yr: Array, at: int, i: int, value: float) -> None:
+    """Set entry (i, i) of the block that starts at column `at`; zero the others of its row."""
+    for k in range(Yr.shape[0]):
+        Yr[i, at + k] = 0.0
+    Yr[i, at + i] = value
 
 
 @inner
-def fill_columns(settings: Settings, t: float, dq: Array, rest: Array) -> None:
-    """Fill D, the last columns of `rest` (n, m), at time t [s] and velocity dq (n,) [rad/s]."""
+def fill_columns(settings: Settings, t: float, dq: Array, Yr: Array) -> None:
+    """Fill D, the last columns of [Yr | D] (n, m), at time t [s] and velocity dq (n,) [rad/s]."""
     n = dq.size
     for i in range(n):
         at = settings.first
         if settings.bias == 1:
-            set_block(rest, at, i, 1.0)
+            set_block(Yr, at, i, 1.0)
             at += n
         if settings.viscous == 1:
-            set_block(rest, at, i, dq[i])
+            set_block(Yr, at, i, dq[i])
             at += n
         if settings.coulomb == 1:
-            set_block(rest, at, i, sliding(dq[i], settings.coulomb_velocity))
+            set_block(Yr, at, i, sliding(dq[i], settings.coulomb_velocity))
             at += n
         for k in range(settings.tones):
-            set_block(rest, at, i, sin(settings.frequencies[k] * t))
-            set_block(rest, at + n, i, cos(settings.frequencies[k] * t))
+            set_block(Yr, at, i, sin(settings.frequencies[k] * t))
+            set_block(Yr, at + n, i, cos(settings.frequencies[k] * t))
             at += 2 * n

@@ -101,8 +101,8 @@ def fill_sample(
 
 
 @inner
-def refuse(checks: Checks, measurement: Array, dt: float) -> int:
-    """Return the flags of a measurement that the law must not use; 0 if it may."""
+def check_measurement(checks: Checks, measurement: Array, dt: float) -> int:
+    """Return the flags of a measurement that the law must not use, or 0; update the sensor's."""
     if checks.velocity_limit[0] <= 0.0:
         return 0  # nothing is checked
     if not is_valid_state(checks, measurement):
@@ -153,6 +153,29 @@ def prepare(
 
 
 @inner
+def advance(
+    law: Law, settings: Settings, state: State, signals: Signals, t: float, dt: float
+) -> None:
+    """Let the law compute its torque, within its limits, and advance its memory by `dt` [s]."""
+    has_last = state.samples[0] > 0.0 or state.saturation.takes_over[0] > 0.0
+    law.compute_demand(settings, state, signals, t, dt)
+    saturated = torque.saturate(
+        settings.torque,
+        state.saturation,
+        signals.saturation,
+        signals.demand,
+        state.torque,
+        has_last,
+        dt,
+        signals.torque,
+    )
+    law.finish(settings, state, signals, dt, saturated)
+    for i in range(settings.n):
+        state.torque[i] = signals.torque[i]
+    state.samples[0] += 1.0
+
+
+@inner
 def step(
     law: Law,
     settings: Settings,
@@ -171,37 +194,18 @@ def step(
     m], t [s] the time since the start, dt [s] since the last sample (at the first:
     until the next).  The terms of (29) are separate: `lyapunov.fill_energies`.
     """
-    flags = refuse(checks, measurement, dt)
+    flags = check_measurement(checks, measurement, dt)
     if flags != 0:
         return flags
-    is_checked = checks.velocity_limit[0] > 0.0
     begins = state.samples[0] == 0.0
     take_measurement(checks, signals, measurement, begins, dt)
     prepare(settings, state, signals, reference_vector, t)
-    oscillates = (
-        is_checked
-        and checks.sample_time[0] > 0.0
-        and watch_oscillation(settings, checks, signals, begins, dt)
-    )
+    oscillates = watch_oscillation(settings, checks, signals, begins, dt)
     fault = state.sensors.fault[0]
-    law.compute_demand(settings, state, signals, t, dt)
-    saturated = torque.saturate(
-        settings.torque,
-        state.saturation,
-        signals.saturation,
-        signals.demand,
-        state.torque,
-        not begins or state.saturation.takes_over[0] > 0.0,
-        dt,
-        signals.torque,
-    )
-    law.finish(settings, state, signals, dt, saturated)
-    for i in range(settings.n):
-        state.torque[i] = signals.torque[i]
-    state.samples[0] += 1.0
+    advance(law, settings, state, signals, t, dt)
     fill_sample(settings, state, signals, sample)
-    if not is_checked:
-        return 0
+    if checks.velocity_limit[0] <= 0.0:
+        return 0  # nothing is checked
     flags = check_sample(settings, checks, state, signals, sample)
     if state.sensors.fault[0] != fault:
         oscillation.forget_all(checks.oscillation)  # r may have been the cause
@@ -356,9 +360,7 @@ class Controller:
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
-        signals = self.signals
-        barrier.update_bound(self.settings.barrier, signals.barrier, t, signals.bound)
-        return np.array(self.signals.bound)
+        return barrier.bound_at(self.settings.barrier, t)
 
     def reference_at(self, t: float) -> Array:
         """Return the reference qr, dqr, ddqr (3, n) at time t [s] since the start."""
@@ -464,8 +466,10 @@ class Controller:
         saved = self.save()
         limit = self.checks.velocity_limit[0]
         self.checks.velocity_limit[0] = 0.0
-        torque: Array = self.update(t, dt, measurement).copy()
-        self.checks.velocity_limit[0] = limit
+        try:
+            torque: Array = self.update(t, dt, measurement).copy()
+        finally:
+            self.checks.velocity_limit[0] = limit
         self.restore(saved)
         return torque
 

@@ -38,11 +38,12 @@ class State(NamedTuple):
     recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
     before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
     compares: Cell  # 1: measured efforts are torques, to be compared with the commands
-    lack: Annotated[Array, 'n']  # N m, average of commands less efforts over _RECENT
+    # N m, average of commands less efforts over _RECENT
+    shortfall: Annotated[Array, 'n']
     # N m, of it the error of the model of what the drives add
-    lack_in_motion: Annotated[Array, 'n']
-    usual: Annotated[Array, 'n']  # N m, average of the lack over _BEFORE
-    lacking: Cell  # s, since a lack has become too large
+    shortfall_in_motion: Annotated[Array, 'n']
+    usual_shortfall: Annotated[Array, 'n']  # N m, average of it over _BEFORE
+    short_for: Cell  # s, for which the shortfall has been too large
 
 
 class Sample(NamedTuple):
@@ -90,13 +91,13 @@ def check_effect(
     effort that follows the commands shows that they have an effect.
     """
     moves = sample.begins or is_elsewhere(readings, sample.q, state.q)
-    lacks = compare_effort(limits, state, sample, moves)
+    falls_short = compare_effort(limits, state, sample, moves)
     state.at_rest[0] = 0.0 if moves else state.at_rest[0] + sample.dt
     has_changed = follow_commands(limits, state, sample, moves)
     has_changed = has_changed and state.at_rest[0] > _RECENT
     is_missing = has_changed and is_elsewhere(readings, sample.qr, state.qr)
     is_missing = is_missing and not effort_follows(state, sample.effort)
-    return lacks or is_missing, moves and state.lacking[0] == 0.0
+    return falls_short or is_missing, moves and state.short_for[0] == 0.0
 
 
 @inner
@@ -126,7 +127,7 @@ def follow_commands(
 @inner
 def effort_follows(state: State, effort: Array) -> bool:
     """Whether measured efforts (n,) are torques and do what is commanded."""
-    follows = bool(state.compares[0] == 1.0) and bool(state.lacking[0] == 0.0)
+    follows = bool(state.compares[0] == 1.0) and bool(state.short_for[0] == 0.0)
     for i in range(effort.size):
         follows = follows and isfinite(effort[i])
     return follows
@@ -144,21 +145,23 @@ def compare_effort(
     """
     if state.compares[0] == 0.0:
         return False
-    is_lacking = False
+    is_short = False
     is_relative = limits.drive > 0 and limits.effort_is_whole == 1
     for i in range(sample.q.size):
-        lack = sample.command[i] - sample.effort[i]
+        shortfall = sample.command[i] - sample.effort[i]
         if is_relative:
-            lack += sample.added[i]
+            shortfall += sample.added[i]
         if sample.begins:
-            state.lack[i] = lack if is_relative else 0.0
-            state.usual[i] = state.lack[i]
-        elif isfinite(lack):
-            state.lack[i] += min(1.0, sample.dt / _RECENT) * (lack - state.lack[i])
-            state.usual[i] += min(1.0, sample.dt / _BEFORE) * (lack - state.usual[i])
+            state.shortfall[i] = shortfall if is_relative else 0.0
+            state.usual_shortfall[i] = state.shortfall[i]
+        elif isfinite(shortfall):
+            change = shortfall - state.shortfall[i]
+            state.shortfall[i] += min(1.0, sample.dt / _RECENT) * change
+            change = shortfall - state.usual_shortfall[i]
+            state.usual_shortfall[i] += min(1.0, sample.dt / _BEFORE) * change
         if moves:
-            state.lack_in_motion[i] = state.lack[i] if is_relative else 0.0
-        excess = abs(state.lack[i] - state.lack_in_motion[i])
-        is_lacking = is_lacking or excess > _CHANGED * limits.limit[i]
-    state.lacking[0] = state.lacking[0] + sample.dt if is_lacking else 0.0
-    return bool(state.lacking[0] > _LASTING)
+            state.shortfall_in_motion[i] = state.shortfall[i] if is_relative else 0.0
+        excess = abs(state.shortfall[i] - state.shortfall_in_motion[i])
+        is_short = is_short or excess > _CHANGED * limits.limit[i]
+    state.short_for[0] = state.short_for[0] + sample.dt if is_short else 0.0
+    return bool(state.short_for[0] > _LASTING)

@@ -25,7 +25,6 @@ most strongly in weakly excited directions.  Likewise, a full window with an unu
 large residual is pulled to an earlier solution, kept once per window.
 """
 
-from math import inf
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.arms.model import ArmModel
@@ -174,19 +173,13 @@ def best_part_residual(
     `sliding.work.newer` is the sum of its `newer_rows` newer rows.  Phi, b, the factor
     and the solution of the whole window are in its scratch again afterwards.
     """
-    work = sliding.work
-    whole = sliding.state.running
+    whole, newer, older = sliding.state.running, sliding.work.newer, sliding.work.part
     length = sliding.settings.length
-    sums.add(whole, -1.0, work.newer, work.part)
-    best = inf
-    for k in range(3):  # the older part, the newer one, and the whole window again
-        part, rows = work.part, length - newer_rows
-        if k == 1:
-            part, rows = work.newer, newer_rows
-        elif k == 2:
-            part, rows = whole, length
-        best = min(best, part_residual(sliding, prior, active, part, rows))
-    return best
+    sums.add(whole, -1.0, newer, older)
+    of_older = part_residual(sliding, prior, active, older, length - newer_rows)
+    of_newer = part_residual(sliding, prior, active, newer, newer_rows)
+    part_residual(sliding, prior, active, whole, length)  # for its scratch alone
+    return min(of_older, of_newer)
 
 
 @inner
@@ -229,15 +222,12 @@ def accept_window(
     is that at the position q (n,).
     """
     now = sliding.work
-    solution = now.solution
-    m = solution.size
-    for j in range(m):
-        solution[j] = now.b[j]
-    cholesky_solve(now.factor, solution)
+    for j in range(now.b.size):
+        now.solution[j] = now.b[j]
+    cholesky_solve(now.factor, now.solution)
     rows = sliding.state.rows[0]
-    residual = window_residual(sliding.state.running, solution) / rows
+    residual = window_residual(sliding.state.running, now.solution) / rows
     missing = 1.0 - rows / sliding.settings.length
-    is_first = state.latched[0] == 0.0
     if is_in_question(settings, state, sliding, residual) and split_window(
         settings, state, sliding, prior, residual
     ):
@@ -252,17 +242,25 @@ def accept_window(
     if pull > 0.0:
         window.pull_to(state.anchor, pull, prior.information, now.Phi, now.b)
         window.solve(sliding.settings, now, prior.information, state.active)
-    find_spare_inertia(model, work, q, solution, prior.estimate)
+    find_spare_inertia(model, work, q, now.solution, prior.estimate)
     if not cholesky_factor(work.inertia):
         return False
-    for j in range(m):
-        state.solution[j] = solution[j]
-    state.residual[0] = residual
-    is_start = window.is_at_start(sliding.settings, sliding.state)
-    if missing <= 0.0 and (is_first or is_start):
-        for j in range(m):
-            state.anchor[j] = solution[j]
+    keep_solution(state, sliding, residual)
     return True
+
+
+@inner
+def keep_solution(state: State, sliding: Window, residual: float) -> None:
+    """Keep the solution of the window; that of a full one becomes the anchor, once per window."""
+    solution = sliding.work.solution
+    is_first = state.latched[0] == 0.0
+    is_due = is_first or window.is_at_start(sliding.settings, sliding.state)
+    becomes_anchor = is_due and window.is_full(sliding.settings, sliding.state)
+    state.residual[0] = residual
+    for j in range(solution.size):
+        state.solution[j] = solution[j]
+        if becomes_anchor:
+            state.anchor[j] = solution[j]
 
 
 @inner
@@ -387,9 +385,8 @@ def update_excitation(
     suffices = value >= settings.excitation_threshold
     if not (learning and suffices and is_preferred(settings, state, value)):
         return
-    consistent = settings.change_detection == 0
-    if not (
-        consistent or accept_window(settings, state, work, sliding, prior, model, q)
+    if settings.change_detection == 1 and not accept_window(
+        settings, state, work, sliding, prior, model, q
     ):
         return
     latch(state, sliding, value, t)

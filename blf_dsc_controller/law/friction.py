@@ -65,9 +65,8 @@ class Settings(NamedTuple):
     coulomb: int  # 1: theta has a column of Coulomb friction per joint
     first_viscous: int  # index of the first such column
     first_coulomb: int
-    learns: (
-        int  # 1: there are columns of Coulomb friction, and rows that show its steps
-    )
+    # 1: there are columns of Coulomb friction, and rows that show its steps
+    learns: int
     bumpless: int  # 1: d^3 gives up what a changed estimate adds to the torque
     coulomb_velocity: float  # v_c, rad/s
     lag: float  # of measured velocities and applied torques together, s

@@ -212,7 +212,7 @@ def check_sensors(
     limit = settings.torque.limit
     for i in range(settings.n):
         work.differences[0, i] = of.filtered[i, settings.p] - now.command[i]
-        if now.is_told[0] == 0.0:
+        if now.is_distinct[0] == 0.0:
             work.differences[1, i] = load_observer.residual(
                 settings.observer, of, i, state.estimate, state.absorbed.absorbed
             )
@@ -294,12 +294,12 @@ def detect_change(
 @inner
 def take_back(settings: Settings, state: State, signals: Signals) -> None:
     """Return to the estimate before the window; the torque stays the same, if configured."""
-    taught = signals.adaptation.tracked
+    before = signals.adaptation.tracked  # scratch here
     for j in range(settings.m):
-        taught[j] = state.estimate[j]
+        before[j] = state.estimate[j]
         state.estimate[j] = state.latch.anchor[j]
     if settings.disturbance.bumpless == 1:
-        transfer_learned(settings, state, signals, taught)
+        transfer_learned(settings, state, signals, before)
 
 
 @inner

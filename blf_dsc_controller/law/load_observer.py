@@ -195,8 +195,8 @@ def find_bias(
         p = state.filtered.shape[1] - 1
         for j in range(m):
             work.row[j] = state.filtered[i, j] if j < p else 0.0
-        rest = settings.unmodelled[i]
-        variance = whiten(work.factor, work.row) + rest * rest
+        f = settings.unmodelled[i]
+        variance = whiten(work.factor, work.row) + f * f
         if abs(state.bias[i]) > _SIGMAS * sqrt(variance):
             state.keeps_bias[i] = 1.0
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong with a law of a file, in one line: its line there, and the remedy.
 
-Numba tells a mistake in some 130 lines, of which most are about its own search and the
+Numba reports a mistake in some 130 lines, of which most are about its own search and the
 loop that calls the law.
 """
 
@@ -22,8 +22,8 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 
 _ARGUMENTS = {'settings': Settings, 'state': State, 'signals': Signals}
 _READ_MORE = 'doc/tutorial_law.md'
-_Told = tuple[str, int | None]
-"""A problem with its remedy, and its line where numba does not tell it."""
+_Mistake = tuple[str, int | None]
+"""What is wrong and what to do, and the line, where numba does not say it."""
 _PLACE = re.compile(
     r'File "(?P<file>[^"]+)", line (?P<line>\d+):'
     r'|\b(?:at|Raised from) (?P<at>\S[^\n]*?) \((?P<there>\d+)\)'
@@ -65,20 +65,20 @@ def mistake_in(law: type, text: str) -> str:
         for each in _PLACE.finditer(text)
         if Path(each['file'] or each['at']).name == file.name
     ]
-    inner = text[: places[0].start()] if places else text  # the innermost is told first
+    inner = text[: places[0].start()] if places else text  # the innermost comes first
     found = [
-        (match.start(), problem, match)
-        for pattern, problem in _RULES.items()
+        (match.start(), rule, match)
+        for pattern, rule in _RULES.items()
         for match in re.finditer(pattern, inner)
     ]
     if found:
-        _, problem, match = max(found, key=lambda each: each[0])
-        told, line = problem(law, source, match)
+        _, rule, match = max(found, key=lambda each: each[0])
+        mistake, line = rule(law, source, match)
     else:
-        told, line = f'it cannot be compiled: {inner.strip().splitlines()[0]}', None
+        mistake, line = f'it cannot be compiled: {inner.strip().splitlines()[0]}', None
     number = places[0]['line'] or places[0]['there'] if places else line
     where = f'{file}, line {number}' if number else f'{file}'
-    return f'{where}: {told}: see {_READ_MORE}'
+    return f'{where}: {mistake}: see {_READ_MORE}'
 
 
 def _line_of(source: ast.Module, is_it: Callable[[ast.AST], bool]) -> int | None:
@@ -101,7 +101,9 @@ def _line_with(source: ast.Module, name: str) -> int | None:
     )
 
 
-def _unknown_attribute(law: type, _source: ast.Module, match: re.Match[str]) -> _Told:
+def _unknown_attribute(
+    law: type, _source: ast.Module, match: re.Match[str]
+) -> _Mistake:
     name, owner = match.groups()
     for argument, layout in _ARGUMENTS.items():
         if owner == layout.__name__:
@@ -127,14 +129,14 @@ def _unknown_field(argument: str, layout: type, name: str) -> str:
     return f'{argument} has no {name}: law/state.py lists what it has; what the law keeps is MEMORY'
 
 
-def _undefined(law: type, source: ast.Module, match: re.Match[str]) -> _Told:
+def _undefined(law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
     name = match[1]
     is_gain = name in getattr(law, '_fields', ())
     remedy = f'write self.{name}' if is_gain else 'define it at the top, or import it'
     return f'{name} is not defined: {remedy}', _line_with(source, name)
 
 
-def _uncompiled(_law: type, _source: ast.Module, match: re.Match[str]) -> _Told:
+def _uncompiled(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
     name, kind = match.groups()
     if kind == 'function':
         return (
@@ -144,7 +146,7 @@ def _uncompiled(_law: type, _source: ast.Module, match: re.Match[str]) -> _Told:
     return f'{name} is a {kind}, which cannot be compiled: use numbers and arrays', None
 
 
-def _impossible(_law: type, _source: ast.Module, match: re.Match[str]) -> _Told:
+def _impossible(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
     call = ' '.join(match[1].split())
     return (
         f'{call}: these shapes or types do not fit: compute entry by entry, with [i]',
@@ -152,7 +154,7 @@ def _impossible(_law: type, _source: ast.Module, match: re.Match[str]) -> _Told:
     )
 
 
-def _allocates(_law: type, source: ast.Module, _match: re.Match[str]) -> _Told:
+def _allocates(_law: type, source: ast.Module, _match: re.Match[str]) -> _Mistake:
     line = _line_of(source, lambda node: isinstance(node, _CREATES))
     return (
         'a law must not create arrays or lists, as numpy and expressions of arrays do: compute '
@@ -160,23 +162,23 @@ def _allocates(_law: type, source: ast.Module, _match: re.Match[str]) -> _Told:
     ), line or _line_with(source, 'np') or _line_with(source, 'numpy')
 
 
-def _set(_law: type, _source: ast.Module, match: re.Match[str]) -> _Told:
+def _set(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
     return (
         f'{match[1]} cannot be set: write to entries of arrays, as signals.demand[i]; what the law '
         'keeps is MEMORY'
     ), None
 
 
-def _not_in_module(_law: type, source: ast.Module, match: re.Match[str]) -> _Told:
+def _not_in_module(_law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
     return f'{match[1]} has no {match[2]}', _line_with(source, match[2])
 
 
-def _other(_law: type, _source: ast.Module, match: re.Match[str]) -> _Told:
+def _other(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
     return f'it cannot be compiled: {match[1].strip()}', None
 
 
-_Problem = Callable[[type, ast.Module, 're.Match[str]'], _Told]
-_RULES: dict[str, _Problem] = {
+_Rule = Callable[[type, ast.Module, 're.Match[str]'], _Mistake]
+_RULES: dict[str, _Rule] = {
     r"Unknown attribute '(\w+)' of type (?:Reference\()?(\w+)": _unknown_attribute,
     r"NameError: name '(\w+)' is not defined": _undefined,
     r"Untyped global name '(\w+)':?.*?<class '(\w+)'>": _uncompiled,

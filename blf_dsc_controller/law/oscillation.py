@@ -64,7 +64,7 @@ _GROWN = 2.0  # half waves in a row
 _AVERAGED = 4.0  # half periods
 
 
-class Oscillation(NamedTuple):
+class State(NamedTuple):
     """What is kept of each joint from sample to sample."""
 
     slow: Annotated[Array, 2, 'n']  # rad, lags of e
@@ -90,7 +90,7 @@ class Oscillation(NamedTuple):
 
 @inner
 def watch(
-    now: Oscillation,
+    now: State,
     limit: Array,
     error: Array,
     torque: Array,
@@ -134,7 +134,7 @@ def watch(
 
 
 @inner
-def begin(now: Oscillation, error: Array, torque: Array) -> None:
+def begin(now: State, error: Array, torque: Array) -> None:
     """Begin with an error (n,) [rad] and a torque (n,) [N m], at rest."""
     now.wait[0] = 0.0
     for i in range(error.size):
@@ -146,13 +146,13 @@ def begin(now: Oscillation, error: Array, torque: Array) -> None:
 
 
 @inner
-def oscillates(now: Oscillation, i: int) -> bool:
+def oscillates(now: State, i: int) -> bool:
     """Whether joint i oscillates."""
     return bool(now.waves[i] >= WAVES or now.grown[i] >= _GROWN)
 
 
 @inner
-def count_down(now: Oscillation, limit: Array, dt: float) -> bool:
+def count_down(now: State, limit: Array, dt: float) -> bool:
     """Count down to the next report; return whether an oscillation is to be reported now.
 
     `dt` [s] is the time since the last call, `limit` (n,) [N m] are those of the
@@ -171,7 +171,7 @@ def count_down(now: Oscillation, limit: Array, dt: float) -> bool:
 
 
 @inner
-def forget(now: Oscillation, i: int, p: float) -> None:
+def forget(now: State, i: int, p: float) -> None:
     """Wait for the next half wave of joint i, from p [rad] on."""
     now.waves[i] = now.grown[i] = now.amplitude[i] = 0.0
     now.square[i] = now.sum[i] = now.span[i] = 0.0
@@ -181,7 +181,7 @@ def forget(now: Oscillation, i: int, p: float) -> None:
 
 
 @inner
-def forget_all(now: Oscillation) -> None:
+def forget_all(now: State) -> None:
     """Wait for the next half waves of all joints, from where they are."""
     now.wait[0] = 0.0
     for i in range(now.waves.size):
@@ -190,7 +190,7 @@ def forget_all(now: Oscillation) -> None:
 
 
 @inner
-def end_span(now: Oscillation, i: int) -> float:
+def end_span(now: State, i: int) -> float:
     """Return the amplitude of the torque [N m] in the half wave that ends, and begin another.
 
     It is about the mean of two half waves; of a first one, which may be half of a wave
@@ -208,7 +208,7 @@ def end_span(now: Oscillation, i: int) -> float:
 
 @inner
 def end_half_wave(
-    now: Oscillation, i: int, travel: float, is_clear: bool, strong: float
+    now: State, i: int, travel: float, is_clear: bool, strong: float
 ) -> None:
     """Count the half wave of joint i that has ended, over `travel` [rad], if it counts.
 
@@ -238,6 +238,6 @@ def end_half_wave(
 
 
 @inner
-def is_fast(now: Oscillation, i: int) -> bool:
+def is_fast(now: State, i: int) -> bool:
     """Whether joint i seems to oscillate so fast that a filtered velocity lags far behind."""
     return bool(now.waves[i] >= SOME and now.half[i] < 0.5 / _FAST)

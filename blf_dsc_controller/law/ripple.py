@@ -17,30 +17,30 @@ from blf_dsc_controller.numerics.elementary import cos, sin
 
 
 @inner
-def fill_ripple(settings: Settings, i: int, angle: float, rest: Array) -> None:
-    """Fill the ripple columns of row i of `rest` (n, m) at the position `angle` [rad]."""
-    n = rest.shape[0]
+def fill_ripple(settings: Settings, i: int, angle: float, H: Array) -> None:
+    """Fill the ripple columns of row i of a regressor H (n, m) at the position `angle` [rad]."""
+    n = H.shape[0]
     blocks = settings.bias + settings.viscous + settings.coulomb + 2 * settings.tones
     at = settings.first + n * blocks
     for k in range(settings.ripples):
         for j in range(2 * n):
-            rest[i, at + j] = 0.0
-        rest[i, at + i] = sin(settings.ripple_cycles[k] * angle)
-        rest[i, at + n + i] = cos(settings.ripple_cycles[k] * angle)
+            H[i, at + j] = 0.0
+        H[i, at + i] = sin(settings.ripple_cycles[k] * angle)
+        H[i, at + n + i] = cos(settings.ripple_cycles[k] * angle)
         at += 2 * n
 
 
 @inner
 def fill_measured_ripple(
-    settings: Settings, lag: float, q: Array, dq: Array, rest: Array
+    settings: Settings, lag: float, q: Array, dq: Array, H: Array
 ) -> None:
-    """Fill the ripple columns of `rest` (n, m) for the row, at q (n,) [rad] and dq (n,) [rad/s].
+    """Fill the ripple columns of H (n, m) for the row, at q (n,) [rad] and dq (n,) [rad/s].
 
     The row's torque has passed the velocity filter, half of the `lag` [s] of
     `robot.lag`, but positions have not.
     """
     for i in range(q.size):
-        fill_ripple(settings, i, q[i] - 0.5 * lag * dq[i], rest)
+        fill_ripple(settings, i, q[i] - 0.5 * lag * dq[i], H)
 
 
 @inner

@@ -26,7 +26,7 @@ from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
-from blf_dsc_controller.law.oscillation import Oscillation, is_fast
+from blf_dsc_controller.law import oscillation
 
 _NOISE = 0.5  # s, over which the noise is averaged
 _SIGMAS = 3.0  # of a filtered value
@@ -95,7 +95,7 @@ def measure_noise(state: State, dt: float, measurement: Array) -> None:
 @inner
 def compare_velocities(
     state: State,
-    oscillation: Oscillation,
+    shaking: oscillation.State,
     sample_time: float,
     dt: float,
     measurement: Array,
@@ -128,20 +128,20 @@ def compare_velocities(
         state.mismatch[i] += slow * (difference * difference - state.mismatch[i])
         larger = max(abs(state.derived[i]), abs(state.measured[i]))
         state.speed[i] += slow * (larger * larger - state.speed[i])
-        is_wrong = is_wrong or is_contradicted(state, oscillation, i, share)
+        is_wrong = is_wrong or is_contradicted(state, shaking, i, share)
     return is_wrong
 
 
 @inner
 def is_contradicted(
-    state: State, oscillation: Oscillation, i: int, share: float
+    state: State, shaking: oscillation.State, i: int, share: float
 ) -> bool:
     """Whether the velocity of joint i contradicts its positions, which no lag explains.
 
     `share` is that of a reading in a filtered velocity.
     """
     least = max(_WRONG * state.speed[i], unseen(state, i, share))
-    is_lag = is_fast(oscillation, i) and is_late(state, i)
+    is_lag = oscillation.is_fast(shaking, i) and is_late(state, i)
     return bool(state.mismatch[i] > least and not is_lag)
 
 

@@ -164,9 +164,8 @@ class Sample(NamedTuple):
     xi1: Annotated[Array, 'n']  # rad
     xi2: Annotated[Array, 'n']  # rad/s
     torque: Annotated[Array, 'n']  # commanded, after saturation, N m
-    disturbance: Annotated[
-        Array, 'n'
-    ]  # d^3, r of `load_observer`, learned friction, N m
+    # d^3, r of `load_observer` and learned friction, N m
+    disturbance: Annotated[Array, 'n']
     bound: Annotated[Array, 'n']  # k(t), rad
     # how the torque was cut: 0, LEVEL_CUT, RATE_CUT, or their sum
     cuts: Annotated[Array, 'n']

@@ -14,6 +14,14 @@ def add(first: Array, weight: float, second: Array, out: Array) -> None:
 
 
 @inner
+def copy(source: Array, out: Array) -> None:
+    """Write the upper triangle of `source` to `out`."""
+    for a in range(out.shape[0]):
+        for b in range(a, out.shape[0]):
+            out[a, b] = source[a, b]
+
+
+@inner
 def add_products(row: Array, sums: Array) -> None:
     """Add the upper triangle of [X | u]^T [X | u] of a row (n, m + 1) to `sums`."""
     for i in range(row.shape[0]):

@@ -38,7 +38,6 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.lag import filter_gain
-from blf_dsc_controller.law.oscillation import Oscillation
 
 NONE, SHAKES, COMMANDS, OFF = range(4)
 """What is wrong with the efforts, if anything."""
@@ -63,7 +62,7 @@ class State(NamedTuple):
 
     fault: Cell  # NONE, SHAKES, COMMANDS or OFF
     joint: Cell  # that shows it
-    is_told: Cell  # 1: efforts are known not to be commands
+    is_distinct: Cell  # 1: efforts are known not to be commands
     moved: Cell  # s of motion so far
     # N m, of the last interval behind L: the torque commanded
     command: Annotated[Array, 'n * observer.enabled']
@@ -72,7 +71,7 @@ class State(NamedTuple):
     # (N m)^2 s, integrals of the squares of what is faster
     square: Annotated[Array, '2 * observer.enabled', 'n']
     lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
-    shaking: Oscillation  # of r
+    shaking: oscillation.State  # of r
 
 
 class Work(NamedTuple):
@@ -82,7 +81,7 @@ class Work(NamedTuple):
     differences: Annotated[Array, '2 * observer.enabled', 'n']
     limit: Annotated[Array, 'n * observer.enabled']  # N m, by which r counts as strong
     clear: Annotated[Array, 'n * observer.enabled']  # N m, of a wave of r
-    none: Annotated[Array, 'n * observer.enabled']  # zeros
+    zeros: Annotated[Array, 'n * observer.enabled']
 
 
 @inner
@@ -102,8 +101,8 @@ def follow_applied(
 
 
 @inner
-def find(state: State, fault: float, i: int) -> None:
-    """Keep what is wrong with joint i, if nothing was before."""
+def note_fault(state: State, fault: float, i: int) -> None:
+    """Keep the first `fault` that is found, which joint i shows."""
     if state.fault[0] == NONE:
         state.fault[0] = fault
         state.joint[0] = i
@@ -118,11 +117,11 @@ def watch_shaking(
         work.limit[i] = _STRONG * limit[i]
         work.clear[i] = _CLEAR * limit[i]
     oscillation.watch(
-        state.shaking, work.limit, torque, torque, work.none, work.clear, dt
+        state.shaking, work.limit, torque, torque, work.zeros, work.clear, dt
     )
     for i in range(torque.size):
         if oscillation.oscillates(state.shaking, i):
-            find(state, SHAKES, i)
+            note_fault(state, SHAKES, i)
 
 
 @inner
@@ -130,7 +129,7 @@ def compare_with_commands(
     state: State, work: Work, reference_speed: Array, begins: bool, dt: float
 ) -> None:
     """Find whether efforts are commands, by `work.differences`: `begins` with them."""
-    if state.is_told[0] == 1.0:
+    if state.is_distinct[0] == 1.0:
         return
     n = reference_speed.size
     share = filter_gain(1.0 / (2.0 * pi * _SLOWEST), dt)
@@ -148,12 +147,12 @@ def compare_with_commands(
     if moves:
         state.moved[0] += dt
     if state.moved[0] > _LEAST_MOTION:
-        judge(state)
+        decide(state)
 
 
 @inner
-def judge(state: State) -> None:
-    """Judge by the mean squares whether efforts are commands, certainly not, or neither."""
+def decide(state: State) -> None:
+    """Decide by the mean squares whether efforts are commands, certainly not, or neither yet."""
     product = equal = distinct = 1.0
     nearest = 0
     for i in range(state.square.shape[1]):
@@ -165,9 +164,9 @@ def judge(state: State) -> None:
         if ratio < near:
             nearest = i
     if product < equal:
-        find(state, COMMANDS, nearest)
+        note_fault(state, COMMANDS, nearest)
     if product > distinct or state.fault[0] != NONE:
-        state.is_told[0] = 1.0
+        state.is_distinct[0] = 1.0
 
 
 @inner
@@ -197,7 +196,7 @@ def follow_commands(
         is_off = is_off or is_one
         state.lasted[i] = state.lasted[i] + dt if is_one and follows else 0.0
         if state.lasted[i] > _LASTING:
-            find(state, OFF, i)
+            note_fault(state, OFF, i)
     return is_off
 
 

@@ -19,7 +19,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.innovation import Prior
-from blf_dsc_controller.law.sums import add, clear
+from blf_dsc_controller.law.sums import add, clear, copy
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 
@@ -57,7 +57,7 @@ class Work(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The whole of it."""
+    """A window: its settings, its rows, and its equations."""
 
     settings: Settings
     state: State
@@ -100,10 +100,10 @@ def push_row(state: State, row: Array) -> None:
     state.rows[0] = min(state.rows[0] + 1.0, float(length))
     state.cursor[0] = float((cursor + 1) % length)
     if cursor + 1 == length // 2:
-        add(fresh, 0.0, half, half)
+        copy(fresh, half)
     if cursor + 1 == length:
         if state.rows[0] == length:
-            add(fresh, 0.0, fresh, running)
+            copy(fresh, running)
         add(fresh, -1.0, half, half)
         clear(fresh)
 
@@ -120,7 +120,7 @@ def newer_part(state: State, newer: Array) -> int:
     if 4 * cursor > 3 * length:
         add(state.fresh, -1.0, state.half, newer)
         return cursor - middle
-    add(state.fresh, 0.0, state.half, newer)
+    copy(state.fresh, newer)
     return cursor
 
 
@@ -171,16 +171,16 @@ def regularized_factor(
 
 
 @inner
-def weigh(information: Array, x: Array, out: Array) -> float:
-    """Write R x (m,) to `out`; return x^T R x."""
+def quadratic_form(A: Array, x: Array, product: Array) -> float:
+    """Return x^T A x of a symmetric A (m, m), and write A x (m,) to `product`."""
     for i in range(x.size):
-        out[i] = 0.0
-    for j in range(x.size):  # R is symmetric: traversed by rows, which are contiguous
+        product[i] = 0.0
+    for j in range(x.size):  # by rows of A, which are contiguous
         for i in range(x.size):
-            out[i] += information[j, i] * x[j]
+            product[i] += A[j, i] * x[j]
     square = 0.0
     for i in range(x.size):
-        square += x[i] * out[i]
+        square += x[i] * product[i]
     return square
 
 
@@ -204,16 +204,16 @@ def min_eigenvector(
     `factor` is the Cholesky factor of Phi + rho R, `work` (m,) scratch.
     """
     m = direction.size
-    weigh(information, direction, work)
+    quadratic_form(information, direction, work)
     for _ in range(iterations):
         for i in range(m):
             direction[i] = work[i]
         cholesky_solve(factor, direction)
-        shrink = 1.0 / sqrt(weigh(information, direction, work))
+        shrink = 1.0 / sqrt(quadratic_form(information, direction, work))
         for i in range(m):
             direction[i] *= shrink
             work[i] *= shrink
-    return weigh(Phi, direction, work)
+    return quadratic_form(Phi, direction, work)
 
 
 @inner
@@ -242,7 +242,7 @@ def forget(state: State) -> None:
 def keep_newer(state: State, newer: Array, rows: int) -> None:
     """Keep only the newer part of the rows, `rows` with the sum `newer` (of `newer_part`)."""
     state.rows[0] = float(rows)
-    add(newer, 0.0, newer, state.running)
+    copy(newer, state.running)
     reset_direction(state)
 
 

@@ -14,7 +14,6 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
-from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.errors import TareError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
@@ -23,6 +22,7 @@ from blf_dsc_controller.messages.codecs import (
 )
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.nodes import parameters, process
+from blf_dsc_controller.nodes.controller_log import ControllerLog
 from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
@@ -35,10 +35,8 @@ from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.gain_limits import worsened
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.state_check import rate_mismatch
-from blf_dsc_controller.supervision.supervisor import Phase
 
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
@@ -59,6 +57,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         status: diagnostics and events; its `trajectories` are the motions that were asked for.
         action: offers trajectories as an action; None: nobody can ask for any.
         load_service: declares loads to the drives; None: nothing does.
+        log: logs what is new of the law.
         warned_at: stamp of the start that the last warning was about [ns].
     """
 
@@ -76,16 +75,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._polled = 0  # joint states at the last poll
         # whether the tracking errors had subscribers at the last count
         self._errors_subscribed = False
-        # What has been reported, so that it is not reported again:
-        self._columns = b''  # those that are estimated, and whether they were checked
-        self._model_changes = 0.0
-        self._contacts = self._oscillations = 0
-        self._untrusted = ''  # sentence about the torque sensors
-        # phase, stops, silenced, text of a stop
-        self._logged = Phase.INACTIVE, 0, False, ''
-        self._warned_of_gains = False  # whose margin nobody has measured
-        self.warned_at = -1  # stamp of the start that the last warning was about
-        self._turned_at = -1  # likewise, of the last reference shifted by turns
+        self.warned_at = -1
+        self.log = ControllerLog(self)
         # After a signal:
         self._ends_at = 0.0  # s, at the latest
         self._last_seen = 0, 0.0  # joint states processed by then, and s, the last
@@ -111,7 +102,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Compile the law; create the topics of the loop on the first call."""
         self._loop = GuardedLoop(self.config, self._steady, self._wall)
         self.guard = self._loop.guard
-        self._contacts = self._oscillations = 0
+        self.log.begin()
         self._record_topics(self.guard)
         self._load = reference_load(self.config, self.guard.controller.settings)
         for warning in config_warnings(self.config, load=self._load):
@@ -351,24 +342,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _report_learning(self, guard: Guard) -> None:
         """Report columns that were rejected or restored, and changes of the arm."""
-        state = guard.controller.state
-        columns = state.latch.active.tobytes() + state.latch.columns_checked.tobytes()
-        has_changed = state.change.changes[0] > self._model_changes
-        self._model_changes = state.change.changes[0]
-        if has_changed:
-            residual = state.change.contradiction[0] ** 0.5
-            self.get_logger().warning(
-                f'the arm has changed: torques differ by {residual:.3g} N m from those expected; '
-                'learning restarts'
-            )
-        if columns != self._columns:
-            self._columns = columns
-            names = self._loop.estimates if self._loop is not None else ()
-            self.status.rejected = rejected_columns(guard.controller, names)
-            for reason in self.status.rejected.values():
-                self.get_logger().warning(reason)
-            has_changed |= bool(self.status.rejected)
-        if has_changed:
+        names = self._loop.estimates if self._loop is not None else ()
+        if self.log.warn_of_learning(guard, names, self.status):
             self._report()
 
     def _command(self, torque: np.ndarray | None) -> None:
@@ -416,18 +391,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return [text + remedy for text in worsened(before, after, self._load)]
 
     def _retune(self, config: ControllerConfig) -> None:
-        self.config, guard = config, self.guard
-        if guard is not None:
-            guard.retune(config)
-            if (
-                self._loop is not None
-                and guard.reference.last_stamp >= 0
-                and config.telemetry.enabled
-            ):
-                bound = guard.controller.bound_at(guard.reference.time)
-                limit = guard.controller.settings.torque.limit
-                telemetry = self._loop.telemetry
-                self._publish(telemetry.bound(guard.journal.stamp, bound, limit))
+        self.config = config
+        if self._loop is not None:
+            message = self._loop.retune(config)
+            if message is not None and config.telemetry.enabled:
+                self._publish(message)
 
     def report_if_changed(self, guard: Guard) -> None:
         """Publish new events, and diagnostics if they have changed."""
@@ -435,7 +403,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.status.publish_events(guard)
             return
         supervisor = guard.supervisor
-        self._log_phase(guard)
+        self.log.warn_of_findings(guard)
+        self.log.log_phase(guard)
         self._started = self._started or supervisor.running
         if (
             guard.starting.error is not None
@@ -456,16 +425,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard is not None and guard.reference.start_stamp != self.warned_at:
             self.warned_at = guard.reference.start_stamp
             if not self._is_simulated():
-                self._warn_of_start(guard)
-
-    def _warn_of_start(self, guard: Guard) -> None:
-        """Say what matters to a robot, and not to a simulated arm, which waits in lock-step."""
-        if guard.watchdog.why_off:
-            self.get_logger().warning(guard.watchdog.why_off)
-        text = not_commissioned(self.config)
-        if text and not self._warned_of_gains:
-            self._warned_of_gains = True
-            self.get_logger().warning(text)
+                self.log.warn_of_start(guard)
 
     def _look_for_watchdog(self) -> None:
         commands = self._outputs.get(topics.COMMANDS)
@@ -474,45 +434,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
         there = self._subscribers(commands, topics.WATCHDOG_NODE) > 0
         if self._watchdog.look(there=there):
             self.get_logger().error(self._watchdog.problem)
-
-    def _warn(self, guard: Guard) -> None:
-        """Warn of what has been found since the last call."""
-        contacts = guard.findings.contacts
-        if contacts.last is not None and contacts.count != self._contacts:
-            self._contacts = contacts.count
-            self.get_logger().warning(contacts.last.text)
-        if guard.calming.count != self._oscillations:
-            self._oscillations = guard.calming.count
-            self.get_logger().warning(guard.calming.text)
-        if guard.findings.untrusted != self._untrusted:
-            self._untrusted = guard.findings.untrusted
-            if guard.findings.untrusted:
-                self.get_logger().warning(guard.findings.untrusted)
-
-    def _log_phase(self, guard: Guard) -> None:
-        supervisor = guard.supervisor
-        self._warn(guard)
-        is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
-        text = supervisor.text if is_stopped else ''
-        now = supervisor.phase, supervisor.stops, guard.silenced, text
-        if now == self._logged:
-            return
-        self._logged = now
-        if guard.reference.turned and guard.reference.start_stamp != self._turned_at:
-            self._turned_at = guard.reference.start_stamp
-            self.get_logger().info(f'the reference {guard.reference.turned}')
-        if guard.silenced:
-            self.get_logger().warning(supervisor.text)
-        elif is_stopped:
-            stop = f'{self.config.safety.torque} torque: {supervisor.text}'
-            self.get_logger().fatal(
-                f'{stop}; {self.get_fully_qualified_name()}/reset starts again'
-            )
-        elif supervisor.phase is Phase.APPROACHING:
-            left = guard.reference.settled - guard.reference.time
-            self.get_logger().info(f'approaching the reference, for {left:.3g} s')
-        elif supervisor.phase is Phase.TRACKING:
-            self.get_logger().info('tracking the reference')
 
     def _report(self) -> None:
         self.status.report(

@@ -194,7 +194,7 @@ class BagRecorderNode(PlainNode):
             return False
         taken = self._raw_subscriptions.take()
         try:
-            for message in self._timed(self._without_repeats(taken)):
+            for message in self._give_times(self._drop_repeats(taken)):
                 self.bag.write(*message)
             if flush:
                 self.bag.flush()
@@ -205,7 +205,7 @@ class BagRecorderNode(PlainNode):
             self.failure = self.bag.abandon(error)
         return len(taken) > _RARE
 
-    def _without_repeats(self, taken: Iterable[RawMessage]) -> list[RawMessage]:
+    def _drop_repeats(self, taken: Iterable[RawMessage]) -> list[RawMessage]:
         """Remember messages; return those that no other subscription has brought before."""
         new = []
         for message in taken:
@@ -214,8 +214,8 @@ class BagRecorderNode(PlainNode):
                 new.append(message)
         return new
 
-    def _timed(self, messages: list[RawMessage]) -> list[RawMessage]:
-        """Return messages with log times, those of the plant if it is the clock.
+    def _give_times(self, messages: list[RawMessage]) -> list[RawMessage]:
+        """Return the messages whose log times are known: those of the plant if it is the clock.
 
         That is the stamp of the last joint state; until the first one, messages wait.
         """

@@ -36,7 +36,7 @@ class RunByRunNode(ControllerNode):
         self._acting: np.ndarray | None = None  # N m, the last torque
         self.heard = time.monotonic()
         super().__init__(**options)
-        self._warned_of_gains = True  # they are about to be measured
+        self.log.warns_of_gains = False  # they are about to be measured
 
     def autostart(self) -> None:
         """Configure the node only: it commands nothing before the first run.

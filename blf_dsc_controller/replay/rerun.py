@@ -340,12 +340,9 @@ class Rerun:
         guard = self._guard
         where = f'event {event.number} of the journal'
         given = current(event.content['parameters'], where, guard.config.law)
-        guard.retune(change(guard.config, given, where))
-        if guard.reference.last_stamp >= 0:
-            stamp = guard.journal.stamp
-            limit = guard.controller.settings.torque.limit
-            bound = guard.controller.bound_at(guard.reference.time)
-            self._add(stamp, self._telemetry.bound(stamp, bound, limit))
+        message = self._loop.retune(change(guard.config, given, where))
+        if message is not None:
+            self._add(guard.journal.stamp, message)
 
     def _stay_silent(self, event: Event) -> None:
         """Command what the watchdog commanded in a silence."""

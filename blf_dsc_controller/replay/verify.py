@@ -165,6 +165,8 @@ def verify(
             one.
     """
     path = Path(path)
+    if law:  # before a large bag is read
+        law_file.check_pinned(law)
     content = read_content(path, namespace, names)
     events, until, other = _events(content)
     _check_format(path, events[0])

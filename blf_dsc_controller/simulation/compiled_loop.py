@@ -41,9 +41,8 @@ class Span(NamedTuple):
     first: int
     last: int
     is_end: bool  # the torque of the last one is not applied
-    observed: (
-        bool  # also compute what no torque depends on: (29), load, external torque
-    )
+    # also compute what no torque depends on: (29), load, external torque
+    observed: bool
 
 
 class Rows(NamedTuple):

@@ -209,9 +209,8 @@ class Record:
     # (k, s) rows of `law.state.Sample`; after a stop NaN except bound, torque
     samples: np.ndarray
     truths: np.ndarray  # (k, p + 3 n) [P, tau_dist, q, dq]
-    motors: (
-        np.ndarray
-    )  # (k, 2, n) rad, rad/s, by encoders of their own; empty: there are none
+    # (k, 2, n) rad, rad/s, by encoders of their own; empty: there are none
+    motors: np.ndarray
     left: np.ndarray  # (n,) N m, commanded after the last sample; NaN: nothing was
     parameters: tuple[str, ...]  # names of the entries of P
     config: ControllerConfig

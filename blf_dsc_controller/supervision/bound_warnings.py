@@ -9,9 +9,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.base_parameters import HEAVIER_DRIVE
 from blf_dsc_controller.arms.tuning import SAMPLES, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.robot import HEAVIER_DRIVE, UNKNOWN_FRICTION
+from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.supervision.expected_errors import (
     ExpectedErrors,

@@ -247,7 +247,7 @@ class Guard(InCommand):
     def watch(self) -> Vector | None:
         """Return a torque during a silence, else None; call it every PERIOD."""
         limit = self.config.sample_time + self.config.safety.state_timeout
-        silent = self.watchdog.silence(limit)
+        silent = self.watchdog.measure_silence(limit)
         if silent == 0.0 or not (self.watchdog.on and self.commanding):
             return None
         return self.time_out(f'no joint state received for {silent:.3g} s')

@@ -59,7 +59,7 @@ class Readings:
 
         `fastest` [rad/s] is the largest speed of a joint.
         """
-        return self._wraps.counted(measurement, self.gap, fastest)
+        return self._wraps.count(measurement, self.gap, fastest)
 
     def replace_velocities(self, stamp: int, measurement: Vector) -> None:
         """Overwrite velocities in a measurement if they are differenced."""

@@ -80,10 +80,9 @@ def _outside_bound(
     controller: Controller, config: ControllerConfig, settings: Settings, t: float
 ) -> Iterator[str]:
     """Yield which joints the bound of a configuration leaves outside at t [s]."""
-    signals = controller.signals
-    barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
+    bounds = barrier.bound_at(settings.barrier, t)
     errors = np.abs(controller.sample.xi1)
-    for joint, error, bound in zip(config.joints, errors, signals.bound, strict=True):
+    for joint, error, bound in zip(config.joints, errors, bounds, strict=True):
         if not error < bound:
             yield (
                 f'barrier.bound: {joint} is {error:.6g} rad from its reference now, outside of a '

@@ -64,7 +64,10 @@ class SafeStop:
         """Begin the ramp of a stop at a speed [rad/s], the largest of a joint."""
         self._speed.begin(speed)
         self._swings.begin()
-        load = self._load_at_stop(reason) if was_running else self._torque.load.copy()
+        load = self._torque.load.copy()
+        if was_running:
+            self._continue_from_held()
+            load = self._load_at_stop(reason)
         reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
         self._torque.begin_ramp(
             safety.stop_ramp,
@@ -135,15 +138,14 @@ class SafeStop:
             'its drive gives less than it is sent'
         )
 
-    def _load_at_stop(self, reason: Reason) -> Vector:
-        """Return the torque (n,) [N m] that holds the arm besides its model when the law stops.
-
-        After a gap in the states it is the torque that holds the arm now, also if another node
-        commands it.
-        """
+    def _continue_from_held(self) -> None:
+        """Let the ramp begin at the torque that acts after a gap, also that of another node."""
         held = self._held.command()
         if held is not None:
             self._torque.commanded[:] = held
+
+    def _load_at_stop(self, reason: Reason) -> Vector:
+        """Return the torque (n,) [N m] that holds the arm besides its model when the law stops."""
         is_wound_up = reason in WINDING_UP or reason is Reason.NO_EFFECT
         if is_wound_up and self._held.after_gap is None:
             return self._samples.disturbance

@@ -21,9 +21,9 @@ from blf_dsc_controller.supervision.supervisor import Fault, Reason
 from blf_dsc_controller.tool.errors import in_words
 
 Vector = NDArray[np.float64]
-# of the torque limit: what an effort lacks, on average and now, that explains an error
-# past the bound
-_LACKS, _LACKS_NOW = 0.05, 0.1
+# of the torque limit: an effort that is so much below its command, on average and now,
+# explains an error past the bound
+_SHORT, _SHORT_NOW = 0.05, 0.1
 _LIGHT = 0.5  # of the assumed inertia: less is worth saying
 _NOTHING = 0.02  # of it: no drive has so little
 _AGAINST = 0.1  # of the torque limit, beyond the torque of the model at rest
@@ -139,13 +139,15 @@ class SampleCheck:
             self.relax(dt)
             return None
         if flags & NO_EFFECT:
-            return self._without_effect()
-        fault = self._not_finite() or self._outside() or self._saturated(dt)
+            return self._stop_without_effect()
+        fault = (
+            self._check_numbers() or self._check_error() or self._count_saturated(dt)
+        )
         if fault is None:
             self.keep()
         return fault
 
-    def _not_finite(self) -> Fault | None:
+    def _check_numbers(self) -> Fault | None:
         state = self._controller.state
         demand = self._controller.signals.demand
         if not (
@@ -161,8 +163,8 @@ class SampleCheck:
             return Fault(Reason.TORQUE, f'the demanded torque is not finite: {demand}')
         return None
 
-    def _without_effect(self) -> Fault:
-        """Return to the estimates from before the commands had no effect."""
+    def _stop_without_effect(self) -> Fault:
+        """Keep the estimates of when a joint last moved; return the fault."""
         checks = self._controller.checks
         limit = self._controller.settings.torque.limit
         self._kept[:] = checks.estimates.moved
@@ -170,9 +172,11 @@ class SampleCheck:
             return Fault(Reason.OSCILLATION, shaking)
         if saturation := self._cause.saturation(self.saturated_time):
             return Fault(Reason.SATURATED, f'{saturation}; no joint moves any more')
-        if checks.effect.lacking[0] > 0.0:
-            lack = checks.effect.lack - checks.effect.lack_in_motion
-            return self._lacking(int(np.argmax(np.abs(lack) / limit)), lack)
+        if checks.effect.short_for[0] > 0.0:
+            shortfall = checks.effect.shortfall - checks.effect.shortfall_in_motion
+            return self._falling_short(
+                int(np.argmax(np.abs(shortfall) / limit)), shortfall
+            )
         change = checks.effect.recent - checks.effect.before
         worst = int(np.argmax(np.abs(change) / limit))
         text = (
@@ -183,10 +187,10 @@ class SampleCheck:
         )
         return Fault(Reason.NO_EFFECT, text)
 
-    def _lacking(self, joint: int, lack: Vector) -> Fault:
-        """Return the fault of a joint whose effort lacks `lack` (n,) [N m]."""
+    def _falling_short(self, joint: int, shortfall: Vector) -> Fault:
+        """Return the fault of a joint whose effort is `shortfall` (n,) [N m] below its command."""
         text = (
-            f'the effort of joint {self._joints[joint]!r} lacks {lack[joint]:+.4g} N m of '
+            f'the effort of joint {self._joints[joint]!r} lacks {shortfall[joint]:+.4g} N m of '
             'what is commanded: release the brakes, and activate the effort controller; if the '
             'effort is not a torque in N m, set robot.effort to current or unknown; if the joint '
             'moves, its drive gives less than it is sent: correct its torque constant, gear ratio '
@@ -194,26 +198,31 @@ class SampleCheck:
         )
         return Fault(Reason.NO_EFFECT, text)
 
-    def _unreached(self) -> Fault | None:
-        """Return the fault if efforts show that commands do not reach a moving arm."""
+    def _check_reach(self) -> Fault | None:
+        """Return the fault if efforts show that commands do not reach a moving arm.
+
+        The kept estimates are then those from before the error grew.
+        """
         settings = self._controller.settings
         checks = self._controller.checks
         if checks.effect.compares[0] == 0.0 or self._cause.oscillation:
             return None
-        lack = checks.effect.lack - checks.effect.usual
+        shortfall = checks.effect.shortfall - checks.effect.usual_shortfall
         now = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
         if settings.torque.drive > 0 and settings.torque.effort_is_whole == 1:
             now += self._controller.signals.saturation.added
-        now -= checks.effect.usual
-        share = np.abs(lack) / settings.torque.limit
+        now -= checks.effect.usual_shortfall
+        share = np.abs(shortfall) / settings.torque.limit
         share_now = np.abs(now) / settings.torque.limit
-        lacks = (share > _LACKS) & (share_now > _LACKS_NOW) & (lack * now > 0.0)
-        if not lacks.any():
+        is_short = (share > _SHORT) & (share_now > _SHORT_NOW) & (shortfall * now > 0.0)
+        if not is_short.any():
             return None
         self.return_to_consistent()
-        return self._lacking(int(np.argmax(np.where(lacks, share, 0.0))), lack)
+        return self._falling_short(
+            int(np.argmax(np.where(is_short, share, 0.0))), shortfall
+        )
 
-    def _outside(self) -> Fault | None:
+    def _check_error(self) -> Fault | None:
         safety = self._safety
         if safety.error_ratio == 0.0 or self._controller.settings.has_barrier == 0:
             return None
@@ -223,7 +232,7 @@ class SampleCheck:
         worst = int(np.argmax(ratio))
         if ratio[worst] < safety.error_ratio:
             return None
-        if (unreached := self._unreached()) is not None:
+        if (unreached := self._check_reach()) is not None:
             return unreached
         share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
         text = (
@@ -288,8 +297,8 @@ class SampleCheck:
             'holds it'
         )
 
-    def _saturated(self, dt: float) -> Fault | None:
-        """Count a sample with a torque at its limit."""
+    def _count_saturated(self, dt: float) -> Fault | None:
+        """Count a sample with a torque at its limit; return the fault if there are too many."""
         signals = self._controller.signals
         limit = self._controller.settings.torque.limit
         demand, added = signals.demand, signals.saturation.added

@@ -60,7 +60,7 @@ class Watchdog:
         """Measure the silence from the next state on."""
         self._last_state = -1
 
-    def silence(self, limit: float) -> float:
+    def measure_silence(self, limit: float) -> float:
         """Return the length of a silence [s] if it exceeds `limit` [s], else 0."""
         now = self._steady()
         is_late = (now - self._last_check) * NANOSECOND > 2.0 * PERIOD

@@ -45,7 +45,7 @@ def chatter_of(controller: Controller, joints: Sequence[str]) -> str:
 
 
 class StopCause:
-    """Knows why the arm may be about to stop."""
+    """Finds why an arm may be about to stop."""
 
     def __init__(
         self, joints: Sequence[str], controller: Controller, calming: Calming

@@ -136,7 +136,7 @@ class TorqueWatchdog:
         """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
         limit = self.config.safety.velocity_limit
         gap = (stamp - self.stamp) * 1e-9
-        measurement, _ = self._wraps.counted(measurement, gap, limit)
+        measurement, _ = self._wraps.count(measurement, gap, limit)
         q = measurement[: self._settings.n]
         self._sensor.take(q, gap, self.config.sample_time)
         self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)

@@ -37,10 +37,10 @@ class Wraps:
         self._last = np.full(n, nan)  # rad, counted on
         self._counted = np.zeros(3 * n)
 
-    def counted(
+    def count(
         self, measurement: Vector, gap: float, fastest: float
     ) -> tuple[Vector, Fault | None]:
-        """Return a measurement [q, dq, effort] (3n,) with turns counted on, and its fault.
+        """Count turns on in a measurement [q, dq, effort] (3n,); return it, and its fault.
 
         It is the given one unless a turn has been counted.  `gap` [s] is the time since
         the state before, `fastest` [rad/s] the largest speed of a joint.

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the controller's node logs of its law: phases, findings and learning, each once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from blf_dsc_controller.control.rejected_columns import rejected_columns
+from blf_dsc_controller.nodes.diagnostics import ControllerStatus
+from blf_dsc_controller.nodes.process import PlainNode
+from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.not_commissioned import not_commissioned
+from blf_dsc_controller.supervision.supervisor import Phase
+
+
+class ControllerLog:
+    """Logs what is new of a guard; it remembers what has been logged.
+
+    Attributes:
+        warns_of_gains: whether to warn, once, of gains whose margin nobody has measured.
+    """
+
+    def __init__(self, node: PlainNode) -> None:
+        """Write to the log of a node."""
+        self.warns_of_gains = True
+        self._node = node
+        self._log = node.get_logger()
+        self._phase = Phase.INACTIVE, 0, False, ''  # stops, silenced, text of a stop
+        self._turned_at = -1  # ns, start of the last reference shifted by turns
+        self._columns = b''  # those that are estimated, and whether they were checked
+        self._model_changes = 0.0
+        self._contacts = self._oscillations = 0
+        self._untrusted = ''  # sentence about the torque sensors
+
+    def begin(self) -> None:
+        """Begin with a new law, which has found nothing yet."""
+        self._contacts = self._oscillations = 0
+
+    def log_phase(self, guard: Guard) -> None:
+        """Log the phase, the cause of a stop, and that the reference is shifted by turns."""
+        supervisor = guard.supervisor
+        is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
+        text = supervisor.text if is_stopped else ''
+        now = supervisor.phase, supervisor.stops, guard.silenced, text
+        if now == self._phase:
+            return
+        self._phase = now
+        if guard.reference.turned and guard.reference.start_stamp != self._turned_at:
+            self._turned_at = guard.reference.start_stamp
+            self._log.info(f'the reference {guard.reference.turned}')
+        if guard.silenced:
+            self._log.warning(supervisor.text)
+        elif is_stopped:
+            stop = f'{guard.config.safety.torque} torque: {supervisor.text}'
+            reset = f'{self._node.get_fully_qualified_name()}/reset'
+            self._log.fatal(f'{stop}; {reset} starts again')
+        elif supervisor.phase is Phase.APPROACHING:
+            left = guard.reference.settled - guard.reference.time
+            self._log.info(f'approaching the reference, for {left:.3g} s')
+        elif supervisor.phase is Phase.TRACKING:
+            self._log.info('tracking the reference')
+
+    def warn_of_findings(self, guard: Guard) -> None:
+        """Warn of contacts, oscillations and efforts of no sensors since the last call."""
+        contacts = guard.findings.contacts
+        if contacts.last is not None and contacts.count != self._contacts:
+            self._contacts = contacts.count
+            self._log.warning(contacts.last.text)
+        if guard.calming.count != self._oscillations:
+            self._oscillations = guard.calming.count
+            self._log.warning(guard.calming.text)
+        if guard.findings.untrusted != self._untrusted:
+            self._untrusted = guard.findings.untrusted
+            if self._untrusted:
+                self._log.warning(self._untrusted)
+
+    def warn_of_start(self, guard: Guard) -> None:
+        """Say what matters to a robot, and not to a simulated arm, which waits in lock-step."""
+        if guard.watchdog.why_off:
+            self._log.warning(guard.watchdog.why_off)
+        text = not_commissioned(guard.config)
+        if text and self.warns_of_gains:
+            self.warns_of_gains = False
+            self._log.warning(text)
+
+    def warn_of_learning(
+        self, guard: Guard, names: Sequence[str], status: ControllerStatus
+    ) -> bool:
+        """Warn of changes of the arm, and of rejected columns, since the last call.
+
+        `names` are those of theta^.  The columns are in the status, too; return whether it is
+        to be published.
+        """
+        state = guard.controller.state
+        has_changed = state.change.changes[0] > self._model_changes
+        self._model_changes = state.change.changes[0]
+        if has_changed:
+            residual = state.change.contradiction[0] ** 0.5
+            self._log.warning(
+                f'the arm has changed: torques differ by {residual:.3g} N m from those expected; '
+                'learning restarts'
+            )
+        columns = state.latch.active.tobytes() + state.latch.columns_checked.tobytes()
+        if columns == self._columns:
+            return bool(has_changed)
+        self._columns = columns
+        status.rejected = rejected_columns(guard.controller, names)
+        for reason in status.rejected.values():
+            self._log.warning(reason)
+        return bool(has_changed or status.rejected)
