@@ -110,6 +110,7 @@ def test_controller_starts_beside_a_predecessor_that_was_killed(ros):
 
 
 def test_managed_controller_that_was_refused_starts_once_it_is_alone(ros):
+    logged = ros.listen(LOG)
     arm, law = ros.loop()
     ros.run(arm, 50)
     second = ros.add(ControllerNode, autostart=False, clock=PatientClock())
@@ -117,6 +118,10 @@ def test_managed_controller_that_was_refused_starts_once_it_is_alone(ros):
     second.trigger_configure()
     second.trigger_activate()
     ros.until(lambda: second.guard.supervisor.reason is Reason.START_REJECTED)
+    ros.until(lambda: any('another node commands' in each.msg for each in logged))
+    # not the safe torque, which it commands in other stops
+    refused = [each.msg for each in logged if 'another node commands' in each.msg]
+    assert refused[0].startswith('nothing is commanded: ')
     ros.kill(law)
     second.reset()
     ros.until(lambda: second.guard.supervisor.running)

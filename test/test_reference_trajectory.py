@@ -519,6 +519,22 @@ def test_trajectory_that_ends_in_motion_brakes_after_its_last_point(fields):
     assert max(limits_used(motion, NOW, NOW + 4.0)) <= 1.0 + 1e-9
 
 
+@pytest.mark.parametrize('time', [0.1, 6.0])
+def test_points_past_position_limits_are_named_and_no_consequence_of_them(time):
+    """Of the way to them only the velocity would be told, which a slower motion keeps."""
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
+    path = np.array([[-1.5, 1.0], [-1.0, 3.5], [0.5, 3.5]])
+    sent = trajectory((path,), times=(time, 2 * time, 3 * time))
+    with pytest.raises(TrajectoryError) as rejection:
+        plan_trajectory(sent, at_rest, 0.0, MIDDLE)
+    (problem,) = rejection.value.problems
+    assert problem == (
+        "point 3 has joint 'shoulder' at 0.5 rad, past its limit of -0.07 rad; "
+        "point 2 has joint 'elbow' at 3.5 rad, past its limit of 3 rad; reduce the motion, or "
+        'relax limits.position_lower and limits.position_upper'
+    )
+
+
 def test_three_thousand_points_are_planned():
     times = 0.01 * np.arange(1, 3001)
     path = 0.3 * np.sin(0.5 * times)[:, None] + at(PAPER, NOW)[0]

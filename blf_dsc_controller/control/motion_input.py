@@ -399,9 +399,10 @@ class MotionInput:
             self.targets += 1
         else:
             self.accepted += 1
-            points = len(plan.command.points)
+            count = len(plan.command.points)
+            points = '1 point' if count == 1 else f'{count} points'
             note = f' {plan.motion.note}' if plan.motion.note else ''
-            self._log.info(f'following a trajectory of {points} points{note}')
+            self._log.info(f'following a trajectory of {points}{note}')
             self._log_turns(plan.motion.turned)
 
     def _report_target(self, plan: Plan | None, reason: str) -> None:

@@ -495,7 +495,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
         text = supervisor.text if is_stopped else ''
         now = supervisor.phase, supervisor.stops, guard.silenced, text
-        if now == self._logged:
+        before = self._logged
+        if now == before:
             return
         self._logged = now
         if guard.reference.turned and guard.reference.start_stamp != self._turned_at:
@@ -504,20 +505,38 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if guard.silenced:
             self.get_logger().warning(supervisor.text)
         elif is_stopped:
-            stop = f'{self.config.safety.torque} torque: {supervisor.text}'
-            self.get_logger().fatal(
-                f'{stop}; {self.get_fully_qualified_name()}/reset starts again'
-            )
+            self._log_stop(guard, _added(before, now))
         elif supervisor.phase is Phase.APPROACHING:
             left = guard.reference.settled - guard.reference.time
             self.get_logger().info(f'approaching the reference, for {left:.3g} s')
         elif supervisor.phase is Phase.TRACKING:
             self.get_logger().info('tracking the reference')
 
+    def _log_stop(self, guard: Guard, added: str) -> None:
+        """Log why the law stopped, or what has been `added` to the text of this stop."""
+        if added:
+            self.get_logger().fatal(f'in this stop: {added}')
+            return
+        torque = f'{self.config.safety.torque} torque'
+        if not guard.commanding:
+            torque = 'nothing is commanded'
+        self.get_logger().fatal(
+            f'{torque}: {guard.supervisor.text}; '
+            f'{self.get_fully_qualified_name()}/reset starts again'
+        )
+
     def _report(self) -> None:
         self.status.report(
             self.state_label, self.guard, self.others, self._watchdog.problem
         )
+
+
+def _added(before: tuple[object, ...], now: tuple[Phase, int, bool, str]) -> str:
+    """Return what the text of a stop has more than before; empty for another stop."""
+    text = str(before[-1])
+    if before[:-1] != now[:-1] or not text or not now[-1].startswith(text):
+        return ''
+    return now[-1][len(text) :].removeprefix('; ')
 
 
 main = partial(process.run, ControllerNode)
