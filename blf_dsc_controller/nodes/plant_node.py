@@ -295,10 +295,11 @@ class PlantNode(LoopNode[PlantConfig]):
     @property
     def _stale_text(self) -> str:
         actuator = self.config.actuator
+        after = _STALE[actuator.without_command]
         return (
-            f'the last torque is too old (actuator.command_timeout, {actuator.command_timeout:g} s): '
-            f'{_STALE[actuator.without_command]}. The controller has ended, or it or this computer '
-            'is too slow'
+            'the last torque is too old '
+            f'(actuator.command_timeout, {actuator.command_timeout:g} s): {after}. The controller '
+            'has ended, or it or this computer is too slow'
         )
 
     def _step(self) -> None:
