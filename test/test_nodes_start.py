@@ -69,6 +69,7 @@ def test_second_controller_does_not_start_unless_it_is_told_to(ros, word):
     arm, law = ros.loop()
     ros.run(arm, 200)
     other = {'safety.other_commands': word}
+    logged = ros.listen(LOG)
     second = ros.add(ControllerNode, other, clock=PatientClock())
     if word == 'allow':
         ros.until(lambda: second.guard.supervisor.running)
@@ -76,6 +77,9 @@ def test_second_controller_does_not_start_unless_it_is_told_to(ros, word):
     ros.until(lambda: second.finished)
     assert 'another node commands torques' in str(second.failure)
     assert not second.guard.commanding
+    ros.until(lambda: any('another node commands' in each.msg for each in logged))
+    (refused,) = [each.msg for each in logged if 'another node commands' in each.msg]
+    assert refused.endswith('; this node ends')  # and has no ~/reset then
     ros.kill(second)
     ros.run(arm, 500)
     assert law.guard.supervisor.phase is Phase.TRACKING

@@ -38,7 +38,7 @@ from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.state_check import rate_mismatch
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.supervisor import STAMPS, Phase, Reason
 
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
@@ -434,9 +434,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if not self.status.has_news(guard):
             self.status.publish_events(guard)
             return
-        supervisor = guard.supervisor
-        self._log_phase(guard)
-        self._started = self._started or supervisor.running
+        self._started = self._started or guard.supervisor.running
         if (
             guard.starting.error is not None
             and self.config.autostart
@@ -444,6 +442,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         ):
             self.failure = guard.starting.error
             self.finished = True
+        self._log_phase(guard)
         self._report()
 
     def on_second(self) -> None:
@@ -520,10 +519,25 @@ class ControllerNode(LoopNode[ControllerConfig]):
         torque = f'{self.config.safety.torque} torque'
         if not guard.commanding:
             torque = 'nothing is commanded'
-        self.get_logger().fatal(
-            f'{torque}: {guard.supervisor.text}; '
-            f'{self.get_fully_qualified_name()}/reset starts again'
+        after = f'{self.get_fully_qualified_name()}/reset starts again'
+        if self.finished:
+            after = 'this node ends'
+        texts = (
+            guard.supervisor.text,
+            self._several_arms(guard.supervisor.reason),
+            after,
         )
+        self.get_logger().fatal(f'{torque}: {"; ".join(filter(None, texts))}')
+
+    def _several_arms(self, reason: Reason) -> str:
+        """Return who publishes joint states, if the stamps of several have caused a stop."""
+        found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
+        if reason not in STAMPS or len(found) < 2:
+            return ''
+        names = ', '.join(
+            f'{each.node_namespace.rstrip("/")}/{each.node_name}' for each in found
+        )
+        return f'{len(found)} publishers send joint states: {names}: stop all but one'
 
     def _report(self) -> None:
         self.status.report(
