@@ -538,6 +538,14 @@ def test_duration_of_zero_is_no_limit_which_no_offline_run_can_have(tmp_path, ca
     assert not out.exists()
 
 
+def test_real_time_without_ros_is_refused_instead_of_ignored(capsys, tmp_path):
+    out = tmp_path / 'out'
+    run = here(capsys, '--offline', '--mode', 'realtime', '--out', out)
+    assert run.returncode == 1
+    assert '--mode realtime needs ROS' in run.stderr
+    assert not out.exists()
+
+
 def test_run_over_ros_without_a_limit_gets_a_plant_without_a_limit():
     options = make_parser().parse_args(['run', '--duration', '0'])
     assert loop_configuration(options).plant.duration == 0.0
