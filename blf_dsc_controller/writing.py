@@ -39,6 +39,19 @@ def whole(path: Path) -> Iterator[Path]:
         raise
 
 
+def try_out(path: Path) -> None:
+    """Raise OSError, which names `path`, if `whole` could not make a file there."""
+    if path.exists() and not path.is_file():
+        return
+    part = path.with_name(f'{path.name}{PART}')
+    try:
+        part.touch()
+    except OSError as error:
+        error.filename = str(path)
+        raise
+    remove(part)
+
+
 def remove(path: Path) -> None:
     """Remove a file or folder, if there is one and as far as it can be removed."""
     if path.is_dir():

@@ -73,6 +73,32 @@ def test_unwritable_output_path_is_reported(
     assert '[Errno ' not in error
 
 
+LONG = {  # commands, and what takes minutes, or moves a robot
+    'commission --config ur5e --out no/x.yaml': 'commission._all_runs',
+    'commission --config fr3_direct --robot 172.16.0.2 --yes --out no/x.yaml': (
+        'commission._all_runs'
+    ),
+    'identify BAG --urdf panda.urdf --out no/x.urdf': 'identify._identified',
+    'identify BAG --urdf panda.urdf --report no/x.html': 'identify._identified',
+    'commission --config ur5e --write no/x.yaml --posture 0 -1.5 1.5 -1.5 -1.5 0': '',
+}
+
+
+@pytest.mark.parametrize('words', LONG)
+def test_place_that_cannot_be_written_is_refused_before_minutes_of_work(
+    bag, tmp_path, monkeypatch, capfd, words
+):
+    def begin(*_):
+        pytest.fail('it has begun')
+
+    monkeypatch.chdir(tmp_path)
+    if LONG[words]:
+        monkeypatch.setattr(f'blf_dsc_controller.cli.{LONG[words]}', begin)
+    assert main([str(bag) if each == 'BAG' else each for each in words.split()]) == 1
+    assert 'there is no folder no: make it, or choose' in capfd.readouterr().err
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.parametrize(
     ('words', 'answer'),
     [
@@ -150,7 +176,7 @@ def test_wrong_option_is_one_line_with_what_to_type(words, answer, capsys):
         ('export BAG --out a.csv --namespace left', "called '/left/joint_states'"),
         ('plot BAG --out notes.md', 'notes.md is no folder: choose another path'),
         ('report BAG --out bags --force', 'bags is a folder: choose the path of a fi'),
-        ('export BAG --out no/a.csv', 'there is no no/a.csv: make its folder, or cho'),
+        ('export BAG --out no/a.csv', 'there is no folder no: make it, or choose'),
         ('arms --laws propsed', 'no such law or file, did you mean proposed?'),
         ('excite e.yaml --config paper', 'such as ur5e'),
         ('commission --config paper', 'needs an arm from a URDF'),
@@ -513,6 +539,14 @@ def test_duration_of_zero_is_no_limit_which_no_offline_run_can_have(tmp_path, ca
     run = here(capsys, '--offline', '--duration', 0, '--out', out)
     assert run.returncode == 1
     assert '--duration 0 is no limit' in run.stderr
+    assert not out.exists()
+
+
+def test_real_time_without_ros_is_refused_instead_of_ignored(capsys, tmp_path):
+    out = tmp_path / 'out'
+    run = here(capsys, '--offline', '--mode', 'realtime', '--out', out)
+    assert run.returncode == 1
+    assert '--mode realtime needs ROS' in run.stderr
     assert not out.exists()
 
 

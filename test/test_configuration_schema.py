@@ -175,6 +175,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             {'disturbance.coulomb': [1.0, -0.5]},
             'got -0.5 at entry 2 of [1.0, -0.5], but it',
         ),
+        (
+            PLANT,
+            {'disturbance.coulomb': [-1.0, -0.5]},
+            'got -1.0 at entry 1 of [-1.0, -0.5], but it must be at least 0 N m; likewise entry 2',
+        ),
         (PLANT, {'duration': float('nan')}, 'got .nan, but a finite number is needed'),
         (
             PLANT,

@@ -16,6 +16,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+import rclpy
 from command import finished
 from plain_law import dynamics
 from rcl_interfaces.msg import Log
@@ -130,7 +131,35 @@ def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
     )  # as it may do later
     node.report_if_changed(node.guard)
     ros.until(lambda: len(log('real', '', FATAL)) == 2)
-    assert log('real', 'the arm speeds up in the safe stop', FATAL)
+    added = log('real', '', FATAL)[1]  # without what has been said already
+    assert added == 'in this stop: the arm speeds up in the safe stop'
+
+
+@pytest.mark.parametrize('others', [0, 1])
+def test_stop_by_the_stamps_of_two_publishers_names_them(ros, log, others):
+    """As of an arm, and a simulated one that somebody else has started."""
+    space = f'pair{others}'
+    node = ros.add(ControllerNode, namespace=space)
+    states = driver(ros, space)
+    for _ in range(others):
+        second = ros.keep(
+            rclpy.create_node('twin', context=ros.context, namespace=space)
+        )
+        second.create_publisher(JointState, 'joint_states', 1)
+    ros.until(lambda: ros.tester.count_publishers(f'/{space}/joint_states') > others)
+    encoder = JointStateEncoder(JOINTS)
+    for k in (10, 11, 5):
+        stamp = 10**9 + k * 10**6
+        states.publish(encoder.encode(stamp, START, ZERO, ZERO))
+        ros.until(lambda: node.guard.journal.messages > 0)
+        ros.spin(0.05)
+    ros.until(lambda: log(space, 'before the last one', FATAL))
+    (stop,) = log(space, 'before the last one', FATAL)
+    told = (
+        f'publishers send joint states: /record_tester, /{space}/twin: stop all but one'
+    )
+    assert (told in stop) is bool(others)
+    assert ('publishers' in stop) is bool(others)
 
 
 def test_a_load_that_nobody_tells_the_drives_is_warned_of(ros, log):

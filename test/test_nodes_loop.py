@@ -479,6 +479,7 @@ def test_stale_torque_is_not_applied_in_real_time(ros):
         lambda: any(
             (status.name, status.level) == ('sim_plant/torque', b'\2')
             and 'too old' in status.message
+            and 'none is applied until another comes' in status.message
             for array in diagnostics
             for status in array.status
         )

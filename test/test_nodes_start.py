@@ -69,6 +69,7 @@ def test_second_controller_does_not_start_unless_it_is_told_to(ros, word):
     arm, law = ros.loop()
     ros.run(arm, 200)
     other = {'safety.other_commands': word}
+    logged = ros.listen(LOG)
     second = ros.add(ControllerNode, other, clock=PatientClock())
     if word == 'allow':
         ros.until(lambda: second.guard.supervisor.running)
@@ -76,6 +77,9 @@ def test_second_controller_does_not_start_unless_it_is_told_to(ros, word):
     ros.until(lambda: second.finished)
     assert 'another node commands torques' in str(second.failure)
     assert not second.guard.commanding
+    ros.until(lambda: any('another node commands' in each.msg for each in logged))
+    (refused,) = [each.msg for each in logged if 'another node commands' in each.msg]
+    assert refused.endswith('; this node ends')  # and has no ~/reset then
     ros.kill(second)
     ros.run(arm, 500)
     assert law.guard.supervisor.phase is Phase.TRACKING
@@ -110,6 +114,7 @@ def test_controller_starts_beside_a_predecessor_that_was_killed(ros):
 
 
 def test_managed_controller_that_was_refused_starts_once_it_is_alone(ros):
+    logged = ros.listen(LOG)
     arm, law = ros.loop()
     ros.run(arm, 50)
     second = ros.add(ControllerNode, autostart=False, clock=PatientClock())
@@ -117,6 +122,10 @@ def test_managed_controller_that_was_refused_starts_once_it_is_alone(ros):
     second.trigger_configure()
     second.trigger_activate()
     ros.until(lambda: second.guard.supervisor.reason is Reason.START_REJECTED)
+    ros.until(lambda: any('another node commands' in each.msg for each in logged))
+    # not the safe torque, which it commands in other stops
+    refused = [each.msg for each in logged if 'another node commands' in each.msg]
+    assert refused[0].startswith('nothing is commanded: ')
     ros.kill(law)
     second.reset()
     ros.until(lambda: second.guard.supervisor.running)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 
 import hypothesis
 import numpy as np
@@ -12,10 +13,12 @@ import pytest
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.motion_groups import MotionLimits
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.reference import retargeting
 from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.approach import MotionError
+from blf_dsc_controller.reference.approach import MotionError, worst_violation
 from blf_dsc_controller.reference.stream import TargetStream
 from blf_dsc_controller.reference.terms import (
     minimum_jerk,
@@ -517,6 +520,44 @@ def test_trajectory_that_ends_in_motion_brakes_after_its_last_point(fields):
     ended = at(motion.vector, NOW + 4.0)[0, 0] - GOALS[-1, 0]
     assert 0.2**2 / (2.0 * 6.0) < ended < 0.2 * 0.1
     assert max(limits_used(motion, NOW, NOW + 4.0)) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize('time', [0.1, 6.0])
+def test_points_past_position_limits_are_named_and_no_consequence_of_them(time):
+    """Of the way to them only the velocity would be told, which a slower motion keeps."""
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
+    path = np.array([[-1.5, 1.0], [-1.0, 3.5], [0.5, 3.5]])
+    sent = trajectory((path,), times=(time, 2 * time, 3 * time))
+    with pytest.raises(TrajectoryError) as rejection:
+        plan_trajectory(sent, at_rest, 0.0, MIDDLE)
+    (problem,) = rejection.value.problems
+    assert problem == (
+        "point 3 has joint 'shoulder' at 0.5 rad, past its limit of -0.07 rad; "
+        "point 2 has joint 'elbow' at 3.5 rad, past its limit of 3 rad; reduce the motion, or "
+        'relax limits.position_lower and limits.position_upper'
+    )
+
+
+def test_limits_of_a_joint_that_slides_are_told_in_metres():
+    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
+    first, second, *_ = re.findall('<joint name="[^"]*" type="[^"]*"', urdf)
+    slides = second.replace(second.split('type=')[1], '"prismatic"')
+    config = build(
+        ControllerConfig,
+        {
+            'joints': [each.split('"')[1] for each in (first, second)],
+            'robot.urdf': urdf.replace(second, slides),
+            'limits.position_lower': [-1.0, -1.0],
+            'limits.position_upper': [1.0, 1.0],
+        },
+    )
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
+    path = trajectory((np.array([[0.0, 2.0]]),), times=(9.0,))
+    with pytest.raises(TrajectoryError, match='at 2 m, past its limit of 1 m;'):
+        plan_trajectory(path._replace(joints=config.joints), at_rest, 0.0, config)
+    fast = pack(2, [minimum_jerk(np.array([0.0, 0.1]), np.array([[0, 0], [0, 0.9]]))])
+    found = worst_violation(fast, np.array([0.05]), config)
+    assert re.search(r'would be [\d.]+ m/s at', str(found))
 
 
 def test_three_thousand_points_are_planned():

@@ -242,6 +242,17 @@ def test_arm_that_was_fast_at_the_stop_speeds_up_only_if_it_gets_faster(
     assert ('speeds up in the safe stop' in guard.supervisor.text) == speeds_up
 
 
+def test_arm_that_falls_after_a_refused_start_is_told_to_be_without_a_torque():
+    guard = Guard(change(ControllerConfig(), {'safety.torque': 'damping'}))
+    guard.starting.activate()
+    guard.supervisor.stop(Reason.START_REJECTED, 'a test')
+    for k in range(400):
+        q = np.array([0.3 + 1.5e-3 * k, -0.4])
+        state = np.concatenate((q, [1.5, 0.0], np.zeros(2)))
+        assert guard.update((1000 + k) * MILLISECOND, state) is None
+    assert 'speeds up while nothing is commanded' in guard.supervisor.text
+
+
 def test_torque_continues_after_immediate_reactivation():
     rig = Rig({'safety.deactivation_ramp': 10.0})
     rig.step(200)

@@ -14,6 +14,7 @@ from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase
 from blf_dsc_controller.supervision.swing import Swing
+from blf_dsc_controller.supervision.swing_names import SwingNames
 from sim_plant.plant import plant_of
 
 T = 1e-3  # s
@@ -140,3 +141,14 @@ def test_stop_names_the_joints_that_swing_in_it():
     text = guard.supervisor.text
     assert text.count("joint 'fr3_joint7' swings under the damping of the stop") == 1
     assert 'robot.rotor_inertia' in text
+
+
+def test_what_a_swing_means_is_said_once_in_a_stop():
+    """In an overloaded loop all seven joints of a Panda swing, one after the other."""
+    names = SwingNames(('a', 'b', 'c'))
+    names.begin()
+    assert 'robot.rotor_inertia' in names.text(np.array([False, True, False]))
+    assert names.text(np.array([False, True, False])) == ''
+    assert names.text(np.array([True, True, True])) == "joints 'a', 'c' swing, too"
+    names.begin()
+    assert 'robot.rotor_inertia' in names.text(np.array([False, False, True]))

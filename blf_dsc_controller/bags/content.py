@@ -339,7 +339,8 @@ def _find(
         if len(fitting) > 1 and not exact:
             raise BagError(
                 f'the bag has {len(fitting)} topics that could be {topic.relative!r}: '
-                f'{", ".join(fitting)}; select the robot by its namespace'
+                f'{", ".join(fitting)}; select the robot by its namespace, such as '
+                f'--namespace {fitting[0].removesuffix(ending)}'
             )
         if fitting:
             return (exact or fitting)[0]

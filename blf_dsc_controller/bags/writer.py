@@ -190,7 +190,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         return BagError(
             f'{self.path} cannot be written any further: '
             f'{getattr(error, "strerror", None) or error}; '
-            f'blf_dsc recover {self.path} saves what was written before'
+            f'blf_dsc recover {self.path} saves what was written before, with --out on another '
+            'disk if this one is full'
         )
 
     @property

@@ -71,7 +71,9 @@ def plot(options: Namespace) -> None:
     from blf_dsc_controller.analysis.output import write_json
 
     names = ('summary.json', *figures.NAMES)
-    make_room(*(options.out / name for name in names), force=options.force)
+    make_room(
+        *(options.out / name for name in names), force=options.force, try_out=False
+    )
     announce_reading([options.bag], 'drawn')
     run = _run(options)
     metrics = measure(run)

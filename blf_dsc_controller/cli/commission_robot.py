@@ -119,7 +119,7 @@ def prepared_folder(options: Namespace) -> Path:
             'the robot moves, and nobody can be asked here: start it in a terminal, or give --yes'
         )
     folder: Path = options.record or options.out.with_name(f'{options.out.stem}_bags')
-    make_room(folder, force=False)
+    make_room(folder, force=False, try_out=False)
     return folder
 
 

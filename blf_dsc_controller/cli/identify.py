@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from datetime import datetime
 from pathlib import Path
-from tempfile import TemporaryFile
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.content import NameMap
@@ -207,12 +206,6 @@ def _listed(paths: Sequence[Path]) -> str:
 def excite(options: Namespace) -> None:
     """Search for the reference, and write it as a preset."""
     make_room(options.out, force=options.force)
-    # what cannot be written is said at once
-    if not options.out.parent.is_dir():
-        raise BlfDscError(
-            f'there is no folder {options.out.parent}: make it, or choose another path'
-        )
-    TemporaryFile(dir=options.out.parent).close()
     config = load(locate(options.config), CONTROLLER, ControllerConfig)
     if config.model != 'urdf':
         raise BlfDscError(

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from blf_dsc_controller import writing
 from blf_dsc_controller.cli.parser import (
     check_command,
     check_text,
@@ -100,7 +101,11 @@ def _place_text(error: OSError) -> str:
         case OSError(filename=None):
             return error.strerror or f'{error}'
         case FileNotFoundError():
-            return f'there is no {path}: make its folder, or choose another path'
+            folder = Path(path).parent
+            what = (
+                (path, 'its folder') if folder.exists() else (f'folder {folder}', 'it')
+            )
+            return f'there is no {what[0]}: make {what[1]}, or choose another path'
         case PermissionError():
             return f'{path} may not be read or written by you: choose another path'
         case IsADirectoryError():
@@ -156,10 +161,14 @@ def _interrupt(program: str, _number: int, _frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def make_room(*paths: Path, force: bool) -> None:
+def make_room(*paths: Path, force: bool, try_out: bool = True) -> None:
     """Prepare `paths` for writing; a symbolic link is replaced instead of followed.
 
-    Raises BlfDscError if one of them exists, unless `force` is set.
+    They are tried out, before minutes of work: not those whose folder is still to be made.
+
+    Raises:
+        BlfDscError: one of them exists, unless `force` is set.
+        OSError: one of them cannot be written.
     """
     existing = [path for path in paths if os.path.lexists(path)]
     if existing and not force:
@@ -169,6 +178,8 @@ def make_room(*paths: Path, force: bool) -> None:
     for path in existing:
         if path.is_symlink():
             path.unlink()
+    for path in paths if try_out else ():
+        writing.try_out(path)
 
 
 def _node(module: str) -> int:

@@ -60,6 +60,10 @@ _DURATION = 60.0  # s, if neither the file nor an option sets it
 def run(options: Namespace) -> int:
     """Run the closed loop and write the results to a new folder."""
     refuse_existing(options.out)  # before warnings, and what takes seconds
+    if options.offline and options.mode == 'realtime':
+        raise BlfDscError(
+            '--mode realtime needs ROS: leave out --offline, which simulates as fast as it goes'
+        )
     with announced_compilation(print_notice):
         config = loop_configuration(options)
     if options.view:

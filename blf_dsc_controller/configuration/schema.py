@@ -129,18 +129,29 @@ class Parameter:
             return
         if not (entries or self.omittable or self.length):
             yield f'{self.name}: got an empty list, but at least one entry is needed'
-        for index, entry in enumerate(entries, 1):
+        yield from self._entry_problems(entries)
+
+    def _entry_problems(self, entries: Sequence[Any]) -> Iterator[str]:
+        """Yield what is wrong with values of the right type, each mistake once."""
+        found: dict[str, list[int]] = {}
+        for index, entry in enumerate(entries):
             if isinstance(entry, float) and not math.isfinite(entry):
-                expected = 'a finite number is needed'
+                found.setdefault('a finite number is needed', []).append(index)
             elif not self._allows(entry):
                 unit = f' {self.unit}' if self.unit and not self.choices else ''
-                expected = f'it must be {self.allowed}{unit}'
-            else:
-                continue
+                found.setdefault(f'it must be {self.allowed}{unit}', []).append(index)
+        for expected, (first, *others) in found.items():
             place = (
-                f' at entry {index} of {format_value(entries)}' if self.is_array else ''
+                f' at entry {first + 1} of {format_value(entries)}'
+                if self.is_array
+                else ''
             )
-            yield f'{self.name}: got {format_value(entry)}{place}, but {expected}'
+            more = (
+                f'; likewise entry {", ".join(str(i + 1) for i in others)}'
+                if others
+                else ''
+            )
+            yield f'{self.name}: got {format_value(entries[first])}{place}, but {expected}{more}'
 
     def _unquoted(self, entries: Sequence[Any]) -> str:
         """Return the remedy if entries would be of this type but for their quotes, or empty."""

@@ -298,19 +298,24 @@ class MotionInput:
         """
         guard = self._guard()
         self._is_stopped = True
+        ignored = f'topics are ignored until they pause for {_PAUSE:g} s'
         if guard is None or not guard.supervisor.running:
-            return 'the controller is not in command: nothing to stop'
+            return f'the controller is not in command: nothing to stop; once it is, {ignored}'
         self._last_message = guard.reference.time
         left = self.stop(guard, '~/stop') - guard.reference.time
-        ignored = f'topics are ignored until they pause for {_PAUSE:g} s'
         text = f'braking for {left:.3g} s; {ignored}'
         self._log.info(text)
         return text
 
     def _ignore_after_stop(self, guard: Guard) -> bool:
-        """Ignore a message of a sender that has not paused since `~/stop`; return whether it is."""
+        """Ignore a message of a sender that has not paused since `~/stop`; return whether it is.
+
+        What arrives while the law is not in command has another reason to be rejected.
+        """
         pause = guard.reference.time - self._last_message
         self._last_message = guard.reference.time
+        if not guard.supervisor.running:
+            return False
         if self._is_stopped and 0.0 <= pause < _PAUSE:
             self._log.warning(
                 f'ignored after ~/stop, until messages pause for {_PAUSE:g} s',
@@ -399,9 +404,10 @@ class MotionInput:
             self.targets += 1
         else:
             self.accepted += 1
-            points = len(plan.command.points)
+            count = len(plan.command.points)
+            points = '1 point' if count == 1 else f'{count} points'
             note = f' {plan.motion.note}' if plan.motion.note else ''
-            self._log.info(f'following a trajectory of {points} points{note}')
+            self._log.info(f'following a trajectory of {points}{note}')
             self._log_turns(plan.motion.turned)
 
     def _report_target(self, plan: Plan | None, reason: str) -> None:

@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from blf_dsc_controller.control.rejected_columns import rejected_columns
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.process import PlainNode
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.supervisor import STAMPS, Phase, Reason
 
 
 class ControllerLog:
@@ -36,13 +37,17 @@ class ControllerLog:
         """Begin with a new law, which has found nothing yet."""
         self._contacts = self._oscillations = 0
 
-    def log_phase(self, guard: Guard) -> None:
-        """Log the phase, the cause of a stop, and that the reference is shifted by turns."""
+    def log_phase(self, guard: Guard, *, ends: bool) -> None:
+        """Log the phase, the cause of a stop, and that the reference is shifted by turns.
+
+        `ends`: whether the node ends by that stop.
+        """
         supervisor = guard.supervisor
         is_stopped = supervisor.phase is Phase.SAFE_STOP  # its text may grow
         text = supervisor.text if is_stopped else ''
         now = supervisor.phase, supervisor.stops, guard.silenced, text
-        if now == self._phase:
+        before = self._phase
+        if now == before:
             return
         self._phase = now
         if guard.reference.turned and guard.reference.start_stamp != self._turned_at:
@@ -51,14 +56,40 @@ class ControllerLog:
         if guard.silenced:
             self._log.warning(supervisor.text)
         elif is_stopped:
-            stop = f'{guard.config.safety.torque} torque: {supervisor.text}'
-            reset = f'{self._node.get_fully_qualified_name()}/reset'
-            self._log.fatal(f'{stop}; {reset} starts again')
+            self._log_stop(guard, _added(before, now), ends=ends)
         elif supervisor.phase is Phase.APPROACHING:
             left = guard.reference.settled - guard.reference.time
             self._log.info(f'approaching the reference, for {left:.3g} s')
         elif supervisor.phase is Phase.TRACKING:
             self._log.info('tracking the reference')
+
+    def _log_stop(self, guard: Guard, added: str, *, ends: bool) -> None:
+        """Log why the law stopped, or what has been `added` to the text of this stop."""
+        if added:
+            self._log.fatal(f'in this stop: {added}')
+            return
+        torque = f'{guard.config.safety.torque} torque'
+        if not guard.commanding:
+            torque = 'nothing is commanded'
+        after = f'{self._node.get_fully_qualified_name()}/reset starts again'
+        if ends:
+            after = 'this node ends'
+        texts = (
+            guard.supervisor.text,
+            self._several_arms(guard.supervisor.reason),
+            after,
+        )
+        self._log.fatal(f'{torque}: {"; ".join(filter(None, texts))}')
+
+    def _several_arms(self, reason: Reason) -> str:
+        """Return who publishes joint states, if the stamps of several have caused a stop."""
+        found = self._node.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
+        if reason not in STAMPS or len(found) < 2:
+            return ''
+        names = ', '.join(
+            f'{each.node_namespace.rstrip("/")}/{each.node_name}' for each in found
+        )
+        return f'{len(found)} publishers send joint states: {names}: stop all but one'
 
     def warn_of_findings(self, guard: Guard) -> None:
         """Warn of contacts, oscillations and efforts of no sensors since the last call."""
@@ -108,3 +139,11 @@ class ControllerLog:
         for reason in status.rejected.values():
             self._log.warning(reason)
         return bool(has_changed or status.rejected)
+
+
+def _added(before: tuple[object, ...], now: tuple[Phase, int, bool, str]) -> str:
+    """Return what the text of a stop has more than before; empty for another stop."""
+    text = str(before[-1])
+    if before[:-1] != now[:-1] or not text or not now[-1].startswith(text):
+        return ''
+    return now[-1][len(text) :].removeprefix('; ')

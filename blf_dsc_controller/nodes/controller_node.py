@@ -402,10 +402,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if not self.status.has_news(guard):
             self.status.publish_events(guard)
             return
-        supervisor = guard.supervisor
-        self.log.warn_of_findings(guard)
-        self.log.log_phase(guard)
-        self._started = self._started or supervisor.running
+        self._started = self._started or guard.supervisor.running
         if (
             guard.starting.error is not None
             and self.config.autostart
@@ -413,6 +410,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         ):
             self.failure = guard.starting.error
             self.finished = True
+        self.log.warn_of_findings(guard)
+        self.log.log_phase(guard, ends=self.finished)
         self._report()
 
     def on_second(self) -> None:

@@ -51,7 +51,10 @@ from sim_plant.sampled_plant import Plant
 from sim_plant.settings import parameter_names_of, plant_settings, steps_of, urdf_of
 from sim_plant.torque_input import Latency, TorqueInput
 
-_STALE = {'zero': ': not applied', 'hold': ', and still applied'}
+_STALE = {
+    'zero': 'none is applied until another comes',
+    'hold': 'it is still applied',
+}
 _REPEAT_PERIOD = 3.0  # s, until a state without a torque is sent again
 # samples in lock-step on their way to a subscriber: a fifth of its queue
 _IN_FLIGHT = 1000
@@ -286,11 +289,18 @@ class PlantNode(LoopNode[PlantConfig]):
         self._apply_changes()
         self._publish_state()
         if self._stale and not was_stale:
-            self.get_logger().error(
-                'the torque is too old' + _STALE[self.config.actuator.without_command],
-                throttle_duration_sec=1.0,
-            )
+            self.get_logger().error(self._stale_text, throttle_duration_sec=1.0)
             self._report()
+
+    @property
+    def _stale_text(self) -> str:
+        actuator = self.config.actuator
+        after = _STALE[actuator.without_command]
+        return (
+            'the last torque is too old '
+            f'(actuator.command_timeout, {actuator.command_timeout:g} s): {after}. The controller '
+            'has ended, or it or this computer is too slow'
+        )
 
     def _step(self) -> None:
         torque = self.input.torque
@@ -367,9 +377,7 @@ class PlantNode(LoopNode[PlantConfig]):
         elif self._halt:
             level, message = ERROR, self._halt
         elif self._stale:
-            after = _STALE[self.config.actuator.without_command]
-            level = ERROR
-            message = f'the last torque is too old (actuator.command_timeout){after}'
+            level, message = ERROR, self._stale_text
         elif rejected > self._reported_rejected:
             level, message = WARN, self.input.problem
         self._reported_rejected = rejected

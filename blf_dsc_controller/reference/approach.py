@@ -60,6 +60,9 @@ _FEWEST_CHECKED = 200  # samples, for short motions
 _MOST_CHECKED = 1_000_000  # samples, for very long ones
 _ROUNDING = 1e-9  # relative, for motions that just reach a limit
 
+POSITIONS = 'limits.position_lower and limits.position_upper'
+"""The parameters of the position limits."""
+
 
 class Violation(NamedTuple):
     """The largest violation of a limit by a motion."""
@@ -71,12 +74,15 @@ class Violation(NamedTuple):
     time: float  # s
     # value over limit; positions are relative to the middle of their range
     ratio: float
+    slides: bool = False  # whether the joint does
 
     def __str__(self) -> str:
         """Describe the violation: joint, quantity, value and limit with their unit."""
-        unit = {'position': 'rad', 'velocity': 'rad/s', 'acceleration': 'rad/s^2'}[
-            self.quantity
-        ]
+        unit = ('m' if self.slides else 'rad') + {
+            'position': '',
+            'velocity': '/s',
+            'acceleration': '/s^2',
+        }[self.quantity]
         return (
             f'the {self.quantity} of joint {self.joint!r} would be {self.value:.6g} {unit} at '
             f't = {self.time:.6g} s, past its limit of {self.limit:.6g} {unit}'
@@ -86,7 +92,7 @@ class Violation(NamedTuple):
     def parameters(self) -> str:
         """The configuration parameters that set this limit."""
         if self.quantity == 'position':
-            return 'limits.position_lower and limits.position_upper'
+            return POSITIONS
         return f'limits.{self.quantity}'
 
 
@@ -128,10 +134,35 @@ def worst_violation(
         reached = float(value[at, i])
         limit = shift + float(np.copysign(allowed[i], reached))
         time = float(times[at])
+        slides = config.robot.kinds(config.joints)[i] == 'prismatic'
         worst = Violation(
-            config.joints[i], quantity, shift + reached, limit, time, ratio
+            config.joints[i], quantity, shift + reached, limit, time, ratio, slides
         )
     return worst
+
+
+def positions_past_limits(
+    points: np.ndarray, first: int, config: ControllerConfig
+) -> str:
+    """Return the joints that positions (k, n) [rad] would hold past their limits.
+
+    Each with the first such point, and its limit; empty if there are none. The points
+    are numbered from `first` on.
+    """
+    limits = np.array((config.limits.position_lower, config.limits.position_upper))
+    room = 0.5 * _ROUNDING * (limits[1] - limits[0])
+    past = (points < limits[0] - room) | (points > limits[1] + room)
+    kinds = config.robot.kinds(config.joints)
+    found = []
+    for i in np.flatnonzero(past.any(axis=0)):
+        k = int(np.argmax(past[:, i]))
+        limit = limits[int(points[k, i] > limits[1, i]), i]
+        unit = 'm' if kinds[i] == 'prismatic' else 'rad'
+        found.append(
+            f'point {first + k} has joint {config.joints[i]!r} at {points[k, i]:.6g} {unit}, '
+            f'past its limit of {limit:.6g} {unit}'
+        )
+    return '; '.join(found)
 
 
 class BlendedReference(NamedTuple):

@@ -33,11 +33,13 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.reference.approach import (
+    POSITIONS,
     MotionError,
     Violation,
     blend,
     braking_time,
     check_times,
+    positions_past_limits,
     worst_violation,
 )
 from blf_dsc_controller.reference.retargeting import (
@@ -124,6 +126,10 @@ def plan_trajectory(
     before = [term for term in terms if term.begin < t0] or terms[:1]
     present = sampled(pack(len(config.joints), before), np.array([t0]))[0, 0]
     points[0], turned = short_way(points[0], present, config)
+    first = 1 + len(trajectory.points) - len(times)
+    past = positions_past_limits(points[0], first, config)
+    if past:
+        raise TrajectoryError([f'{past}; reduce the motion, or relax {POSITIONS}'])
     motion = _planned(before, now, t0, times, points, config)
     return motion._replace(turned=turned)
 

@@ -250,7 +250,10 @@ class Guard(InCommand):
         silent = self.watchdog.measure_silence(limit)
         if silent == 0.0 or not (self.watchdog.on and self.commanding):
             return None
-        return self.time_out(f'no joint state received for {silent:.3g} s')
+        return self.time_out(
+            f'no joint state received for {silent:.3g} s, and {limit:.3g} s are allowed '
+            '(sample_time + safety.state_timeout): is the driver alive, and the computer free?'
+        )
 
     def time_out(self, text: str) -> Vector | None:
         """Return the torque of one watchdog period without a joint state."""

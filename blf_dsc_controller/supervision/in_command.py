@@ -239,9 +239,12 @@ class InCommand:
         if self.supervisor.phase is not Phase.SAFE_STOP:
             return
         speed, gap = self.readings.speed, self.readings.gap
-        text = self.safe_stop.observe_speed(self.config.safety, speed, gap)
-        if text:
-            self.supervisor.add(text)
+        if not self.safe_stop.observe_speed(self.config.safety, speed, gap):
+            return
+        when = 'in the safe stop' if self.commanding else 'while nothing is commanded'
+        self.supervisor.add(
+            f'the arm speeds up {when}, to {speed:.3g} rad/s: engage the brakes'
+        )
 
     def release(self) -> Vector | None:
         """Return the last torque, if any: the safe torque of an arm at rest."""

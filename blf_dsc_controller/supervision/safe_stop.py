@@ -109,16 +109,16 @@ class SafeStop:
         settings = self._controller.settings
         return self._torque.leave(safety, settings, self._samples.estimate)
 
-    def observe_speed(self, safety: Safety, speed: float, gap: float) -> str:
-        """Return to the load known before if the arm speeds up; return a text if it does.
+    def observe_speed(self, safety: Safety, speed: float, gap: float) -> bool:
+        """Return to the load known before if the arm speeds up; return whether it does.
 
         `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last one.
         """
         begins = self._speed.observe(speed, gap)
         if not begins or safety.torque == 'zero':
-            return ''
+            return False
         self._torque.stop_observing()
-        return f'the arm speeds up in the safe stop, to {speed:.3g} rad/s: engage the brakes'
+        return True
 
     def name_swings(self) -> str:
         """Return a text about joints that swing in the stop and have not been named; or empty."""

@@ -92,13 +92,17 @@ class StateCheck:
             return self._check_repeats()
         self._repeats = 0
         if step < 0.0:
-            text = f'the stamp of a joint state is {-step:.6g} s before the last one'
+            text = (
+                f'the stamp of a joint state is {-step:.6g} s before the last one: the clock was '
+                'set back, two nodes publish joint states, or the driver was restarted'
+            )
             return Fault(Reason.STAMP_BACKWARD, text)
         if step > self._sample_time + safety.state_timeout:
             text = (
                 f'the stamp of a joint state is {step:.6g} s after the last one: '
                 f'{self._sample_time:g} s is the sample time, and it may be late by '
-                f'{safety.state_timeout:g} s (safety.state_timeout)'
+                f'{safety.state_timeout:g} s (safety.state_timeout). States were lost, or the '
+                'clock was set'
             )
             return Fault(Reason.STAMP_JUMP, text)
         self._last_stamp = stamp
@@ -115,7 +119,10 @@ class StateCheck:
         self._repeats += 1
         if self._repeats <= _REPEATS:
             return SKIP
-        text = f'{self._repeats} joint states in a row repeat the stamp of the one before them'
+        text = (
+            f'{self._repeats} joint states in a row repeat the stamp of the one before them: the '
+            'driver has to stamp each'
+        )
         return Fault(Reason.STAMP_REPEATED, text)
 
     def _count_missed(self, safety: Safety, missed: int) -> Fault | None:

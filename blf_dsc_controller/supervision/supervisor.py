@@ -51,6 +51,10 @@ class Reason(str, Enum):
     FAILED = 'failed'
 
 
+STAMPS = (Reason.STAMP_REPEATED, Reason.STAMP_BACKWARD, Reason.STAMP_JUMP)
+"""What the states of two publishers on one topic look like, among others."""
+
+
 class Fault(NamedTuple):
     """Why the controller must stop: the reason, and a sentence with the values."""
 

@@ -21,10 +21,14 @@ class SwingNames:
         self._named[:] = False
 
     def text(self, has_swung: NDArray[np.bool_]) -> str:
-        """Return a text about joints (n,) that are not named yet; or empty."""
+        """Return a text about joints (n,) that are not named yet; or empty.
+
+        Only the first text of a stop says what that means: the others follow it.
+        """
         new = has_swung & ~self._named
         if not new.any():
             return ''
+        is_first = not self._named.any()
         self._named |= new
         names = [
             repr(name) for name, is_new in zip(self._joints, new, strict=True) if is_new
@@ -34,6 +38,8 @@ class SwingNames:
             if len(names) > 1
             else f'joint {names[0]} swings'
         )
+        if not is_first:
+            return f'{what}, too'
         return (
             f'{what} under the damping of the stop, which is taken down there: is a motor lighter '
             'than robot.rotor_inertia, or a torque later than robot.lag?'
