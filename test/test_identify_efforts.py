@@ -140,7 +140,19 @@ def test_wrong_mounting_is_named_instead_of_reversed_efforts(wide, given):
         found = problem(states, robot)
         np.testing.assert_allclose(found.other_gravity, GRAVITY, atol=0.01)
         assert (found.reversed == is_reversed).all()
-    wrong = identify_arm(recorded(wide), robot)
+
+
+@pytest.mark.parametrize(
+    'given',
+    [
+        'ceiling',
+        *(pytest.param(k, marks=pytest.mark.nightly) for k in ('wall', 'tilted')),
+    ],
+)
+def test_wrong_mounting_is_not_taken_for_a_load_or_other_joints(wide, given):
+    wrong = identify_arm(recorded(wide), replace(ROBOT, gravity=MOUNTINGS[given]))
+    left = np.linalg.norm(wrong.score.errors[2]) / np.linalg.norm(wrong.score.torque)
+    assert left > 0.1
     assert not is_usable(wrong)
     (named,) = problems_of(wrong, 'torque')
     assert '--gravity 0 0 -9.81' in named
