@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -83,13 +84,17 @@ def problem(states, robot=ROBOT):
     return problem_of(recorded(states), robot, 'torque', None, find_signs=True)
 
 
+# those nearest to 1 are the hardest to see
+FACTORS = (0.1, 10.0, 1000.0) if os.environ.get('NIGHTLY') else (0.1, 10.0)
+
+
 @pytest.mark.parametrize('motion', ['wide', 'narrow'])
 def test_efforts_in_other_units_are_refused_and_right_ones_are_not(motion, request):
     states = request.getfixturevalue(motion)
     found = identify_arm(recorded(states), ROBOT)
     assert not list(problems_of(found, 'torque'))
     assert found.gravity == pytest.approx(1.0, abs=0.3)  # masses are off by 30 %
-    for factor in (0.1, 10.0, 1000.0):
+    for factor in FACTORS:
         other = with_torque(states, factor * states[:, TORQUE])
         wrong = identify_arm(recorded(other), ROBOT)
         assert not is_usable(wrong)
