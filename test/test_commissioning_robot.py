@@ -296,14 +296,14 @@ def test_loop_of_ones_own_logs_it_without_a_warning(caplog):
     assert line.levelno == logging.INFO
 
 
-def test_a_posture_that_noise_hides_is_measured_again(whole, capsys):
+def test_a_posture_that_noise_hides_is_measured_again(arm, capsys):
     """Both bags are kept, and only the second one counts."""
-    coarsen(whole, '4.0e-4')
-    assert commission(whole, 'plant', '--yes', '--torque', '0.03') == 0
+    coarsen(arm, '4.0e-4')
+    assert commission(arm, 'plant', '--yes', '--torque', '0.03') == 0
     told = capsys.readouterr().out
     assert 'is measured once more' in told
     assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
-    folder = whole.with_name('out_bags')
+    folder = arm.with_name('out_bags')
     assert {bag.name for bag in folder.iterdir()} == {
         *('move_1', 'weak_posture_1', 'posture_1')
     }
@@ -314,10 +314,10 @@ def test_a_posture_that_noise_hides_is_measured_again(whole, capsys):
     assert strong == pytest.approx(MOST * weak)  # of the last joint's fastest line
     run = blf.read_run(folder / 'posture_1')
     assert np.abs(run.error[0]).max() < 1e-3  # from where the arm rests: a step or two
-    gains = gains_of(whole.with_name('out.yaml'))
+    gains = gains_of(arm.with_name('out.yaml'))
     bag = str(folder / 'posture_1')
-    again = whole.with_name('again.yaml')
-    assert main(['commission', bag, '--config', str(whole), '--out', str(again)]) == 0
+    again = arm.with_name('again.yaml')
+    assert main(['commission', bag, '--config', str(arm), '--out', str(again)]) == 0
     np.testing.assert_array_equal(gains_of(again), gains)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.commissioning.better_known import (
     ABOVE_IF_HIDDEN,
     FAR_ABOVE,
@@ -259,4 +259,4 @@ def measured_in(bag: str | Path) -> Measured:
     Raises BagError if it cannot be read, or has none.
     """
     content = read_content(Path(bag))
-    return read_run(bag), content.controller_config()
+    return recorded_run(content, np.asarray), content.controller_config()

@@ -27,6 +27,7 @@ from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.own_loop import (
     REPEATS,
     Commissioning,
+    Measured,
     measured_in,
 )
 from blf_dsc_controller.commissioning.proof import (
@@ -101,9 +102,10 @@ def plan_repeat_by_bag(
 
     Raises BlfDscError if it is None, and the bag does not show the response.
     """
-    again = commissioning.plan_repeat(planned, measured_in(bag)[0], posture)
+    measured = measured_in(bag)
+    again = commissioning.plan_repeat(planned, measured[0], posture)
     if again is None:
-        check(bag)
+        _check(measured)
     return again
 
 
@@ -119,7 +121,11 @@ def better_known_by_bag(
 
 def check(bag: Path) -> None:
     """Raise BlfDscError if the run of a bag does not show the response."""
-    run, config = measured_in(bag)
+    _check(measured_in(bag))
+
+
+def _check(measured: Measured) -> None:
+    run, config = measured
     response_of(run, motion.lines_in(config), config.sample_time)
 
 

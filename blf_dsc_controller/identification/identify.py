@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -183,64 +184,74 @@ def identify_arm(
     if is_good and not unexplained.size:
         return found
     if picked_up is None and not is_good:
-        changing = _identified(
-            recording, robot, effort, np.nan, find_signs, _tell_nobody
-        )
+        changing = _trained(recording, robot, effort, np.nan, find_signs, _tell_nobody)
         if (load := _better_load(found, changing)) is not None:
             return found._replace(other_load=load)
     if effort == 'without-gravity':
         return found
 
-    def identified_as(convention: Convention) -> Identified:
+    def trained_as(convention: Convention) -> _Trained:
         other = converted(recording, convention)
-        return _identified(other, robot, effort, picked_up, find_signs, _tell_nobody)
+        return _trained(other, robot, effort, picked_up, find_signs, _tell_nobody)
 
     likely = likely_conventions(recording, robot, unexplained.tolist())
-    convention = _better_convention(found, likely, identified_as)
+    convention = _better_convention(found, likely, trained_as)
     return found._replace(other_convention=convention)
 
 
-def _better_load(found: Identified, changing: Identified) -> OtherLoad | None:
-    """Return the load of `changing` if that explains the torques far better, or None."""
-    error = float(changing.score.total[2])
-    if changing.carried is None or not error < _BETTER * found.score.total[2]:
+class _Trained(NamedTuple):
+    """An arm fitted to the first four fifths of a recording, and scored on the rest."""
+
+    recording: Recording
+    problem: Problem
+    selected: Selected
+    score: Score
+
+
+def _better_load(found: Identified, trained: _Trained) -> OtherLoad | None:
+    """Return the load that was found if it explains the torques far better, or None."""
+    error = float(trained.score.total[2])
+    carried = trained.problem.carried
+    if carried is None or not error < _BETTER * found.score.total[2]:
         return None
+    changing = _completed(trained, _tell_nobody)
     mass, deviation = (float(each[0]) for each in changing.load)
     if mass < _SHOWN * deviation or not is_usable(changing):
         return None
-    return OtherLoad(changing.carried, mass, error)
+    return OtherLoad(carried, mass, error)
 
 
 def _better_convention(
     found: Identified,
     likely: Sequence[Convention],
-    identified_as: Callable[[Convention], Identified],
+    trained_as: Callable[[Convention], _Trained],
 ) -> OtherConvention | None:
     """Return the first of likely ones that explains the torques far better, or None."""
     for convention in likely:
-        other = identified_as(convention)
-        if _left(other) < _BETTER * _left(found) and is_usable(other):
-            return _simplest(OtherConvention(convention, other.score), identified_as)
+        other = trained_as(convention)
+        is_better = _left(other.score) < _BETTER * _left(found.score)
+        if is_better and is_usable(_completed(other, _tell_nobody)):
+            return _simplest(OtherConvention(convention, other.score), trained_as)
     return None
 
 
 def _simplest(
-    best: OtherConvention, identified_as: Callable[[Convention], Identified]
+    best: OtherConvention, trained_as: Callable[[Convention], _Trained]
 ) -> OtherConvention:
     """Return the convention without signs and offsets that are not needed."""
-    most = _AS_GOOD * _left(best)
+    most = _AS_GOOD * _left(best.score)
     for i in best.convention.unlike:
         for simpler in best.convention.simpler(i):
-            other = identified_as(simpler)
-            if _left(other) < most:
+            other = trained_as(simpler)
+            if _left(other.score) < most:
                 best = OtherConvention(simpler, other.score)
                 break
     return best
 
 
-def _left(found: Identified | OtherConvention) -> float:
+def _left(score: Score) -> float:
     """Return what is left of the torques held back, each joint by its own torque."""
-    return float(np.sqrt(np.mean(found.score.shares**2)))
+    return float(np.sqrt(np.mean(score.shares**2)))
 
 
 def _identified(
@@ -252,14 +263,36 @@ def _identified(
     begin: Callable[[str], None],
 ) -> Identified:
     """Return what `identify_arm` finds for the positions as they are recorded."""
+    return _completed(
+        _trained(recording, robot, effort, picked_up, find_signs, begin), begin
+    )
+
+
+def _trained(
+    recording: Recording,
+    robot: Robot,
+    effort: Effort,
+    picked_up: float | None,
+    find_signs: bool,  # noqa: FBT001
+    begin: Callable[[str], None],
+) -> _Trained:
+    """Return the arm that is fitted to a part of the recording: enough to compare others."""
     begin(CHECKING)
     problem = problem_of(recording, robot, effort, picked_up, find_signs=find_signs)
-    rows = problem.rows
-    windows = problem.windows
+    rows, windows = problem.rows, problem.windows
     begin(SELECTING)
     selected = select(rows, windows.fit, problem.G, problem.prior)
     begin(FITTING)
-    score, alone = _held_back(problem, selected)
+    trained = fitted(rows, windows.fit, problem.G, selected.prior, selected.found)
+    score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
+    return _Trained(recording, problem, selected, score)
+
+
+def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
+    """Return the arm that is fitted to all of the recording, with its intervals."""
+    recording, problem, selected, score = trained
+    rows, windows = problem.rows, problem.windows
+    each = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
     final = fitted(rows, windows.moving, problem.G, selected.prior, selected.found)
     dynamics = nearest_friction(rows, windows, final.values)
     size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
@@ -278,7 +311,7 @@ def _identified(
         left_out=doubted.torques,
         dynamics=dynamics,
         score=score,
-        alone=alone,
+        alone=errors_alone(rows, windows.test, each),
         distances=selected.distances,
         widths=selected.widths,
         still=_named(recording.joints, rows.speed < STILL),
@@ -294,16 +327,6 @@ def _identified(
         carried=problem.carried,
         compliance=compliance,
     )
-
-
-def _held_back(problem: Problem, selected: Selected) -> tuple[Score, Floats]:
-    """Return the score on torques held back from the fit, and errors (n,) of joints alone there."""
-    rows = problem.rows
-    windows = problem.windows
-    trained = fitted(rows, windows.fit, problem.G, selected.prior, selected.found)
-    score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
-    alone = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
-    return score, errors_alone(rows, windows.test, alone)
 
 
 def _compliance(
