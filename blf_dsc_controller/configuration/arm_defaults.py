@@ -135,8 +135,11 @@ def _given_gains(given: Mapping[str, Any], n: int) -> JointGains | None:
     gains = JointGains(
         *(
             np.array(given.get(f'feedback.joint_{each}', ()))
-            for each in JointGains._fields
+            for each in ('stiffness', 'damping')
         )
     )
-    is_valid = all(each.shape == (n,) and (each > 0.0).all() for each in gains)
+    is_valid = all(
+        each.shape == (n,) and (each > 0.0).all()
+        for each in (gains.stiffness, gains.damping)
+    )
     return gains if is_valid else None
