@@ -362,7 +362,9 @@ def above(name: str, count: int) -> Iterator[list[str]]:
     bands = np.geomspace(SLOWEST, SEEN, 400), np.geomspace(SEEN, fastest, 800)[1:]
     arms = [drawn_joints(study, number) for number in range(count)]
     for factor in STIFFER:
-        law = linear(measuring_gains(arm).scaled(factor), inertia, len(links))
+        law = linear(
+            measuring_gains(study.controller).scaled(factor), inertia, len(links)
+        )
         least = np.array(
             [[least_of(links, each, law, f) for f in bands] for each in arms]
         )

@@ -28,7 +28,13 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
-from blf_dsc_controller.commissioning.choice import Loops, RigidArm, _one_by_one, choose
+from blf_dsc_controller.commissioning.choice import (
+    Loops,
+    RigidArm,
+    _most,
+    _one_by_one,
+    choose,
+)
 from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
 from blf_dsc_controller.commissioning.commissioning import (
     commissioned,
@@ -592,7 +598,8 @@ def test_joint_is_raised_to_five_times_what_all_bear_or_what_it_was_measured_wit
     together, alone
 ):
     """One whose motor is guessed far too heavy does not keep the others soft."""
-    factors = _one_by_one(np.full(2, together), lambda tried: tried[1] <= together)
+    start = np.full(2, together)
+    factors = _one_by_one(start, lambda tried: tried[1] <= together, _most(start))
     assert alone / 1.1 < factors[0] <= alone
     assert factors[1] == together
 
@@ -1193,8 +1200,7 @@ def test_posture_after_one_that_nearly_oscillated_has_softer_gains(
 
 def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
     """Four times the gains of the others are too high; play and friction keep it within bounds."""
-    arm, _ = design_of(CONFIG)
-    stiff = measuring_gains(arm).scaled(4.0)
+    stiff = measuring_gains(CONFIG).scaled(4.0)
     given = {
         'feedback.joint_stiffness': tuple(stiff.stiffness.tolist()),
         'feedback.joint_damping': tuple(stiff.damping.tolist()),

@@ -53,6 +53,7 @@ class JointGains(NamedTuple):
 
     stiffness: Floats
     damping: Floats
+    damping_lag: float | Floats = 0.0  # s, of all joints or of each (n,)
 
     @property
     def rate(self) -> Floats:
@@ -66,7 +67,9 @@ class JointGains(NamedTuple):
 
     def scaled(self, factor: float | Floats) -> JointGains:
         """Return stiffness and damping times a factor."""
-        return JointGains(factor * self.stiffness, factor * self.damping)
+        return self._replace(
+            stiffness=factor * self.stiffness, damping=factor * self.damping
+        )
 
 
 def unknown_arm(motors: Floats) -> JointGains:
@@ -96,6 +99,7 @@ def linear(gains: JointGains, inertia: Floats, postures: int) -> Feedback:
         rate=_RATE * rate,
         time_constant=SURFACE,
         known_rate=True,
+        damping_lag=gains.damping_lag,
     )
 
 

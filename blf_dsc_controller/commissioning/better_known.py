@@ -35,6 +35,7 @@ ABOVE_IF_HIDDEN = 2.5
 
 _SHARE = 0.5  # of the gains that an arm bears, to measure it with
 _OF_STUCK = 2.0  # times those of the measurement: friction damps what is measured
+_GAINS = 'stiffness', 'damping'
 _NAMES = (
     'robot.coulomb',
     'robot.lag',
@@ -73,10 +74,11 @@ def better_configuration(
     By runs with `config` the parameters `found` and the `friction` (n,) [N m] are known; `start`
     are the gains of these runs.  Those of a joint that `sticks` (n,) at most double.
     """
-    chosen = np.array([found[f'feedback.joint_{each}'] for each in JointGains._fields])
-    most = np.where(sticks, _OF_STUCK * np.array(start), np.inf)
-    stiffer = np.maximum(np.minimum(_SHARE * chosen, most), np.array(start))
-    gains = dict(zip(JointGains._fields, stiffer.tolist(), strict=True))
+    before = np.array([start.stiffness, start.damping])
+    chosen = np.array([found[f'feedback.joint_{each}'] for each in _GAINS])
+    most = np.where(sticks, _OF_STUCK * before, np.inf)
+    stiffer = np.maximum(np.minimum(_SHARE * chosen, most), before)
+    gains = dict(zip(_GAINS, stiffer.tolist(), strict=True))
     values = {name: value for name, value in found.items() if name in _NAMES}
     values |= {f'feedback.joint_{each}': tuple(gains[each]) for each in gains}
     values['feedback.stiffness'] = 1.0
