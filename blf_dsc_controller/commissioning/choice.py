@@ -10,8 +10,9 @@ singular value passes zero, so every step on the way must have the margin.
 First the stiffness and damping of all joints grow together, then those of each joint by
 itself, in turns, as far as the margin allows.  Then the damping of one joint after the other
 may lag (`feedback.joint_damping_lag`), where that lets gains grow further.  A lag pays where
-encoders are at the links and motors are heavy, and costs elsewhere.  No joint pays with its
-gains for the lag of another, and a lag that gives next to nothing is none.
+encoders are at the links and motors are heavy, and costs elsewhere.  Gains of joints without a
+lag stay, since lighter joints may be limited by what is faster than the motion shows.  A lag
+that gives next to nothing is none.
 
 A rigid joint of the measured inertia and lags must have the margin, too (`RigidArm`).  What is
 measured bears more only where friction damps it, or where it is not seen.
@@ -165,10 +166,10 @@ def choose(
         return measured >= margin and is_borne(factors, lag)
 
     lag = np.zeros(n)
-    without_lag, most = _without_lag(n, partial(has_margin, lag=lag))
-    factors = without_lag
+    without_lag = factors = _without_lag(n, partial(has_margin, lag=lag))
     if has_margin(factors, lag):
-        factors, lag = _with_lags(factors, has_margin, most, lags)
+        fastest = min(each.frequency[-1] for each in loops.responses)
+        factors, lag = _with_lags(factors, has_margin, lags, fastest)
     chosen = gains(factors, lag)
     raised = factors * np.where(np.eye(n, dtype=bool), _STEP, 1.0)
     return Choice(
@@ -181,13 +182,12 @@ def choose(
     )
 
 
-def _without_lag(n: int, has_margin: Callable[[Floats], bool]) -> tuple[Floats, Floats]:
-    """Return the largest factors (n,) with the margin, and the most (n,) that any may be."""
+def _without_lag(n: int, has_margin: Callable[[Floats], bool]) -> Floats:
+    """Return the largest factors (n,) with the margin, of all joints and then of each."""
     factors = _LEAST * np.ones(n)
     while factors[0] * _STEP <= _MOST and has_margin(_STEP * factors):
         factors *= _STEP
-    most = _most(factors)
-    return _one_by_one(factors, has_margin, most), most
+    return _one_by_one(factors, has_margin, _most(factors))
 
 
 def _most(factors: Floats) -> Floats:
@@ -196,16 +196,18 @@ def _most(factors: Floats) -> Floats:
 
 
 def _with_lags(
-    factors: Floats,
+    without: Floats,
     has_margin: Callable[[Floats, Floats], bool],
-    most: Floats,
     lags: Sequence[float],
+    fastest: float,
 ) -> tuple[Floats, Floats]:
     """Return the factors (n,) that lags of the damping allow, and these lags (n,) [s].
 
-    Gains with them are raised together from small ones, for every step to have the margin.
+    Above the `fastest` frequency that is seen [Hz] a joint has no more damping than `without`
+    (n,) a lag, so without one its gains stay.  Gains with lags are raised together from small
+    ones, for every step to have the margin.
     """
-    lag = np.zeros(len(factors))
+    factors, lag = without, np.zeros(len(without))
     pays = True
     while pays:
         pays = False
@@ -214,7 +216,10 @@ def _with_lags(
             tried[j] = more
             if more <= lag[j] or not has_margin(factors, tried):
                 continue
-            grown = _one_by_one(factors, partial(has_margin, lag=tried), most)
+            most = without * np.hypot(1.0, 2.0 * np.pi * fastest * tried)
+            grown = _one_by_one(
+                factors, partial(has_margin, lag=tried), np.minimum(most, _MOST)
+            )
             gained = np.prod(grown / factors) > _STEP ** (_PAYS - 0.5)
             if gained and all(has_margin(part * grown, tried) for part in _RAISED):
                 factors, lag, pays = grown, tried, True
