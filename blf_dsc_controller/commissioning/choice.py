@@ -161,13 +161,13 @@ def choose(
     def is_borne(factors: Floats, lag: Floats) -> bool:
         return rigid.margin(gains(factors, lag), loops.inertia) >= margin
 
-    def has_margin(factors: Floats, lag: Floats) -> bool:
+    def has_margin(lag: Floats, factors: Floats) -> bool:
         measured = loops.margin(gains(factors, lag)).value
         return measured >= margin and is_borne(factors, lag)
 
     lag = np.zeros(n)
-    without_lag = factors = _without_lag(n, partial(has_margin, lag=lag))
-    if has_margin(factors, lag):
+    without_lag = factors = _without_lag(n, partial(has_margin, lag))
+    if has_margin(lag, factors):
         fastest = min(each.frequency[-1] for each in loops.responses)
         factors, lag = _with_lags(factors, has_margin, lags, fastest)
     chosen = gains(factors, lag)
@@ -214,14 +214,13 @@ def _with_lags(
         for j, more in product(range(len(factors)), lags):
             tried = lag.copy()
             tried[j] = more
-            if more <= lag[j] or not has_margin(factors, tried):
+            has_it = partial(has_margin, tried)
+            if more <= lag[j] or not has_it(factors):
                 continue
             most = without * np.hypot(1.0, 2.0 * np.pi * fastest * tried)
-            grown = _one_by_one(
-                factors, partial(has_margin, lag=tried), np.minimum(most, _MOST)
-            )
+            grown = _one_by_one(factors, has_it, np.minimum(most, _MOST))
             gained = np.prod(grown / factors) > _STEP ** (_PAYS - 0.5)
-            if gained and all(has_margin(part * grown, tried) for part in _RAISED):
+            if gained and all(has_it(part * grown) for part in _RAISED):
                 factors, lag, pays = grown, tried, True
     return factors, lag
 

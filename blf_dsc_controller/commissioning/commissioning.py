@@ -153,7 +153,9 @@ class Commissioned(NamedTuple):
         if self.coulomb is not None:
             of_arm['robot.coulomb'] = _rounded(self.coulomb)
         if self.lags or any(self.before.feedback.lags):
-            of_arm['feedback.joint_damping_lag'] = _rounded(gains.damping_lag)
+            of_arm['feedback.joint_damping_lag'] = _rounded(
+                np.asarray(gains.damping_lag)
+            )
         return {
             **of_arm,
             'robot.lag': float(f'{self.lag:.3g}'),
