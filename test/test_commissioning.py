@@ -35,6 +35,7 @@ from blf_dsc_controller.commissioning.choice import (
     RigidArm,
     _most,
     _one_by_one,
+    _with_lags,
     choose,
 )
 from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
@@ -611,6 +612,39 @@ def test_damping_does_not_lag_where_nothing_is_gained_by_it():
     for mine, other in zip(choice.gains, without.gains, strict=True):
         np.testing.assert_array_equal(mine, other)
     assert choice.margin == without.margin
+
+
+def test_only_joints_that_lag_are_raised_and_damp_no_more_above_what_is_seen():
+    """Of two joints that bear a hundred times as much if the first one lags."""
+
+    def has_margin(lag, factors):
+        return lag[1] == 0.0 and factors.prod() <= (100.0 if lag[0] else 1.0)
+
+    factors, lag = _with_lags(np.ones(2), has_margin, LAGS, 100.0)
+    assert lag.tolist() == [0.005, 0.0]
+    assert factors[1] == 1.0
+    most = abs(1.0 + 2j * np.pi * 100.0 * 0.005)
+    assert most / 1.1 < factors[0] <= most
+
+
+@pytest.mark.parametrize(
+    ('most', 'lost', 'is_chosen'),
+    [
+        (1.3, 0.0, True),
+        (1.2, 0.0, False),  # a tenth more, and no second one
+        (1.3, 0.3, False),  # between small gains and these the margin is lost
+    ],
+)
+def test_lag_is_chosen_if_it_pays_and_smaller_gains_have_the_margin(
+    most, lost, is_chosen
+):
+    def has_margin(lag, factors):
+        is_lost = lag.any() and 0.9 * lost < factors[0] < 1.1 * lost
+        return not is_lost and factors.prod() <= (most if lag.any() else 1.0)
+
+    factors, lag = _with_lags(np.ones(2), has_margin, LAGS[:1], 100.0)
+    assert lag.any() == is_chosen
+    assert (factors.prod() > 1.2) == is_chosen
 
 
 def test_chosen_lags_are_written_and_told_and_give_way_to_those_of_a_next_time():
