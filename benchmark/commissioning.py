@@ -5,6 +5,7 @@
     python -m benchmark commissioning repeat [ARMS] [STUDY ...]
     python -m benchmark commissioning careful [ARMS] [STUDY ...]
     python -m benchmark commissioning unknown [ARMS] [STUDY ...]
+    python -m benchmark commissioning lags [ARMS] [STUDY ...]
     python -m benchmark commissioning above [ARMS] [STUDY ...]
 
 The arms are those of the studies `monte_carlo_elastic_*`: gears, motors, friction, links,
@@ -43,6 +44,14 @@ presets have are left out.  With what is written each runs its motion for 16 s
     pick-up    likewise from the pick-up at 8 s on
     bears      as above
 
+`lags` chooses the gains of each arm by the same runs twice: for damping that does not lag, and
+with a lag where it pays
+
+    lag [ms]   of each joint's damping
+    stiffer    the gains, joint by joint
+    pick-up    as above, without and with these lags; - if it does not hold
+    bears      likewise
+
 `above` says whether a motion that ends at 120 Hz misses anything: the modulus margin of the true
 linear arms up to there and above, in the postures of the measurement, with gains of the preset and
 multiples of them.  Play and friction are left out.
@@ -73,14 +82,14 @@ from blf_dsc_controller.arms.linear_loop import (
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
-from blf_dsc_controller.commissioning.choice import Loops
+from blf_dsc_controller.commissioning.choice import LAGS, Loops
 from blf_dsc_controller.commissioning.commissioning import (
     Commissioned,
     commissioned,
     measuring_gains,
     postures_of,
 )
-from blf_dsc_controller.commissioning.own_loop import Commissioning
+from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -197,6 +206,17 @@ def commissioning_of(
 
     `known` returns what is known of the arm, by the configuration of the study.
     """
+    controller, measured, plant = measured_of(name, number, seed, known)
+    return commissioned(controller, measured, MARGIN), plant
+
+
+def measured_of(
+    name: str,
+    number: int,
+    seed: int | None = None,
+    known: Callable[[ControllerConfig], ControllerConfig] = lambda config: config,
+) -> tuple[ControllerConfig, list[Measured], PlantConfig]:
+    """Return what is known of an arm of a study, its runs, and its plant, as above."""
     study = load_study(name)
     controller = known(study.controller)
     # motors are drawn, which leaves nothing to scale
@@ -206,7 +226,25 @@ def commissioning_of(
     loop = LoopConfig(plant, controller, RecorderConfig())
     runs = [run for _, run in simulated.runs_of(Commissioning(controller), loop)]
     measured = [run for run in runs if not isinstance(run, BlfDscError)]
-    return commissioned(controller, measured, MARGIN), plant
+    return controller, measured, plant
+
+
+def lagging(name: str, number: int) -> list[str]:
+    """Return the row of `lags` for an arm."""
+    controller, measured, plant = measured_of(name, number)
+    without, found = (
+        commissioned(controller, measured, MARGIN, lags) for lags in ((), LAGS)
+    )
+    choice = found.choice
+    row = [
+        ', '.join(f'{1e3 * each:g}' for each in np.asarray(choice.gains.damping_lag)),
+        ', '.join(f'{each:.2f}' for each in choice.factors / choice.without_lag),
+    ]
+    free = [without_bound(each.config) for each in (without, found)]
+    errors = (worked(each, plant, LONG)[1] for each in free)
+    row.append(', '.join('-' if np.isnan(e) else f'{e:.1f}' for e in errors))
+    row.append(', '.join(f'{borne(each, plant):g}' for each in free))
+    return [name.rpartition('_')[2], f'{number}', *row]
 
 
 _STATED = (
@@ -362,7 +400,9 @@ def above(name: str, count: int) -> Iterator[list[str]]:
     bands = np.geomspace(SLOWEST, SEEN, 400), np.geomspace(SEEN, fastest, 800)[1:]
     arms = [drawn_joints(study, number) for number in range(count)]
     for factor in STIFFER:
-        law = linear(measuring_gains(arm).scaled(factor), inertia, len(links))
+        law = linear(
+            measuring_gains(study.controller).scaled(factor), inertia, len(links)
+        )
         least = np.array(
             [[least_of(links, each, law, f) for f in bands] for each in arms]
         )
@@ -414,6 +454,7 @@ def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
 
 HEADS = {
     'repeat': ['arm', 'number', 'times', 'stiffness chosen', 'inertia measured'],
+    'lags': ['arm', 'number', 'lag [ms]', 'stiffer', 'pick-up [mrad]', 'bears'],
     'careful': ['arm', 'number', 'noise', 'margin', 'here', 'holds'],
     'unknown': ['arm', 'number', 'hidden', 'bound', 'motion', 'pick-up', 'bears'],
     'above': [
@@ -427,7 +468,7 @@ HEADS = {
         'least above',
     ],
 }
-ROWS = {'repeat': repeated, 'careful': careful, 'unknown': unknown}
+ROWS = {'lags': lagging, 'repeat': repeated, 'careful': careful, 'unknown': unknown}
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

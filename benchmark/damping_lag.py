@@ -8,13 +8,13 @@
     python -m benchmark damping-lag presets [--lag 0.003]
 
 The margins are those of the linear loop of the arm in the middle of the study of
-`random-arms`, with encoders at its links and at its motors.  Those of `motors` are of presets
-with motors of several times the controller's guess, those of `drawn` of arms of that study,
-both also with a lag on the damping of the first three joints alone, which the law does not
-have.  Arms are random ones of the study, by default those that oscillate although the
-published gains hold, and three calm ones.  Presets pick up the 3 kg of `ur5e`, or 2 kg, with
-motors of several times the controller's guess, encoders at either side, and play.  Errors
-[mrad] are the largest in motion, from the pick-up on, and from 3 s later on.
+`random-arms`, with encoders at its links and at its motors. Those of `motors` are of
+presets with motors of several times the controller's guess, those of `drawn` of arms of
+that study, both also with a lag on the damping of the first three joints alone. Arms are
+random ones of the study, by default those that oscillate although the published gains hold,
+and three calm ones. Presets pick up the 3 kg of `ur5e`, or 2 kg, with motors of several
+times the controller's guess, encoders at either side, and play. Errors [mrad] are the
+largest in motion, from the pick-up on, and from 3 s later on.
 """
 
 from __future__ import annotations

@@ -25,10 +25,19 @@ from blf_dsc_controller.arms.linear_loop import (
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.cli.commission import _lags as lags_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
-from blf_dsc_controller.commissioning.choice import Loops, RigidArm, _one_by_one, choose
+from blf_dsc_controller.commissioning.choice import (
+    LAGS,
+    Loops,
+    RigidArm,
+    _most,
+    _one_by_one,
+    _with_lags,
+    choose,
+)
 from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
 from blf_dsc_controller.commissioning.commissioning import (
     commissioned,
@@ -43,7 +52,7 @@ from blf_dsc_controller.commissioning.motion import (
     lines_in,
 )
 from blf_dsc_controller.commissioning.own_loop import REPEATS
-from blf_dsc_controller.commissioning.page import errors_table, sentences
+from blf_dsc_controller.commissioning.page import errors_table, sentences, table
 from blf_dsc_controller.commissioning.postures import PostureByPosture
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.response import (
@@ -54,7 +63,7 @@ from blf_dsc_controller.commissioning.response import (
     response_of,
 )
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
-from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop, read
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -539,8 +548,6 @@ def test_what_is_no_commissioning_is_refused():
             build(ControllerConfig, {**ROBOT, 'feedback.inertia': 'whole'}),
             POSTURE[None],
         )
-    with pytest.raises(BlfDscError, match=r'feedback\.damping_lag: got 0\.003 s'):
-        plan(change(CONFIG, {'feedback.damping_lag': 0.003}), POSTURE[None])
     with pytest.raises(BlfDscError, match=r'joint2 would be at 6\.25 rad'):
         plan(CONFIG, np.array([[0.0, 6.25]]))
     with pytest.raises(BlfDscError, match=r'robot\.urdf: got none'):
@@ -556,6 +563,132 @@ def test_no_gains_have_a_margin_if_noise_hides_the_response():
     assert choice.margin.value < 0.5
     assert (choice.factors < 0.1).all()
     assert not choice.by_inertia.any()
+
+
+def linear_arm(*, motor_side):
+    """Return the linear arm with encoders at links or motors, and what is seen of it."""
+    (response,) = found().responses
+    loop = true_loop(found().start, found().loops.inertia)
+    loop = loop._replace(joints=loop.joints._replace(motor_side=motor_side))
+    s = 2j * np.pi * response.frequency
+    G = arm_response(loop.links, loop.joints, TIMING, s)[0]
+    differenced = (1.0 - np.exp(-1e-3 * s))[:, None, None] / 1e-3 * G
+    exact = response._replace(
+        position=G,
+        velocity=differenced,
+        position_noise=0.0 * response.position_noise,
+        velocity_noise=0.0 * response.velocity_noise,
+    )
+    return loop, found().loops._replace(responses=[exact])
+
+
+def test_damping_lags_where_gains_gain_by_it_and_the_true_loop_has_the_margin():
+    """Encoders beyond gears that give way, and heavy motors; 0.06 are between lines at 24 Hz."""
+    loop, loops = linear_arm(motor_side=False)
+    start = found().start
+    given = loops, start, start.scaled, true_rigid_arm()
+    choice, without = choose(*given), choose(*given, lags=())
+    np.testing.assert_array_equal(choice.without_lag, without.factors)
+    assert not without.gains.damping_lag.any()
+    assert set(choice.gains.damping_lag) <= {0.0, *LAGS}
+    raised = choice.factors / without.factors
+    assert raised.min() >= 1.0
+    assert raised.prod() > 2.0
+    assert choice.margin.value >= 0.5
+    of = linear(choice.gains, loops.inertia, 1)
+    true = loop._replace(feedback=of).margin().value
+    assert true == pytest.approx(choice.margin.value, abs=0.06)
+    at_once = of._replace(damping_lag=0.0)
+    assert loop._replace(feedback=at_once).margin().value < 0.85 * true
+
+
+def test_damping_does_not_lag_where_nothing_is_gained_by_it():
+    """Encoders at the motors: gains are those of a choice that knows no lag."""
+    _, loops = linear_arm(motor_side=True)
+    start = found().start
+    given = loops, start, start.scaled, true_rigid_arm()
+    choice, without = choose(*given), choose(*given, lags=())
+    assert not choice.gains.damping_lag.any()
+    for mine, other in zip(choice.gains, without.gains, strict=True):
+        np.testing.assert_array_equal(mine, other)
+    assert choice.margin == without.margin
+
+
+def test_only_joints_that_lag_are_raised_and_damp_no_more_above_what_is_seen():
+    """Of two joints that bear a hundred times as much if the first one lags."""
+
+    def has_margin(lag, factors):
+        return lag[1] == 0.0 and factors.prod() <= (100.0 if lag[0] else 1.0)
+
+    factors, lag = _with_lags(np.ones(2), has_margin, LAGS, 100.0)
+    assert lag.tolist() == [0.005, 0.0]
+    assert factors[1] == 1.0
+    most = abs(1.0 + 2j * np.pi * 100.0 * 0.005)
+    assert most / 1.1 < factors[0] <= most
+
+
+@pytest.mark.parametrize(
+    ('most', 'lost', 'is_chosen'),
+    [
+        (1.3, 0.0, True),
+        (1.2, 0.0, False),  # a tenth more, and no second one
+        (1.3, 0.3, False),  # between small gains and these the margin is lost
+    ],
+)
+def test_lag_is_chosen_if_it_pays_and_smaller_gains_have_the_margin(
+    most, lost, is_chosen
+):
+    def has_margin(lag, factors):
+        is_lost = lag.any() and 0.9 * lost < factors[0] < 1.1 * lost
+        return not is_lost and factors.prod() <= (most if lag.any() else 1.0)
+
+    factors, lag = _with_lags(np.ones(2), has_margin, LAGS[:1], 100.0)
+    assert lag.any() == is_chosen
+    assert (factors.prod() > 1.2) == is_chosen
+
+
+def test_chosen_lags_are_written_and_told_and_give_way_to_those_of_a_next_time():
+    seen = found()
+    lags = (0.005, 0.0)
+    gains = seen.choice.gains._replace(damping_lag=np.array(lags))
+    choice = seen.choice._replace(
+        gains=gains, factors=np.array([1.5, 0.8]), without_lag=np.array([0.75, 0.64])
+    )
+    lagging = seen._replace(choice=choice)
+    assert lagging.parameters()['feedback.joint_damping_lag'] == lags
+    np.testing.assert_array_equal(
+        settings_of_config(lagging.config).feedback.damping_lag, lags
+    )
+    told = '\n'.join(sentences(lagging))
+    assert 'the damping of joint1 5 ms lags (feedback.joint_damping_lag)' in told
+    assert 'is 1.25 to 2 times what it would be without' in told
+    first, second = table(lagging).splitlines()[-2:]
+    assert (first.split()[-1], second.split()[-1]) == ('5', '-')
+    none = choice._replace(gains=gains._replace(damping_lag=np.zeros(2)))
+    written = seen._replace(choice=none)
+    assert 'feedback.joint_damping_lag' not in written.parameters()
+    assert 'lags' not in '\n'.join(sentences(written))
+    again = written._replace(before=lagging.config)
+    assert again.parameters()['feedback.joint_damping_lag'] == (0.0, 0.0)
+    assert not again.config.feedback.joint_damping_lag[0]
+
+
+def test_arm_whose_damping_lags_is_measured_as_any_other():
+    """Its margin as measured is that with the lag; what is chosen does not depend on it."""
+    late = change(CONFIG, {'feedback.damping_lag': 0.003})
+    (motion,) = plan(late, POSTURE[None])
+    seen = commissioned(late, [simulated.measured(motion, ARM)])
+    np.testing.assert_array_equal(seen.start.damping_lag, (0.003, 0.003))
+    assert seen.choice.measured.value > 1.1 * found().choice.measured.value
+    np.testing.assert_allclose(
+        seen.choice.gains.damping, found().choice.gains.damping, rtol=0.11
+    )
+
+
+def test_motors_that_close_the_feedback_are_given_no_lag(tmp_path):
+    """They damp at once, and refuse one."""
+    assert lags_of(share_folder() / 'config' / 'yam.yaml') == ()
+    assert lags_of(file_of_arm(tmp_path)) == LAGS
 
 
 def true_rigid_arm():
@@ -592,7 +725,8 @@ def test_joint_is_raised_to_five_times_what_all_bear_or_what_it_was_measured_wit
     together, alone
 ):
     """One whose motor is guessed far too heavy does not keep the others soft."""
-    factors = _one_by_one(np.full(2, together), lambda tried: tried[1] <= together)
+    start = np.full(2, together)
+    factors = _one_by_one(start, lambda tried: tried[1] <= together, _most(start))
     assert alone / 1.1 < factors[0] <= alone
     assert factors[1] == together
 
@@ -1193,8 +1327,7 @@ def test_posture_after_one_that_nearly_oscillated_has_softer_gains(
 
 def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
     """Four times the gains of the others are too high; play and friction keep it within bounds."""
-    arm, _ = design_of(CONFIG)
-    stiff = measuring_gains(arm).scaled(4.0)
+    stiff = measuring_gains(CONFIG).scaled(4.0)
     given = {
         'feedback.joint_stiffness': tuple(stiff.stiffness.tolist()),
         'feedback.joint_damping': tuple(stiff.damping.tolist()),

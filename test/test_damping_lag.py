@@ -43,12 +43,26 @@ def amplitude(values, s):
     return complex(found[0], found[1])
 
 
+def of_joints(*lags):
+    """Return the parameter of lags of joints [s]."""
+    return {'feedback.joint_damping_lag': list(lags)}
+
+
 @pytest.mark.parametrize('hertz', [8.0, 25.0, 40.0])
 @pytest.mark.parametrize('of_velocity', [False, True])
+@pytest.mark.parametrize(
+    'lags',
+    [
+        {},
+        of_joints(0.0, 0.0, 0.0, 0.005, 0.0, 0.0),
+        of_joints(0.005, 0.005, 0.005, 0.0, 0.0, 0.0),
+    ],
+)
 def test_the_law_has_the_frequency_response_of_its_linear_form(
-    config, hertz, of_velocity
+    config, hertz, of_velocity, lags
 ):
     """One joint of the compiled law is shaken by 1 urad, or by 1 mrad/s."""
+    config = change(config, lags)
     law = controller_of(config)
     qr, n = np.array(config.reference.offset), 6
     s = 2j * np.pi * hertz
@@ -65,6 +79,28 @@ def test_the_law_has_the_frequency_response_of_its_linear_form(
     C = law_responses(form, T, np.array([s]))[of_velocity][0, 0]
     found = amplitude(np.array(torques[500:]), s) * np.exp(-s * 500 * T)
     assert found / size == pytest.approx(-C[SHAKEN, SHAKEN], rel=1e-5)
+
+
+def test_joints_have_the_torques_of_laws_that_have_their_lag_at_all_joints(config):
+    """Bit for bit, for a motion in which all joints move."""
+    rng = np.random.default_rng(1)
+    measured = np.concatenate((config.reference.offset, np.zeros(12)))
+    moved = measured + 1e-4 * rng.standard_normal((200, 18))
+
+    def torques(lags):
+        law = controller_of(change(config, lags))
+        return np.array(
+            [law.update(LATE + k * T, T, row).copy() for k, row in enumerate(moved)]
+        )
+
+    some = torques(of_joints(0.003, 0.0, 0.005, 0.0, 0.0, 0.003))
+    for lag, joints in ((0.003, [0, 5]), (0.0, [1, 3, 4]), (0.005, [2])):
+        alike = torques({'feedback.damping_lag': lag})
+        np.testing.assert_array_equal(some[:, joints], alike[:, joints])
+        others = np.delete(np.arange(6), joints)
+        assert (some[1:, others] != alike[1:, others]).any(axis=0).all()
+    same = torques(of_joints(*(0.003,) * 6))
+    np.testing.assert_array_equal(same, torques({'feedback.damping_lag': 0.003}))
 
 
 def test_the_lag_begins_anew_with_the_first_sample_of_a_start(config):

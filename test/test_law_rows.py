@@ -113,7 +113,7 @@ FEEDBACK = feedback.Settings(
     damping_rate=5.0,
     follows_inertia=0,
     decoupled=0,
-    damping_lag=0.0,
+    damping_lag=np.zeros(2),
     lags=0,
 )
 
@@ -141,16 +141,18 @@ def test_the_robust_term_does_not_lag(late, joint, torque):
 
 
 @pytest.mark.parametrize(
-    ('lag', 'begins', 'samples', 'share'),
+    ('lags', 'begins', 'samples', 'share'),
     [
-        (0.0, False, 1, 1.0),  # no lag
-        (0.003, True, 1, 1.0),  # it begins with the first sample
-        (0.003, False, 1, 1.0 - np.exp(-1.0 / 3.0)),
-        (0.003, False, 6, 1.0 - np.exp(-2.0)),
+        ([0.0, 0.0], False, 1, 1.0),  # no lag
+        ([0.003, 0.003], True, 1, 1.0),  # it begins with the first sample
+        ([0.003, 0.003], False, 1, 1.0 - np.exp(-1.0 / 3.0)),
+        ([0.003, 0.003], False, 6, 1.0 - np.exp(-2.0)),
+        ([0.003, 0.0], False, 6, [1.0 - np.exp(-2.0), 1.0]),
+        ([0.006, 0.003], False, 6, 1.0 - np.exp([-1.0, -2.0])),
     ],
 )
-def test_damping_follows_a_step_of_the_velocity_error(lag, begins, samples, share):
-    of = FEEDBACK._replace(damping_lag=lag, lags=int(lag > 0.0))
+def test_damping_follows_a_step_of_the_velocity_error(lags, begins, samples, share):
+    of = FEEDBACK._replace(damping_lag=np.array(lags), lags=int(any(lags)))
     first, then = np.array([0.1, -0.2]), np.array([0.5, 0.2])
     state = feedback.State(late=first[: 2 * of.lags].copy())
     for _ in range(samples):

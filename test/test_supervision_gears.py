@@ -125,6 +125,17 @@ def test_given_gains_of_joints_are_used_and_scaled():
         ),
         ({'feedback.damping_lag': -0.001}, 'feedback.damping_lag: got -0.001'),
         (
+            {
+                'feedback.inertia': 'whole',
+                'feedback.joint_damping_lag': [0.0, 0.005, 0.0, 0.0, 0.0, 0.0],
+            },
+            'feedback.joint_damping_lag: got 0.005 s, which is the lag of feedback.gain alone',
+        ),
+        (
+            {'feedback.joint_damping_lag': [0.003]},
+            'feedback.joint_damping_lag: got 1, but 6 entries are needed',
+        ),
+        (
             GAINS | {'feedback.joint_damping': [60.0] * 5 + [0.0]},
             'got 0 for a joint, but each must be above 0',
         ),

@@ -56,11 +56,12 @@ GIVEN = 'stiffness', 'damping'
 
 
 class JointGains(NamedTuple):
-    """Stiffness and damping of each joint's feedback, and the largest share of its integral."""
+    """What each joint's feedback follows from."""
 
     stiffness: Floats  # (n,) N m/rad
     damping: Floats  # (n,) N m s/rad
-    share: float = ALONE
+    damping_lag: float | Floats = 0.0  # s, of all joints or of each (n,)
+    share: float = ALONE  # c of the integral, at most
 
     @property
     def rate(self) -> Floats:
@@ -111,6 +112,7 @@ def linear(gains: JointGains, inertia: Floats, postures: int) -> Feedback:
         rate=_RATE * rate,
         time_constant=SURFACE,
         known_rate=True,
+        damping_lag=gains.damping_lag,
     )
 
 

@@ -16,6 +16,7 @@ from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.commissioning import files, page, simulated
+from blf_dsc_controller.commissioning.choice import LAGS
 from blf_dsc_controller.commissioning.commissioning import Commissioned
 from blf_dsc_controller.commissioning.own_loop import (
     Commissioning,
@@ -25,8 +26,10 @@ from blf_dsc_controller.commissioning.own_loop import (
 from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
+    DRIVE,
     dump,
     load,
     load_loop,
@@ -64,6 +67,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         torque=options.torque,
         travel=options.travel,
         margin=options.margin,
+        lags=_lags(path),
     )
     if options.prove:
         return _prove_on_robot(options, path, commissioning)
@@ -93,6 +97,12 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
     if not (options.bags or options.robot or options.ros):
         _prove(options.out)
     return 0
+
+
+def _lags(path: Path) -> Sequence[float]:
+    """Return the lags of the damping to try [s]: motors that close the feedback have none."""
+    in_motors = load(path, DRIVE, DriveConfig).feedback == 'motor'
+    return () if in_motors else LAGS
 
 
 def _check(options: Namespace) -> None:

@@ -24,6 +24,7 @@ from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.better_known import as_measured, known_friction
 from blf_dsc_controller.commissioning.choice import (
     BARELY,
+    LAGS,
     MARGIN,
     Choice,
     Loops,
@@ -106,6 +107,11 @@ class Commissioned(NamedTuple):
         return self.choice.margin.value >= self.aim
 
     @property
+    def lags(self) -> bool:
+        """Whether the damping of a joint is to lag."""
+        return bool(np.any(self.choice.gains.damping_lag))
+
+    @property
     def why_no_margin(self) -> str:
         """Why no gains may have the margin, and what to do."""
         own = self.loops.margin(self.start, noise=False)
@@ -151,6 +157,10 @@ class Commissioned(NamedTuple):
             of_arm['robot.rotor_inertia'] = _rounded(self.rotors)
         if self.coulomb is not None:
             of_arm['robot.coulomb'] = _rounded(self.coulomb)
+        if self.lags or any(self.before.feedback.lags):
+            of_arm['feedback.joint_damping_lag'] = _rounded(
+                np.asarray(gains.damping_lag)
+            )
         return {
             **of_arm,
             'robot.lag': float(f'{self.lag:.3g}'),
@@ -199,9 +209,8 @@ def plan(
     `sliding` adds swings that keep joints sliding which would stick without.  The arm has a
     `share` of the gains of the configuration.
 
-    Raises BlfDscError if the arm is not from a URDF; if its feedback acts through the
-    inertia matrix, which may make an arm with elastic joints unstable; or if its damping
-    lags, which the choice of gains does not model.
+    Raises BlfDscError if the arm is not from a URDF, or if its feedback acts through the
+    inertia matrix, which may make an arm with elastic joints unstable.
     """
     if config.model != 'urdf':
         raise BlfDscError(
@@ -211,11 +220,6 @@ def plan(
         raise BlfDscError(
             f'feedback.inertia: got {config.feedback.inertia}, but an arm is measured with '
             'gains of its joints, each on its own: give none'
-        )
-    if config.feedback.damping_lag > 0.0:
-        raise BlfDscError(
-            f'feedback.damping_lag: got {config.feedback.damping_lag:g} s, but the margin of gains '
-            'that are chosen is that of damping which does not lag: give 0.0'
         )
     gains = _softer(config, share)
     arm = with_gains(config, gains) if gains else config
@@ -233,8 +237,7 @@ def _softer(config: ControllerConfig, share: float) -> dict[str, Value]:
     """Return a share of the gains of the measurement, by dotted name: none, if it is all."""
     if share == 1.0:
         return {}
-    arm, _ = design_of(config)
-    gains = measuring_gains(arm).scaled(share)
+    gains = measuring_gains(config).scaled(share)
     return {
         'feedback.joint_stiffness': tuple(gains.stiffness.tolist()),
         'feedback.joint_damping': tuple(gains.damping.tolist()),
@@ -246,10 +249,12 @@ def commissioned(
     config: ControllerConfig,
     runs: Sequence[tuple[Run, ControllerConfig]],
     margin: float = MARGIN,
+    lags: Sequence[float] = LAGS,
 ) -> Commissioned:
     """Return what runs of `plan` show, each with the configuration that it had.
 
-    `margin` is the modulus margin that the gains are chosen for.
+    `margin` is the modulus margin that the gains are chosen for, `lags` [s] are those of the
+    damping that are tried.
 
     Raises BlfDscError if a run is not one of its motions, or has a stop.
     """
@@ -262,7 +267,7 @@ def commissioned(
     assumed = _assumed_inertia(arm, responses)
     inertia = _largest_inertia(arm, found, assumed)
     loops = Loops(responses, inertia, T)
-    start = measuring_gains(arm)
+    start = measuring_gains(measured)
     rigid = RigidArm(_least(found.inertias, assumed), found.timing(T, arm.lag))
     by_factors = _gains_by_factors(config, start, inertia)
     return Commissioned(
@@ -270,7 +275,7 @@ def commissioned(
         responses=responses,
         loops=loops,
         start=start,
-        choice=choose(loops, start, by_factors, rigid, margin),
+        choice=choose(loops, start, by_factors, rigid, margin, lags),
         findings=found,
         assumed=assumed.max(axis=0),
         rotors=_rotors(config, arm, found, assumed),
@@ -380,10 +385,12 @@ def _unseen(found: Findings, assumed: Floats) -> Floats:
     return np.asarray(np.where(np.isnan(found.inertia), beyond, 0.0))
 
 
-def measuring_gains(arm: Design) -> JointGains:
+def measuring_gains(config: ControllerConfig) -> JointGains:
     """Return the gains with which an arm is measured."""
+    arm, _ = design_of(config)
     gains = arm.joints or unknown_arm(arm.rotors)
-    return gains.scaled(arm.stiffness)._replace(share=BESIDE)
+    lag = np.array(config.feedback.lags)
+    return gains.scaled(arm.stiffness)._replace(damping_lag=lag, share=BESIDE)
 
 
 def _check_posture(config: ControllerConfig, posture: Floats) -> None:

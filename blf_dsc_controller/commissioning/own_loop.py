@@ -20,7 +20,7 @@ from blf_dsc_controller.commissioning.better_known import (
     better_configuration,
     is_known_by_urdf_only,
 )
-from blf_dsc_controller.commissioning.choice import MARGIN
+from blf_dsc_controller.commissioning.choice import LAGS, MARGIN
 from blf_dsc_controller.commissioning.commissioning import (
     TORQUE,
     TRAVEL,
@@ -78,6 +78,7 @@ class Commissioning:
         torque: float = TORQUE,
         travel: float = TRAVEL,
         margin: float = MARGIN,
+        lags: Sequence[float] = LAGS,
     ) -> None:
         """Prepare the motions for a configuration, file or preset.
 
@@ -87,6 +88,7 @@ class Commissioning:
             torque: of a first motion, rms, as a share of the rated torque, at most.
             travel: how far the tool moves from its middle, at most [m].
             margin: modulus margin of the gains.
+            lags: lags of the damping that are tried, joint by joint [s]; empty: none.
 
         Raises:
             ConfigurationError: with all problems of the file.
@@ -95,6 +97,7 @@ class Commissioning:
             config = load(locate(config), CONTROLLER, ControllerConfig)
         self.config = config
         self.margin = margin
+        self._lags = lags
         self.measured_with = config
         self.slides = False
         self.share = 1.0
@@ -199,7 +202,8 @@ class Commissioning:
         """
         if not self.anew_left:
             return None
-        found = commissioned(self.config, [(run, motion.config)], self.margin)
+        # the next measurement has no lag either
+        found = commissioned(self.config, [(run, motion.config)], self.margin, ())
         hidden = np.isnan(found.findings.inertia)
         if found.choice.factors.max() <= (
             ABOVE_IF_HIDDEN if hidden.any() else FAR_ABOVE
@@ -250,7 +254,7 @@ class Commissioning:
         measured = [
             each if isinstance(each, tuple) else measured_in(each) for each in runs
         ]
-        return commissioned(self.config, measured, self.margin)
+        return commissioned(self.config, measured, self.margin, self._lags)
 
 
 def measured_in(bag: str | Path) -> Measured:

@@ -58,6 +58,7 @@ def table(found: Commissioned) -> str:
         'resonance',
         'stiffness',
         'damping',
+        'its lag',
     )
     units = (
         '',
@@ -68,11 +69,13 @@ def table(found: Commissioned) -> str:
         'Hz',
         'N m/rad',
         'N m s/rad',
+        'ms',
     )
     measured = ('measured',) * 3
-    above = ('', 'measured', '', *measured, 'chosen', 'chosen')
+    above = ('', 'measured', '', *measured, *('chosen',) * 3)
     rows: list[Sequence[str]] = [heads, above, units]
     gains = found.choice.gains
+    lags = np.broadcast_to(gains.damping_lag, gains.damping.shape)
     for j, joint in enumerate(found.joints):
         peaks = [
             each.frequency for each in found.findings.resonances if each.joint == j
@@ -87,6 +90,7 @@ def table(found: Commissioned) -> str:
                 f'{min(peaks):.0f}' if peaks else '-',
                 f'{gains.stiffness[j]:.3g}',
                 f'{gains.damping[j]:.3g}',
+                f'{1e3 * lags[j]:g}' if lags[j] else '-',
             )
         )
     return aligned(rows)
@@ -98,6 +102,7 @@ def sentences(found: Commissioned) -> Iterator[str]:
     yield from _of_hidden(found)
     yield from _of_friction(found)
     yield from _of_margin(found)
+    yield from _of_lags(found)
     yield from _of_factors(found)
     if found.has_margin:
         yield f'errors to expect with these gains: {expectation(found.config)}'
@@ -152,6 +157,26 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
             f'noise costs {doubt:.2g} of the margin: a larger --torque may show that the arm '
             'bears more'
         )
+
+
+def _of_lags(found: Commissioned) -> Iterator[str]:
+    """Yield whose damping lags, and what the gains owe to that."""
+    if not found.lags:
+        return
+    choice = found.choice
+    lags = ', '.join(
+        f'{joint} {1e3 * lag:g} ms'
+        for joint, lag in zip(
+            found.joints, np.asarray(choice.gains.damping_lag), strict=True
+        )
+        if lag
+    )
+    raised = choice.factors / choice.without_lag
+    yield (
+        f'the damping of {lags} lags (feedback.joint_damping_lag): it drives resonances less, '
+        f'and with the same margin the damping of the joints is {raised.min():.3g} to '
+        f'{raised.max():.3g} times what it would be without'
+    )
 
 
 def _of_factors(found: Commissioned) -> Iterator[str]:

@@ -54,7 +54,7 @@ def shown_by(run: Run, config: ControllerConfig) -> Shown:
     arm, _ = design_of(config)
     P = arm.parameters.of(arm.chain.inertias, arm.rotors)
     (M,) = inertia_matrices(arm.parameters.model, P, response.posture[None])
-    gains = measuring_gains(arm)
+    gains = measuring_gains(config)
     loops = Loops((response,), np.diagonal(M), config.sample_time)
     clean = loops.margin(gains, noise=False).value
     taken = clean - loops.margin(gains).value

@@ -248,9 +248,10 @@ class ControllerConfig(ArmConfig):
                 f'feedback.damping_rate: got {feedback.damping_rate:g} 1/s, which acts through '
                 'the inertia matrix, with feedback.inertia none: give feedback.joint_damping'
             )
-        if feedback.damping_lag > 0.0 and feedback.damping_rate > 0.0:
+        if any(feedback.lags) and feedback.damping_rate > 0.0:
+            name = 'joint_damping_lag' if feedback.joint_damping_lag else 'damping_lag'
             yield (
-                f'feedback.damping_lag: got {feedback.damping_lag:g} s, which is the lag of '
+                f'feedback.{name}: got {max(feedback.lags):g} s, which is the lag of '
                 f'feedback.gain alone, with a feedback.damping_rate of {feedback.damping_rate:g} '
                 '1/s: set one of them to 0'
             )

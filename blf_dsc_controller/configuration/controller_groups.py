@@ -260,6 +260,13 @@ class Feedback:
         's',
         read_only='it sets the size of the state of the law',
     )
+    joint_damping_lag: PerJoint = non_negative(
+        (),
+        'the same of each joint, instead of damping_lag; empty: damping_lag of all',
+        's',
+        read_only='it sets the size of the state of the law',
+        omittable=True,
+    )
     damping_rate: float = non_negative(
         0.0,
         'rate of damping, scaled by the inertia of learning.initial_estimate',
@@ -269,6 +276,11 @@ class Feedback:
     robust_gain: PerJoint = non_negative(
         (0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
     )
+
+    @property
+    def lags(self) -> tuple[float, ...]:
+        """Lag of the damping of each joint [s]."""
+        return self.joint_damping_lag or (self.damping_lag,) * len(self.gain)
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,8 @@ def _feedback(config: ControllerConfig) -> feedback.Settings:
         config.feedback,
         follows_inertia=int(_follows_inertia(config)),
         decoupled=int(config.feedback.inertia == 'none'),
-        lags=int(config.feedback.damping_lag > 0.0),
+        damping_lag=np.array(config.feedback.lags),
+        lags=int(any(config.feedback.lags)),
     )
 
 

@@ -8,8 +8,8 @@ a_f is the acceleration that the model is given (see `compensation`), where damp
 the torque tau_c by the error act through the inertia matrix of the initial estimate.
 
 Between the resonance of a link behind its gear and that of link and motor, damping by an
-encoder at the link drives what it should damp.  So K_p xi2 may pass a lag, which acts there
-alone: the rest of the torque is small at those frequencies.
+encoder at the link drives what it should damp.  So K_p xi2 of a joint may pass a lag, which
+acts there alone: the rest of the torque is small at those frequencies.
 """
 
 from typing import Annotated, NamedTuple
@@ -29,14 +29,15 @@ class Settings(NamedTuple):
     damping_rate: float
     follows_inertia: int  # 1: barrier and d^3 act through M(q, P^(0)) / m
     decoupled: int  # 1: no feedback acts through M(q, P^(0))
-    damping_lag: float  # of K_p xi2, s; 0: none
-    lags: int  # 1: there is one
+    damping_lag: Annotated[Array, 'n']  # of K_p xi2, s; 0: none
+    lags: int  # 1: a joint has one
 
 
 class State(NamedTuple):
     """What it keeps from one sample to the next."""
 
-    late: Annotated[Array, 'n * feedback.lags']  # xi2 behind the lag, rad/s
+    # xi2 behind the lags, rad/s; 0 of a joint without one
+    late: Annotated[Array, 'n * feedback.lags']
 
 
 class Work(NamedTuple):
@@ -50,18 +51,17 @@ class Work(NamedTuple):
 def advance(
     settings: Settings, state: State, xi2: Array, begins: bool, dt: float
 ) -> None:
-    """Pass xi2 (n,) [rad/s] of a sample, `dt` [s] after the last, through the lag."""
-    if settings.lags == 0:
-        return
-    gain = 1.0 if begins else filter_gain(settings.damping_lag, dt)
+    """Pass xi2 (n,) [rad/s] of a sample, `dt` [s] after the last, through the lags."""
     for i in range(xi2.size):
-        state.late[i] += gain * (xi2[i] - state.late[i])
+        if settings.damping_lag[i] > 0.0:
+            gain = 1.0 if begins else filter_gain(settings.damping_lag[i], dt)
+            state.late[i] += gain * (xi2[i] - state.late[i])
 
 
 @inner
 def damped(settings: Settings, state: State, xi2: Array, i: int) -> float:
     """Return what K_p damps of joint i [rad/s]: its xi2, behind the lag if there is one."""
-    return float(state.late[i] if settings.lags == 1 else xi2[i])
+    return float(state.late[i] if settings.damping_lag[i] > 0.0 else xi2[i])
 
 
 @inner

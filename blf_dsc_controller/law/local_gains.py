@@ -70,11 +70,12 @@ class LocalGains:
                 f'the feedback of {type(controller.law).__name__}, a law of a file, is not '
                 'known: let the host close it'
             )
-        if controller.settings.feedback.lags == 1:
+        feedback = controller.settings.feedback
+        if feedback.lags == 1:
             raise BlfDscError(
-                f'feedback.damping_lag: got {controller.settings.feedback.damping_lag:g} s, but '
-                'motors that close the feedback damp without a lag: set it to 0, or '
-                'drive.feedback: host'
+                f'feedback.damping_lag: got {feedback.damping_lag.max():g} s, but motors that '
+                'close the feedback damp without a lag: set it to 0, drop '
+                'feedback.joint_damping_lag, or set drive.feedback: host'
             )
         self._gains = np.zeros((2, controller.settings.n))
         self._arguments = (
