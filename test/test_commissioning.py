@@ -954,9 +954,9 @@ def at_the_tool(**given):
 
 
 def stiff(before, friction=None):
-    """Return the commissioning of an arm that bears twenty times the gains, for a file."""
+    """Return the commissioning of an arm that bears ten times the gains, for a file."""
     seen = found()
-    choice = seen.choice._replace(gains=seen.choice.gains.scaled(20.0))
+    choice = seen.choice._replace(gains=seen.choice.gains.scaled(10.0))
     friction = seen.friction if friction is None else np.array(friction)
     return seen._replace(before=before, choice=choice, friction=friction)
 
