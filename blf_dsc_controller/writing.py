@@ -49,7 +49,8 @@ def try_out(path: Path) -> None:
     except OSError as error:
         error.filename = str(path)
         raise
-    remove(part)
+    finally:
+        remove(part)
 
 
 def remove(path: Path) -> None:

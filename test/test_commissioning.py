@@ -953,10 +953,16 @@ def at_the_tool(**given):
     return {**GIVEN, **own, **values, **given}
 
 
+@cache
+def at_once():
+    """Return what the simulated arm shows, with gains for damping that does not lag."""
+    return commissioned(CONFIG, [simulated.measured(planned(), ARM)], lags=())
+
+
 def stiff(before, friction=None):
-    """Return the commissioning of an arm that bears ten times the gains, for a file."""
-    seen = found()
-    choice = seen.choice._replace(gains=seen.choice.gains.scaled(10.0))
+    """Return the commissioning of an arm that bears twenty times the gains, for a file."""
+    seen = at_once()
+    choice = seen.choice._replace(gains=seen.choice.gains.scaled(20.0))
     friction = seen.friction if friction is None else np.array(friction)
     return seen._replace(before=before, choice=choice, friction=friction)
 
