@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
@@ -49,8 +49,9 @@ def try_out(path: Path) -> None:
     except OSError as error:
         error.filename = str(path)
         raise
-    finally:
-        remove(part)
+    finally:  # also if it is interrupted
+        with suppress(OSError):
+            remove(part)
 
 
 def remove(path: Path) -> None:
