@@ -301,7 +301,7 @@ BAD = (
     (trajectory(begin=-0.5), 'it ended 0.3 s ago'),
     (
         trajectory((FAR,), times=(5.0, 10.0, 15.0)),
-        "the position of joint 'elbow' would be",
+        "point 2 has joint 'elbow' at 3.5 rad, past its limit of 3 rad",
     ),
     (trajectory((FAR,), times=(0.0, 5.0, 10.0)), 'limits.position_lower'),
     (points_at(1.0, 3601.0), 'it takes 3601 s, longer than 3600 s: send it in pieces'),

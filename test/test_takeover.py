@@ -57,6 +57,15 @@ class Arm:
             fastest = max(fastest, np.abs(self.plant.truth()[-n:]).max())
         return np.array(torques), fastest
 
+    def holding(self):
+        """Return the torque (n,) [N m] that holds the arm, without what encoder steps add."""
+        return np.median(self.run(0.1)[0], axis=0)
+
+    def damping(self):
+        """Return the damping (n,) [N m] of the velocities that are measured: encoders step."""
+        _, dq, _ = self.plant.measure().reshape(3, -1)
+        return np.array(self.config.feedback.gain) * np.abs(dq)
+
 
 @pytest.fixture(params=['fr3', 'panda', 'ur5e'])
 def arm(request):
@@ -66,11 +75,12 @@ def arm(request):
 
 
 def test_it_goes_on_from_the_torque_that_holds_the_arm(arm):
-    held = arm.guard.controller.state.torque.copy()
+    held = arm.holding()
     arm.restart(held)
-    torques, speed = arm.run(0.5)
     limit = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
-    assert (np.abs(torques[0] - held) <= np.where(limit > 0.0, limit, 0.5) + 1e-9).all()
+    limit = np.where(limit > 0.0, limit, 0.5 + arm.damping()) + 1e-9
+    torques, speed = arm.run(0.5)
+    assert (np.abs(torques[0] - held) <= limit).all()
     assert speed < 0.02  # rad/s
     types = [event.type for event in arm.guard.journal.pending]
     assert types[-2:] == [EventType.TAKEOVER, EventType.START]
@@ -78,13 +88,14 @@ def test_it_goes_on_from_the_torque_that_holds_the_arm(arm):
 
 def test_a_reset_in_command_forgets_what_was_learned_and_goes_on_to_carry_the_load(arm):
     """Elsewhere the arm sags, as the next test shows."""
-    held = arm.guard.controller.state.torque.copy()
+    held = arm.holding()
     arm.guard.starting.reset()
     state, settings = arm.guard.controller.state, arm.guard.controller.settings
     np.testing.assert_array_equal(state.estimate, settings.initial_estimate)
+    limit = 0.5 + arm.damping()
     torques, speed = arm.run(0.5)
     assert speed < 0.02  # rad/s
-    np.testing.assert_allclose(torques[0], held, atol=0.5)
+    assert (np.abs(torques[0] - held) <= limit).all()
 
 
 def test_a_reset_of_an_arm_that_has_stopped_goes_on_to_carry_its_load(arm):
@@ -200,11 +211,18 @@ def test_a_controller_that_is_told_nothing_lets_the_load_sag(arm):
 
 
 def test_without_it_an_arm_that_rests_by_another_torque_is_not_taken_over():
+    """Whenever it is asked: also while an encoder steps, which looks like motion."""
     arm = Arm('ur5e')
     arm.run(3.0)
-    arm.restart()
-    assert not len(arm.run(0.1)[0])
-    assert 'gravity twice' in str(arm.guard.starting.error)
+    holding, fastest = arm.guard, 0.0
+    for _ in range(20):
+        arm.run(0.01)
+        fastest = max(fastest, np.abs(arm.plant.measure()[6:12]).max())
+        arm.restart()
+        assert not len(arm.run(0.001)[0])
+        assert 'gravity twice' in str(arm.guard.starting.error)
+        arm.guard = holding
+    assert fastest > 0.005  # rad/s
 
 
 def test_the_largest_first_step_is_one_from_there():

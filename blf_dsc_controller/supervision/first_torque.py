@@ -24,6 +24,7 @@ Vector = NDArray[np.float64]
 MATTERS = 0.05
 """Share of the torque limit from which a torque of gravity matters."""
 
+_SLOW = 0.05  # rad/s: below it efforts are those of rest, which encoder steps interrupt
 _NOTICED = 0.02  # of the torque of gravity; a few amperes for some fifty N m
 _ALIKE = 0.9  # cosine of the angle between two torques
 _SEND = 'safety.first_torque: send'
@@ -110,7 +111,7 @@ def _check_gravity(
     """Raise StartError if the arm would get gravity twice, or not at all."""
     worst = int(np.argmax(np.abs(gravity)))
     matters = np.abs(gravity[worst]) > MATTERS * config.torque.limit[worst]
-    if not (matters and np.abs(dq).max() <= AT_REST and np.isfinite(effort).all()):
+    if not (matters and np.abs(dq).max() <= _SLOW and np.isfinite(effort).all()):
         return
     if config.robot.drive_compensates == 'none':
         _check_not_twice(config, effort, gravity, torque)
