@@ -39,6 +39,8 @@ class Chosen:
         if commissioning.friction:  # earlier files have none
             self.values['commissioning.friction'] = commissioning.friction
             self.values['commissioning.unseen_inertia'] = commissioning.unseen_inertia
+        if feedback.joint_damping_lag:  # where it pays
+            self.values['feedback.joint_damping_lag'] = feedback.joint_damping_lag
         if config.robot.rotor_inertia:  # no drive hides the motors
             self.values['robot.rotor_inertia'] = config.robot.rotor_inertia
             self.values['safety.damping'] = config.safety.damping
