@@ -177,7 +177,8 @@ def identify_arm(
     Raises:
         BlfDscError: the recording is too short or has no motion.
     """
-    found = _identified(recording, robot, effort, picked_up, find_signs, begin)
+    trained = _trained(recording, robot, effort, picked_up, find_signs, begin)
+    found = _completed(trained, begin)
     begin(OTHERS)
     unexplained = unexplained_joints(found)
     is_good = found.score.total[2] < _GOOD
@@ -254,20 +255,6 @@ def _left(score: Score) -> float:
     return float(np.sqrt(np.mean(score.shares**2)))
 
 
-def _identified(
-    recording: Recording,
-    robot: Robot,
-    effort: Effort,
-    picked_up: float | None,
-    find_signs: bool,  # noqa: FBT001
-    begin: Callable[[str], None],
-) -> Identified:
-    """Return what `identify_arm` finds for the positions as they are recorded."""
-    return _completed(
-        _trained(recording, robot, effort, picked_up, find_signs, begin), begin
-    )
-
-
 def _trained(
     recording: Recording,
     robot: Robot,
@@ -292,7 +279,7 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
     """Return the arm that is fitted to all of the recording, with its intervals."""
     recording, problem, selected, score = trained
     rows, windows = problem.rows, problem.windows
-    each = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
+    fits = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
     final = fitted(rows, windows.moving, problem.G, selected.prior, selected.found)
     dynamics = nearest_friction(rows, windows, final.values)
     size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
@@ -311,7 +298,7 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
         left_out=doubted.torques,
         dynamics=dynamics,
         score=score,
-        alone=errors_alone(rows, windows.test, each),
+        alone=errors_alone(rows, windows.test, fits),
         distances=selected.distances,
         widths=selected.widths,
         still=_named(recording.joints, rows.speed < STILL),

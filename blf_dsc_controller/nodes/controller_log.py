@@ -83,8 +83,10 @@ class ControllerLog:
 
     def _several_arms(self, reason: Reason) -> str:
         """Return who publishes joint states, if the stamps of several have caused a stop."""
+        if reason not in STAMPS:
+            return ''
         found = self._node.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
-        if reason not in STAMPS or len(found) < 2:
+        if len(found) < 2:
             return ''
         names = ', '.join(
             f'{each.node_namespace.rstrip("/")}/{each.node_name}' for each in found
