@@ -13,8 +13,9 @@ so that near the reference the torque is - d xi1' - (1.8 + c) r d xi1 - 1.5 c r^
 The integral's share c is at most 0.45, or 0.15 where drives have a torque loop: there a
 load observer integrates beside it, and play in the gears bears no more.  It is less where
 the damping is small for the inertia J of the outstretched, loaded arm: d (1.8 r d) >
-J 1.5 c r^2 d keeps the slow oscillation damped, here by a factor of three.  What the
-tracking error adapts is an integral beside it as well.
+J 1.5 c r^2 d keeps the slow oscillation damped, here by a factor of three, or two with
+drives as heavy as they may be where they are a guess.  What the tracking error adapts is
+an integral beside it as well.
 
 Of an arm about which nothing but its URDF is known, the gears may have any stiffness,
 the encoders may be on either side of them, and drives may have a torque loop that hides

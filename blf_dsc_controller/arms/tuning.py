@@ -51,6 +51,9 @@ _BOUND = 0.002  # rad, at full stiffness
 # Of gains of joints: fraction of the rated torque that is expected beside gravity and
 # unknown friction, and rad, the widest bound by default
 _PUSH, _WIDEST = 0.03, 0.35
+# What is left, with drives as heavy as they may be, of how much the slow oscillation is
+# damped: a factor of two instead of three
+_HEAVIEST = 1.5
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = 5.0  # s
 _REGULARISATION = 1e-5  # pulls P (about 1) to 0
@@ -80,6 +83,7 @@ class Design(NamedTuple):
     parameters: BaseParameters
     efforts: np.ndarray  # (n,) N m, rated torques
     rotors: np.ndarray  # (n,) kg m^2, inertias of the drives
+    unknown_rotors: np.ndarray  # (n,) kg m^2, what these may be beyond a guess
     friction: np.ndarray  # (n,) N m, dry friction to expect where none is known
     payload: float  # kg, rated
     lag: float  # s
@@ -156,7 +160,8 @@ def _of_joints(
     sag = np.minimum(_SAG * pushed / gains.stiffness, _WIDEST)
     usual_bound = np.maximum(sag, _BOUND)
     start = np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
-    inertia = postures.inertia
+    heaviest = (postures.inertia + arm.unknown_rotors) / _HEAVIEST
+    inertia = np.maximum(postures.inertia, heaviest)
     beside = gains._replace(share=BESIDE).integral(inertia)
     Gamma = adaptation_gain(beside, postures.gravity)
     law = {name: _listed(each) for name, each in law_gains(gains, inertia).items()}

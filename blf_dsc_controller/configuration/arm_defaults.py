@@ -107,6 +107,7 @@ def stated_design(
         base,
         robot.efforts(chain),
         motors,
+        robot.unknown_rotors(chain),
         robot.unknown_friction(chain),
         robot.payload,
         robot.lag,
