@@ -19,9 +19,10 @@ fitted apart, neither may explain its rows better than by that factor, else the 
 part is removed from the window; again only if the residual has halved since, since
 parts of a period never agree about a lasting disturbance.
 
-After a change of the arm (see `change`) and until the new window is full, it does not
-average out disturbances, so its solution is pulled to the estimate before the change,
-most strongly in weakly excited directions.  Likewise, a full window with an unusually
+A window that is not full does not average out disturbances.  Where there is a prior it is
+learned from all the same, from the start on and after a change of the arm (see `change`),
+but its solution is pulled to the initial estimate, or to that before the change, most
+strongly in weakly excited directions.  Likewise, a full window with an unusually
 large residual is pulled to an earlier solution, kept once per window.
 """
 
@@ -342,14 +343,17 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
 def has_settled(settings: Settings, sliding: Window, t: float, dt: float) -> bool:
     """Whether the window may be learned from at time t [s].
 
-    After a change of the arm it need not be full, but must span at least T_a.
+    It is full, or spans T_a: after a change of the arm, and from the start where rows are
+    compared with a prior.  Else the first window must be full (27).
     """
     of = sliding.settings
+    is_checked = settings.change_detection == 1 and of.prior_weight > 0.0
+    if not is_checked and t < settings.learning_start:
+        return False
     period = of.row_interval * dt
     settling_time = settings.learning_start - of.length * period
     rows = sliding.state.rows[0]
-    settled = rows == of.length or rows * period >= settling_time
-    return bool(t >= settings.learning_start and settled)
+    return bool(rows == of.length or rows * period >= settling_time)
 
 
 @inner
@@ -364,7 +368,7 @@ def update_excitation(
     t: float,
     dt: float,
 ) -> None:
-    """Compute lambda_min of the window; from tau_d + T_a on, latch the window if it suffices (27).
+    """Compute lambda_min of the window; once it has settled, latch it if it suffices (27).
 
     q (n,) [rad] is the position of the arm at time t [s].
     """
