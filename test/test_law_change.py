@@ -20,6 +20,7 @@ SIZES = window.Settings(
 LATCHES = excitation.Settings(
     excitation_threshold=0.01,
     learning_start=1.0,
+    starts_full=1,
     change_detection=1,
     residual_floor=0.02,
     anchor_weight=0.1,
@@ -272,17 +273,22 @@ def test_residual_of_a_part_is_that_of_least_squares(parts):
 
 
 @pytest.mark.parametrize(
-    ('t', 'rows', 'settled'),
+    ('t', 'rows', 'starts_full', 'settled'),
     [
-        (1.0, LENGTH, True),
-        (0.99, LENGTH, False),  # tau_d + T_a is 1 s
-        (1.0, 59, False),  # T_a is 0.6 s
-        (1.0, 60, True),
+        (1.0, LENGTH, 1, True),
+        (0.99, LENGTH, 1, False),  # tau_d + T_a is 1 s
+        (1.0, 59, 1, False),  # T_a is 0.6 s
+        (1.0, 60, 1, True),
+        (0.6, 60, 0, True),
+        (0.6, 59, 0, False),
     ],
 )
-def test_window_must_be_full_or_span_the_settling_time(parts, t, rows, settled):
+def test_window_must_be_full_or_span_the_settling_time(
+    parts, t, rows, starts_full, settled
+):
     parts.sliding.state.rows[0] = rows
-    assert excitation.has_settled(LATCHES, parts.sliding, t, DT) == settled
+    latches = LATCHES._replace(starts_full=starts_full)
+    assert excitation.has_settled(latches, parts.sliding, t, DT) == settled
 
 
 @pytest.mark.parametrize(

@@ -257,13 +257,20 @@ def _window(config: ControllerConfig) -> window.Settings:
 
 
 def _excitation(config: ControllerConfig) -> excitation.Settings:
-    """Return which windows are learned from."""
+    """Return which windows are learned from.
+
+    The first must be full (27), unless its rows are compared with a prior from the start.
+    With feedback through the inertia matrix it must be, too: there drives lighter than
+    guessed are measured first.
+    """
     learning = config.learning
     least = _least_floor(config)
+    is_compared = config.model == 'urdf' and learning.change_detection
     return filled(
         excitation.Settings,
         learning,
         learning_start=learning.window + learning.settling_time,
+        starts_full=int(not is_compared or config.feedback.inertia != 'none'),
         residual_floor=len(config.joints) * least * least,
     )
 

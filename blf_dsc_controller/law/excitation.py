@@ -19,10 +19,10 @@ fitted apart, neither may explain its rows better than by that factor, else the 
 part is removed from the window; again only if the residual has halved since, since
 parts of a period never agree about a lasting disturbance.
 
-A window that is not full does not average out disturbances.  Where there is a prior it is
-learned from all the same, from the start on and after a change of the arm (see `change`),
-but its solution is pulled to the initial estimate, or to that before the change, most
-strongly in weakly excited directions.  Likewise, a full window with an unusually
+A window that is not full does not average out disturbances.  It is learned from all the
+same after a change of the arm (see `change`) and, if configured, from the start, but its
+solution is pulled to the estimate before, most strongly in weakly excited directions.
+Likewise, a full window with an unusually
 large residual is pulled to an earlier solution, kept once per window.
 """
 
@@ -56,6 +56,7 @@ class Settings(NamedTuple):
 
     excitation_threshold: float  # sigma, on lambda_min(Phi)
     learning_start: float  # tau_d + T_a, s
+    starts_full: int  # 1: no window is learned from before then
     change_detection: int  # 1: windows must be consistent
     # mean square residual that noise and unmodelled torque explain, (N m)^2
     residual_floor: float
@@ -343,13 +344,11 @@ def is_preferred(settings: Settings, state: State, value: float) -> bool:
 def has_settled(settings: Settings, sliding: Window, t: float, dt: float) -> bool:
     """Whether the window may be learned from at time t [s].
 
-    It is full, or spans T_a: after a change of the arm, and from the start where rows are
-    compared with a prior.  Else the first window must be full (27).
+    It is full, or spans T_a: after a change of the arm, and from the start if configured.
     """
-    of = sliding.settings
-    is_checked = settings.change_detection == 1 and of.prior_weight > 0.0
-    if not is_checked and t < settings.learning_start:
+    if settings.starts_full == 1 and t < settings.learning_start:
         return False
+    of = sliding.settings
     period = of.row_interval * dt
     settling_time = settings.learning_start - of.length * period
     rows = sliding.state.rows[0]
