@@ -356,6 +356,17 @@ def close_reversal(settings: Settings, state: State, i: int) -> None:
 
 
 @inner
+def forget_reversal(state: State) -> None:
+    """Forget the present reversal, whose rows are of two arms: a load looks like its step."""
+    found = state.reversal_estimate
+    for i in range(found.shape[1]):
+        if shown_energy(state, i) > _SHOWN:
+            found[0, i] = found[1, i]
+        for k in range(5):
+            state.latest_sums[k, i] = 0.0
+
+
+@inner
 def overrule(settings: Settings, state: State, i: int) -> None:
     """Give the sums of joint i the friction of the last two reversals if both contradict them."""
     coulomb, stribeck = learned_friction(settings, state, i)
