@@ -230,6 +230,26 @@ def test_first_window_that_spans_a_change_is_not_latched(preset, begin, duration
         assert settings.n * np.mean(error**2) < 4.0 * settings.excitation.residual_floor
 
 
+def rms_error(preset, duration, begin, law=None, arm=None):
+    config = configured(preset, duration, law, arm)
+    run = simulate(config.controller, config.plant).run()
+    return np.sqrt((run.error[run.time > begin] ** 2).sum(axis=1).mean())
+
+
+@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'fr3_direct'])
+def test_joints_with_gains_of_their_own_learn_before_the_first_window_is_full(preset):
+    """The errors of the first 5 s used to be those without learning."""
+    errors = [rms_error(preset, 5.0, 2.0, law) for law in ({}, OFF)]
+    assert errors[0] < 0.9 * errors[1]
+
+
+def test_load_that_is_held_for_a_moment_of_the_first_window_leaves_no_friction():
+    """Its pick-up was in a reversal, and looked like 0.3 N m of friction: three times the error."""
+    load = several({'begin': 2.5, 'duration': 1.5, 'payload': 2.0})
+    errors = [rms_error('fr3_direct', 8.0, 5.0, law, load) for law in ({}, OFF)]
+    assert errors[0] < 1.3 * errors[1]
+
+
 def test_lasting_disturbance_above_the_floor_does_not_end_learning():
     """Its first window is split once, since its parts never agree, and then accepted."""
     learning = run_preset(30.0, {'disturbance.amplitude': [1.5, 1.5]}, preset='noisy')
