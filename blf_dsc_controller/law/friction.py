@@ -356,14 +356,15 @@ def close_reversal(settings: Settings, state: State, i: int) -> None:
 
 
 @inner
-def forget_reversal(state: State) -> None:
-    """Forget the present reversal, whose rows are of two arms: a load looks like its step."""
-    found = state.reversal_estimate
-    for i in range(found.shape[1]):
-        if shown_energy(state, i) > _SHOWN:
-            found[0, i] = found[1, i]
-        for k in range(5):
-            state.latest_sums[k, i] = 0.0
+def forget_begun(state: State) -> None:
+    """Forget reversals that have just begun, since the arm changed.
+
+    Most of their rows are of the change, and a load looks like the step of friction.
+    """
+    for i in range(state.moves.size):
+        if shown_energy(state, i) <= _SHOWN:
+            for k in range(5):
+                state.latest_sums[k, i] = 0.0
 
 
 @inner

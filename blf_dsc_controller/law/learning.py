@@ -288,7 +288,7 @@ def detect_change(
     if latch.latched[0] == 1.0 and not window.is_full(settings.window, state.window):
         take_back(settings, state, signals)
     change.count_change(state.change, latch, sliding, prior, state.estimate, dt)
-    friction.forget_reversal(state.friction)
+    friction.forget_begun(state.friction)
     prediction.forget(state.row)
 
 
