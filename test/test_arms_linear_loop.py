@@ -234,7 +234,9 @@ def test_the_slow_oscillation_is_damped_with_motors_of_seven_times_the_guess_too
     heavy = np.diagonal(links, axis1=1, axis2=2).max(axis=0) + 7.0 * guess
     d = np.array(config.feedback.gain)
     rate = np.array(config.surface.gain) / 0.4
-    damping = d * 1.8 * rate * d / (heavy * 1.5 * rate * np.array(config.disturbance.gain))
+    damping = (
+        d * 1.8 * rate * d / (heavy * 1.5 * rate * np.array(config.disturbance.gain))
+    )
     assert damping.min() > 1.7  # the rule knows twenty postures, these are others
 
 
