@@ -35,7 +35,7 @@ from random_arm import (
 
 from benchmark.harness import print_table
 from benchmark.options import add_configs, add_runs
-from blf_dsc_controller.arms.urdf import pseudo_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     PLANT,

@@ -39,8 +39,9 @@ from benchmark import __main__ as tables
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.friction import fading, fadings, sliding, slidings
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli import identify as command
 from blf_dsc_controller.cli.main import main

@@ -13,8 +13,8 @@ from blf_dsc_controller.arms.base_parameters import (
     deviations,
     payload_inertia,
 )
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import ROTOR
-from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.layout import filled
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.known_arm import known_arm
