@@ -35,7 +35,7 @@ from random_arm import (
 
 from benchmark.harness import print_table
 from benchmark.options import add_configs, add_runs
-from blf_dsc_controller.arms.urdf import pseudo_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     PLANT,
@@ -151,13 +151,13 @@ def _is_physical(found: Identified) -> bool:
 
 def _errors(found: Identified, unseen: Recording) -> tuple[float, float]:
     rows = rows_of(unseen, found.parameters.model)
-    rows.set_sliding(found.distances)
+    rows = rows.with_sliding(found.distances)
     G = base_matrix(found.parameters, len(unseen.joints))
     u = rows.u(0.5 * PERIOD)  # torques are held for a period
     errors = []
     for values in (found.prior, found.values):
-        rows.set_load((G @ values)[: found.parameters.model.p])
-        left = rows.matrix() @ (G @ values)[:-1] - u
+        loaded = rows.with_load((G @ values)[: found.parameters.model.p])
+        left = loaded.matrix() @ (G @ values)[:-1] - u
         errors.append(100.0 * float(np.linalg.norm(left) / np.linalg.norm(u)))
     return errors[0], errors[1]
 

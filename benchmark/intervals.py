@@ -38,7 +38,8 @@ from random_arm import (
 from benchmark import identification
 from benchmark.harness import print_table
 from benchmark.options import add_runs
-from blf_dsc_controller.arms.urdf import Chain, inertia_of
+from blf_dsc_controller.arms.inertia import inertia_of
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.recording import joined

@@ -152,13 +152,14 @@ def _result(entry: Entry, *, last_only: bool) -> Result:
     problem = problem_of(entry.recording, robot, 'torque', None, find_signs=True)
     reading = time.process_time() - begin
     selected = select(problem.rows, problem.windows.fit, problem.G, problem.prior)
+    problem = problem._replace(rows=selected.rows)
     begin = time.process_time()
     arm = identify_arm(entry.recording, robot)
     own = time.process_time() - begin
     fits, seconds = _fits(problem, selected.prior, arm, robot)
     figures = {
         'torque': _torque_errors(problem, arm, fits),
-        'rollout': _rollout_errors(entry, problem, selected.distances, arm, fits),
+        'rollout': _rollout_errors(entry, problem, arm, fits),
         'covered': _coverage(entry, arm, fits),
         'seconds': {name: reading + each for name, each in seconds.items()},
         'fifths': {} if last_only else _of_fifths(problem),
@@ -230,8 +231,9 @@ def _published_error(
     published: Published, problem: Problem, robot: Robot, delay: float
 ) -> float:
     """Return the torque error [%] on the last fifth of the model of the recording's authors."""
-    rows, test = problem.rows, problem.windows.test
-    rows.set_sliding(np.zeros(rows.speed.size))  # theirs slides at once
+    test = problem.windows.test
+    # theirs slides at once
+    rows = problem.rows.with_sliding(np.zeros(problem.rows.speed.size))
     u = rows.u(delay)[test]
     off = published(rows, robot)[test] - u
     return float(100.0 * np.linalg.norm(off) / np.linalg.norm(u))
@@ -240,21 +242,21 @@ def _published_error(
 def _rollout_errors(
     entry: Entry,
     problem: Problem,
-    distances: Floats,
     arm: Identified,
     fits: dict[str, Fit],
 ) -> dict[str, float]:
     """Return the errors [%] of rollouts by the measured torques on the last fifth."""
     rows, windows = problem.rows, problem.windows
+    at_once = rows.with_sliding(np.zeros(rows.speed.size))
     recording = entry.recording._replace(torque=rows.torque)
     delay = float(fits['identify'].values[-1])
     motions = rollouts_of(recording, rows, windows.test, delay)
     gravity = entry.taken.robot.gravity
     errors = {}
     for name, fit in fits.items():
-        rows.set_sliding(np.zeros_like(distances) if fit.at_once else distances)
-        rows.set_load((problem.G @ fit.values)[: rows.p])
-        errors[name] = rollout_error(arm, fit.values, rows, windows, motions, gravity)
+        slid = at_once if fit.at_once else rows
+        loaded = slid.with_load((problem.G @ fit.values)[: rows.p])
+        errors[name] = rollout_error(arm, fit.values, loaded, windows, motions, gravity)
     return errors
 
 
@@ -282,8 +284,9 @@ def _of_fifths(problem: Problem) -> dict[str, float]:
         fit = problem.windows.moving[apart]
         selected = select(rows, fit, G, full)
         for name, prior in {**_peers(full), 'identify': selected.prior}.items():
-            values = fitted(rows, fit, G, prior).values
-            off = rows.torques(test, (G @ values)[:-1]) - rows.u(values[-1])[test]
+            found = fitted(selected.rows, fit, G, prior)
+            values, own = found.values, found.rows
+            off = own.torques(test, (G @ values)[:-1]) - own.u(values[-1])[test]
             squares[name] = squares.get(name, 0.0) + float(np.sum(off**2))
         total += float(np.sum(rows.u(0.0)[test] ** 2))
     return {name: 100.0 * np.sqrt(each / total) for name, each in squares.items()}

@@ -66,12 +66,12 @@ from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import Record, simulate
+from blf_dsc_controller.studies.distributions import parse
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.studies.monte_carlo import (
     Study,
     Variation,
     draw,
-    parse,
     plant_with,
 )
 from blf_dsc_controller.supervision.expected_errors import linear_feedback

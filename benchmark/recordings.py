@@ -17,7 +17,7 @@ import numpy as np
 import random_arm
 
 from blf_dsc_controller.configuration.robot import Robot, parameters_of
-from blf_dsc_controller.identification.windows import COLUMNS, Rows
+from blf_dsc_controller.identification.windows import Rows
 from blf_dsc_controller.run import Floats
 
 PANDA = tuple(f'panda_joint{i}' for i in range(1, 8))
@@ -87,7 +87,7 @@ def _of_panda(rows: Rows, robot: Robot) -> Floats:
     chain = robot.chain(PANDA)
     parameters = parameters_of(robot, chain)
     p = parameters.model.p
-    v = rows.friction[:, COLUMNS.index('viscous')]
+    v = rows.columns['viscous']
     a, b, c = _PANDA_FRICTION
     friction = a / (1.0 + np.exp(-b * (v + c))) - a / (1.0 + np.exp(-b * c))
     rotors = np.zeros(7)

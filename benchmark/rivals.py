@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from benchmark.rollouts import spec_of
-from blf_dsc_controller.arms.urdf import inertia_of
+from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.regression import Regression

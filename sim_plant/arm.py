@@ -22,7 +22,8 @@ from typing import Annotated, NamedTuple, Protocol
 import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
-from blf_dsc_controller.arms.urdf import Chain, pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.jit import called, compile_methods, inner
 from blf_dsc_controller.compiled.layout import Array, pack, size_of, view_of
 from blf_dsc_controller.numerics.algebra import (

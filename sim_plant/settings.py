@@ -8,8 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.two_link import PARAMETER_NAMES, urdf
-from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.layout import filled, pack
 from blf_dsc_controller.configuration.plant import Deviation, PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of

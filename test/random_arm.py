@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio
 
-from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.identification.recording import Recording

@@ -32,10 +32,11 @@ from blf_dsc_controller.arms.base_parameters import (
     payload_inertia,
     prior_factor,
 )
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import arm_model, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.serial_chain import ROTOR, serial_chain
 from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.arms.urdf import frames, inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.errors import BlfDscError
 from sim_plant.arm import PointMassArm, motion_of, rigid_arm, rigid_bodies
 

@@ -314,14 +314,14 @@ def test_formatted_values_round_trip_here_and_through_pyyaml(value):
 
 def test_parameter_page_is_what_its_command_writes(tmp_path):
     page = tmp_path / 'parameters.md'
-    module = 'blf_dsc_controller.configuration.nodes'
+    script = Path(__file__).with_name('parameter_tables.py')
     committed = COMMITTED.read_text(encoding='utf-8')
     page.write_text(committed.partition('\n## ')[0], encoding='utf-8')
     subprocess.run(
-        [sys.executable, '-m', module, str(page)], check=True, cwd=COMMITTED.parents[1]
+        [sys.executable, str(script), str(page)], check=True, cwd=COMMITTED.parents[1]
     )
     assert committed == page.read_text(encoding='utf-8'), (
-        'run: python -m blf_dsc_controller.configuration.nodes doc/parameters.md'
+        'run: python test/parameter_tables.py doc/parameters.md'
     )
     rows = [row for row in committed.splitlines() if row.startswith('| `')]
     gains = {f'gains.{each.name}' for of in GAINS.values() for each in parameters(of)}

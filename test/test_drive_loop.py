@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import signal
+import sys
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -90,6 +91,23 @@ def test_it_ends_at_rest_and_the_bag_replays_bit_equal(address, end, tmp_path):
     np.testing.assert_array_equal(
         recorded.torque, driver.torques[: len(recorded.torque)]
     )
+
+
+def test_other_threads_yield_to_the_loop_until_it_ends(monkeypatch, tmp_path):
+    seen = []
+    read = PlantDriver.read
+
+    def observed(self):
+        seen.append(sys.getswitchinterval())
+        return read(self)
+
+    monkeypatch.setattr(PlantDriver, 'read', observed)
+    before = sys.getswitchinterval()
+    drive('plant', tmp_path, duration=0.01)
+    # a tenth of a sample time of 1 ms
+    assert max(seen) == pytest.approx(1e-4)
+    assert before > 1e-3  # as Python has it: 5 ms
+    assert sys.getswitchinterval() == before
 
 
 def test_a_second_request_ends_at_once(tmp_path):

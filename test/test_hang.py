@@ -62,7 +62,7 @@ class Loop:
         self.torque = self.guard.update(stamp, measurement).copy()
         if self.line is not None:
             now = self.plant.sample * self.config.sample_time
-            self.line.torque_of_controller(self.torque, now)
+            self.line.take_torque(self.torque, now)
 
     def run(self, seconds, *, hangs=False):
         """Return the speeds (k, n) [rad/s], and those that the reference asks for."""
@@ -82,7 +82,7 @@ class Loop:
         if self.line is None:
             return
         T = self.config.sample_time
-        self.line.state(stamp, measurement, self.plant.sample * T)
+        self.line.take_state(stamp, measurement, self.plant.sample * T)
         period = T if self.line.active else PERIOD
         if self.plant.sample % max(1, round(period / T)) == 0:
             torque = self.line.poll(self.plant.sample * T)
@@ -198,7 +198,7 @@ def test_plan_that_takes_longer_than_a_gap_is_not_made_again(monkeypatch, late):
         if len(plans) > made:
             loop.run(late, hangs=True)
         loop.torque = torque
-        loop.line.torque_of_controller(torque, loop.plant.sample * T)
+        loop.line.take_torque(torque, loop.plant.sample * T)
         loop.plant.step(torque)
     assert len(plans) == 2
     assert loop.guard.supervisor.running, loop.guard.supervisor.text

@@ -30,7 +30,9 @@ def folds_that_show(values, weight=0.2):
         row[BODY], row[-1] = 1.0, value
         folds[k, 0] = weight * np.outer(row, row)
     nothing = np.zeros(0)
-    return Regression(nothing, nothing, folds, nothing, nothing, nothing, delay=0.0)
+    return Regression(
+        nothing, nothing, folds, nothing, nothing, nothing, delay=0.0, rows=None
+    )
 
 
 @pytest.mark.parametrize(

@@ -39,8 +39,9 @@ from benchmark import __main__ as tables
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.friction import fading, fadings, sliding, slidings
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia, read_chain
+from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli import identify as command
 from blf_dsc_controller.cli.main import main
@@ -624,9 +625,8 @@ def test_solution_from_that_of_another_problem_is_the_same(plain):
         recording_of(measured(plain, 3)), AT_TIP, 'torque', None, find_signs=False
     )
     rows, fit = problem.rows, problem.windows.fit
-    rows.set_sliding(np.full(7, 3e-3))
-    other = regression(rows, fit, problem.G, problem.prior)
-    rows.set_sliding(np.zeros(7))
+    late = rows.with_sliding(np.full(7, 3e-3))
+    other = regression(late, fit, problem.G, problem.prior)
     alone = regression(rows, fit, problem.G, problem.prior)
     assert np.abs(other.deviation / alone.deviation - 1.0).max() > 0.5
     near = regression(rows, fit, problem.G, problem.prior, other)
@@ -705,7 +705,7 @@ def test_friction_of_a_urdf_is_the_nearest_that_changes_its_sign_at_once():
     model = base_parameters(chain, GRAVITY).model
     gap = np.zeros(len(t), dtype=bool)
     rows = rows_of(Recording(('joint1', 'joint2'), h, q, q, gap, ''), model)
-    rows.set_sliding(np.array([0.0, 3e-3]))
+    rows = rows.with_sliding(np.array([0.0, 3e-3]))
     windows = split(rows)
     values = np.zeros(17 * 2 + 14)
     parts(values).terms[COULOMB] = 1.0
@@ -713,8 +713,9 @@ def test_friction_of_a_urdf_is_the_nearest_that_changes_its_sign_at_once():
     np.testing.assert_allclose((viscous[0], coulomb[0]), (0.0, 1.0), atol=1e-9)
     assert 0.5 < coulomb[1] < 0.98
     fit = windows.fit
-    columns = rows.friction[fit, 0, 1], rows.sliding_at_once()[fit, 1]
-    left = rows.friction[fit, 1, 1] - viscous[1] * columns[0] - coulomb[1] * columns[1]
+    own = {name: column[fit, 1] for name, column in rows.columns.items()}
+    columns = own['viscous'], rows.sliding_at_once()[fit, 1]
+    left = own['Coulomb'] - viscous[1] * columns[0] - coulomb[1] * columns[1]
     weight = rows.weight[fit, 1] ** 2
     assert abs(left @ (weight * columns[1])) < 1e-6 * weight.sum()
 
@@ -824,13 +825,11 @@ def test_shapes_of_friction_are_those_of_the_law_over_arrays():
     gap = np.zeros(len(v), dtype=bool)
     recording = Recording(('joint1', 'joint2'), 0.01, 0.01 * q, q, gap, '')
     rows = rows_of(recording, base_parameters(chain, GRAVITY).model)
-    rows.set_sliding(np.zeros(2))
     dq = np.asarray(rows.dq)
     for exponent in (2.0, 1.0):
-        rows.set_stribeck(0.2, exponent)
         shape = np.tanh(dq / COULOMB_SPEED) * np.exp(-(np.abs(dq / 0.2) ** exponent))
         expected = rows.over_windows(lambda at, shape=shape: shape[at], rows.g)
-        np.testing.assert_allclose(rows.friction[:, 4], expected, atol=1e-12)
+        np.testing.assert_allclose(rows.stribeck(0.2, exponent), expected, atol=1e-12)
 
 
 def test_contacts_that_yield_at_reversals_are_found(plain):

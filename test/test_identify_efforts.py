@@ -22,8 +22,8 @@ from random_arm import (
 )
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
+from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.arms.urdf import inertia_of, pseudo_inertia
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification import signs as signs_module
 from blf_dsc_controller.identification.identify import identify_arm

@@ -24,8 +24,8 @@ from random_arm import (
 )
 
 from benchmark.intervals import KINDS, Arm
+from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.arms.urdf import inertia_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification import summary

@@ -15,7 +15,7 @@ from random_arm import (
     truth_of,
 )
 
-from blf_dsc_controller.arms.urdf import inertia_of
+from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.pick_up import _best_interval

@@ -113,7 +113,7 @@ def test_friction_explains_the_torques_of_its_own_windows(states, monkeypatch):
     for own, columns in zip(u, friction, strict=True):
         (k,) = np.flatnonzero((rows.u(0.0) == own).all(axis=1))
         for column in columns:
-            assert (rows.friction[k] == column).all(axis=1).any()
+            assert (rows.friction([k])[0] == column).all(axis=1).any()
 
 
 def test_right_joints_are_not_doubted(states):

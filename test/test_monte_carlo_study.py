@@ -17,11 +17,11 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.distributions import parse
 from blf_dsc_controller.studies.monte_carlo import (
     another_motion,
     draw,
     load_study,
-    parse,
     plant_with,
     torque_rows,
 )

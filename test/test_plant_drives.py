@@ -13,7 +13,7 @@ from plants import PERIOD, QUIET, commands, plant, true_parameters
 from random_arm import CONFIG
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.urdf import pseudo_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.errors import ConfigurationError

@@ -44,7 +44,7 @@ def test_load_is_told_in_steps_of_half_a_percent_of_a_torque_limit(law):
     loads = DriveLoads(CONFIG)
     weigh(law, 2.0)
     told = []
-    while (load := loads.next(law)) is not None:
+    while (load := loads.begin_step(law)) is not None:
         before = law.state.saturation.added.copy()
         loads.take(law, load)
         told.append(load.mass)
@@ -76,7 +76,7 @@ def test_load_is_told_in_steps_of_half_a_percent_of_a_torque_limit(law):
 def test_only_a_load_that_is_well_known_is_told(law, mass, deviations, phase, is_told):
     weigh(law, mass, deviations)
     law.state.contact.phase[0] = phase
-    assert (DriveLoads(CONFIG).next(law) is not None) == is_told
+    assert (DriveLoads(CONFIG).begin_step(law) is not None) == is_told
 
 
 def test_law_leaves_to_the_drives_what_they_were_told_since_it_began(law):
@@ -98,7 +98,7 @@ def test_load_that_is_put_down_after_a_reset_leaves_what_it_held(law):
     loads.forget(law)
     weigh(law, -1.0)
     for _ in range(100):
-        load = loads.next(law)
+        load = loads.begin_step(law)
         if load is None:
             break
         loads.take(law, load)
@@ -111,11 +111,11 @@ def test_told_load_is_left_as_it_is_until_another_is_weighed(law):
     loads = DriveLoads(CONFIG)
     loads.take(law, DriveLoad(2.5, CENTRE))
     weigh(law, 2.05)
-    assert loads.next(law) is None
+    assert loads.begin_step(law) is None
     weigh(law, 2.2)
-    assert loads.next(law) is not None  # the first of several steps ...
+    assert loads.begin_step(law) is not None  # the first of several steps ...
     weigh(law, 2.05)
-    assert loads.next(law) is not None  # ... which are carried on
+    assert loads.begin_step(law) is not None  # ... which are carried on
     loads.forget(law)
     weigh(law, 0.0)
-    assert loads.next(law) is None
+    assert loads.begin_step(law) is None

@@ -38,9 +38,9 @@ class Watched(Rig):
             now = self.plant.sample * 1e-3
             if not self.dead:
                 self.deliver(state.raw())
-                self.line.torque_of_controller(self.commands[-1], now)
+                self.line.take_torque(self.commands[-1], now)
             values = np.concatenate((state.q, state.dq, state.effort))
-            self.line.state(state.stamp, values, now)
+            self.line.take_state(state.stamp, values, now)
             if self.plant.sample % self.period == 0:
                 torque = self.line.poll(now)
                 if torque is not None:
@@ -106,9 +106,11 @@ def test_named_arm_of_a_dead_controller_comes_to_rest(preset, angle, armed):
                 START + k * loop.controller.sample_time_ns, measurement
             ).copy()
             if not armed:
-                line.torque_of_controller(torque, now)
+                line.take_torque(torque, now)
         if k >= death or not armed:
-            line.state(START + k * loop.controller.sample_time_ns, measurement, now)
+            line.take_state(
+                START + k * loop.controller.sample_time_ns, measurement, now
+            )
             taken = line.poll(now)
             torque = torque if taken is None else taken.copy()
         plant.step(torque)
@@ -127,8 +129,8 @@ def test_nothing_is_commanded_before_the_controller_or_while_states_stand_still(
     values = np.concatenate((state.q, state.dq, state.effort))
     for k in range(1000):
         if k == 500:
-            rig.line.torque_of_controller(np.ones(2), 0.5)
-        rig.line.state(state.stamp + min(k, 499) * MILLISECOND, values, k * 1e-3)
+            rig.line.take_torque(np.ones(2), 0.5)
+        rig.line.take_state(state.stamp + min(k, 499) * MILLISECOND, values, k * 1e-3)
         assert rig.line.poll(k * 1e-3) is None
     assert rig.line.leave() is None
 
@@ -167,7 +169,7 @@ def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded
     restarted.dead = True
     rig.step(100)
     last = np.array([20.0, np.nan])
-    rig.line.torque_of_controller(last, rig.plant.sample * 1e-3)
+    rig.line.take_torque(last, rig.plant.sample * 1e-3)
     rig.dead = True
     for each in (rig, restarted):
         each.step(100)

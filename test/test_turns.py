@@ -168,7 +168,9 @@ def test_watchdog_sees_no_wrap_in_its_differenced_velocities():
     watchdog = TorqueWatchdog(build(ControllerConfig, ARM), 0.05)
     for k in range(200):  # at 1 rad/s past pi
         q = within_a_turn([3.1 + 1e-3 * k, 0.0])
-        watchdog.state(1 + k * MILLISECOND, np.array([*q, nan, nan, 0, 0]), 1e-3 * k)
+        watchdog.take_state(
+            1 + k * MILLISECOND, np.array([*q, nan, nan, 0, 0]), 1e-3 * k
+        )
         if k:
             np.testing.assert_allclose(watchdog._safe.last.dq, [1.0, 0.0], atol=1e-9)
 

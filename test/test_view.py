@@ -14,7 +14,6 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from subprocess import PIPE, STDOUT
-from types import SimpleNamespace
 from urllib.error import URLError
 from urllib.request import urlopen
 
@@ -41,11 +40,12 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.view import node as view_node
 from blf_dsc_controller.view import page as pages
 from blf_dsc_controller.view.model_error import shares
-from blf_dsc_controller.view.node import ViewNode, plant_events
+from blf_dsc_controller.view.node import ViewNode
 from blf_dsc_controller.view.page import Page, ShownArm, Snapshot, known_model
+from blf_dsc_controller.view.plant_events import plant_events
+from blf_dsc_controller.view.thinned_run import KEPT, ThinnedRun
 
 HOST = '127.0.0.1'
 PORT = 18080
@@ -137,12 +137,11 @@ def test_error_of_a_model_is_that_of_the_last_frames(frames, learned):
 
 def test_snapshots_of_a_long_run_are_evenly_spaced():
     """Of numbered ones, three times as many as are kept."""
-    most = view_node._KEPT
-    shown = SimpleNamespace(run=[], _stride=1, _taken=0)
-    for k in range(3 * most):
-        ViewNode._keep_for_replay(shown, k)
-    assert set(np.diff(shown.run)) == {4}
-    assert most / 2 < len(shown.run) <= most
+    run = ThinnedRun()
+    for k in range(3 * KEPT):
+        run.take(k)
+    assert set(np.diff(run.snapshots)) == {4}
+    assert KEPT / 2 < len(run.snapshots) <= KEPT
 
 
 def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):

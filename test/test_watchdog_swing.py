@@ -48,12 +48,12 @@ def killed(study, config, late=0.0):
         if stop is None or k < stop + round(late / T):
             torque = guard.update(stamp, measurement).copy()
             guard.perceive()
-            line.torque_of_controller(torque, k * T)
+            line.take_torque(torque, k * T)
             if stop is None and guard.supervisor.phase is Phase.SAFE_STOP:
                 stop = k
         else:
             speeds.append(np.abs(arm.truth()[-n:]).max())
-        line.state(stamp, measurement, k * T)
+        line.take_state(stamp, measurement, k * T)
         taken = line.poll(k * T)
         arm.step(torque if taken is None else taken)
         if len(speeds) * T > 1.5:
@@ -102,9 +102,9 @@ def held(sigma, frequency=0.0, amplitude=0.0):
         q = random.normal(0.0, sigma, n)
         q += amplitude * np.sin(2.0 * np.pi * frequency * k * T)
         stamp = FIRST_STAMP + k * config.sample_time_ns
-        line.state(stamp, np.concatenate((q, np.full(2 * n, np.nan))), k * T)
+        line.take_state(stamp, np.concatenate((q, np.full(2 * n, np.nan))), k * T)
         if k * T < 0.4:
-            line.torque_of_controller(np.zeros(n), k * T)
+            line.take_torque(np.zeros(n), k * T)
         line.poll(k * T)
     assert line.active
     return line

@@ -21,8 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import ROTOR, SerialChain, serial_chain
-from blf_dsc_controller.arms.urdf import Chain, inertia_of, moved, pseudo_inertia
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.numerics.algebra import independent_columns, product
 
 LINKS = 0.3

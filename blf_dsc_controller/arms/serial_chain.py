@@ -23,7 +23,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.urdf import INERTIA_NAMES, INERTIA_UNITS, Chain
+from blf_dsc_controller.arms.inertia import INERTIA_NAMES, INERTIA_UNITS
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.compiled.jit import called, inner
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
 from blf_dsc_controller.numerics.algebra import Vector, cross, dot, plus, product

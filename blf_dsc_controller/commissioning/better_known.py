@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.joint_gains import GIVEN, JointGains
-from blf_dsc_controller.commissioning.chosen import with_gains
+from blf_dsc_controller.arms.joint_gains import JointGains
+from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.schema import Value, flatten
 
@@ -73,14 +73,14 @@ def better_configuration(
     By runs with `config` the parameters `found` and the `friction` (n,) [N m] are known; `start`
     are the gains of these runs.  Those of a joint that `sticks` (n,) at most double.
     """
-    chosen = np.array([found[f'feedback.joint_{each}'] for each in GIVEN])
+    chosen = np.array(
+        [found['feedback.joint_stiffness'], found['feedback.joint_damping']]
+    )
     measured = np.array([start.stiffness, start.damping])
     most = np.where(sticks, _OF_STUCK * measured, np.inf)
     stiffer = np.maximum(np.minimum(_SHARE * chosen, most), measured)
-    gains = dict(zip(GIVEN, stiffer.tolist(), strict=True))
     values = {name: value for name, value in found.items() if name in _NAMES}
-    values |= {f'feedback.joint_{each}': tuple(gains[each]) for each in gains}
-    values['feedback.stiffness'] = 1.0
+    values |= as_parameters(*stiffer)
     values['robot.coulomb'] = tuple(np.maximum(known_friction(config), friction))
     return with_gains(config, values)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.arms.tuning import gains_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
@@ -42,6 +42,18 @@ _BOUNDS = 'barrier.bound', 'barrier.initial_bound'  # not of gains, with one at 
 _SOFT = 'noise or friction hide the response: measure again with a larger --torque or --travel'
 
 _EXCESS = 1.1  # of a bound over the errors to expect
+
+
+def as_parameters(stiffness: ArrayLike, damping: ArrayLike) -> dict[str, Value]:
+    """Return gains (n,) of the joints by dotted name; no factor makes them softer.
+
+    `stiffness` is in N m/rad, `damping` in N m s/rad.
+    """
+    return {
+        'feedback.joint_stiffness': tuple(np.asarray(stiffness).tolist()),
+        'feedback.joint_damping': tuple(np.asarray(damping).tolist()),
+        'feedback.stiffness': 1.0,
+    }
 
 
 def with_gains(

@@ -32,6 +32,7 @@ from blf_dsc_controller.commissioning.choice import (
     choose,
 )
 from blf_dsc_controller.commissioning.chosen import (
+    as_parameters,
     capped_stop_damping,
     widened_bounds,
     with_gains,
@@ -165,9 +166,7 @@ class Commissioned(NamedTuple):
             **of_arm,
             'robot.lag': float(f'{self.lag:.3g}'),
             'feedback.inertia': 'none',
-            'feedback.joint_stiffness': _rounded(gains.stiffness),
-            'feedback.joint_damping': damping,
-            'feedback.stiffness': 1.0,
+            **as_parameters(_rounded(gains.stiffness), damping),
             'commissioning.date': self.date,
             'commissioning.version': __version__,
             'commissioning.margin': float(f'{self.choice.margin.value:.3g}'),
@@ -238,11 +237,7 @@ def _softer(config: ControllerConfig, share: float) -> dict[str, Value]:
     if share == 1.0:
         return {}
     gains = measuring_gains(config).scaled(share)
-    return {
-        'feedback.joint_stiffness': tuple(gains.stiffness.tolist()),
-        'feedback.joint_damping': tuple(gains.damping.tolist()),
-        'feedback.stiffness': 1.0,
-    }
+    return as_parameters(gains.stiffness, gains.damping)
 
 
 def commissioned(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.commissioning import motion
-from blf_dsc_controller.commissioning.chosen import with_gains
+from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
 from blf_dsc_controller.commissioning.limit_cycle import (
     AT_REST,
     IN_MOTION,
@@ -76,15 +76,10 @@ def steps(config: ControllerConfig) -> list[Step]:
     found = []
     for share in SHARES[:-1]:
         factor = share * gains.stiffness
-        values: dict[str, Value] = {
-            'feedback.joint_stiffness': tuple(
-                factor * each for each in gains.joint_stiffness
-            ),
-            'feedback.joint_damping': tuple(
-                factor * each for each in gains.joint_damping
-            ),
-            'feedback.stiffness': 1.0,
-        }
+        values = as_parameters(
+            factor * np.array(gains.joint_stiffness),
+            factor * np.array(gains.joint_damping),
+        )
         found.append(Step(share, with_gains(soft, values), _SHORT))
     return [*found, Step(SHARES[-1], change(config, calm), _LAST)]
 

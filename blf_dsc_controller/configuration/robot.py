@@ -17,8 +17,9 @@ from blf_dsc_controller.arms.base_parameters import (
     BaseParameters,
     base_parameters,
 )
+from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.serial_chain import serial_chain
-from blf_dsc_controller.arms.urdf import Chain, Joint, inertia_of, read_chain
+from blf_dsc_controller.arms.urdf import Chain, Joint, read_chain
 from blf_dsc_controller.arms.xml_text import without_mark
 from blf_dsc_controller.configuration import mjcf
 from blf_dsc_controller.configuration.description import (

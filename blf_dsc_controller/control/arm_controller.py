@@ -164,8 +164,9 @@ class ArmController:
             q: positions (n,) [rad], or [m] of prismatic joints.
             dq: velocities (n,) [rad/s].
             effort: torques (n,) [N m] over the last interval, as `robot.effort`
-                describes them. They show whether commands reach the arm; the law
-                itself takes those that it commanded.
+                describes them. They show whether commands reach the arm, and the load to
+                the observer of `disturbance.observer_bandwidth`; all else is learned
+                from the torques that were commanded.
             motors: positions and velocities (2, n) of the motors, where these have encoders
                 and q is of the links. They are recorded for `blf_dsc identify`, which finds
                 the stiffness of gears, and are not used.

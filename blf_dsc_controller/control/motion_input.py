@@ -7,7 +7,6 @@ and by the goals of the action, whoever receives them. Every rejection has a rea
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
@@ -44,7 +43,6 @@ _SMALL = 4096  # bytes of a message that is read at once: a few points
 _LEAD = 0.02  # s from now to the time for which a trajectory is planned, at first
 _TARGET_LEAD = 0.004  # likewise for a target
 _LONGEST_LEAD = 2.0
-_SWITCH_INTERVAL = 1e-4  # s after which the planning thread yields to the loop
 _PAUSE = 1.0  # s without messages, after which a stopped sender is followed again
 _RARELY = 1.0  # s between two warnings of a stream
 _ON_TRAJECTORY = JOINT_TRAJECTORY.name
@@ -78,7 +76,7 @@ class MotionInput:
 
     In lock-step the plant waits while a motion is planned. A live one does not: it is
     planned in a thread, for a time slightly ahead, and further ahead if planning takes
-    longer. The latest wins.
+    longer. The latest wins. Run the loop in `undisturbed_loop`, so that this thread yields.
 
     Attributes:
         accepted, rejected: number of trajectories that are or were followed, or are not.
@@ -115,7 +113,6 @@ class MotionInput:
         self._is_stopped = False
         self._has_logged_turns = False
         self._last_message = -np.inf  # s since the start
-        sys.setswitchinterval(_SWITCH_INTERVAL)
 
     @property
     def values(self) -> dict[str, str]:

@@ -11,7 +11,6 @@ resumed.
 
 from __future__ import annotations
 
-import gc
 import math
 from enum import Enum
 from time import perf_counter
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.control.arm_controller import ArmController
+from blf_dsc_controller.control.realtime import undisturbed_loop
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.drive.driver import (
     ConnectionLostError,
@@ -130,19 +130,17 @@ class DriveLoop:
             MotionError: no approach from there keeps the limits.
             Exception: an error of the controller, after the arm was brought to rest.
         """
-        gc.collect()
-        gc.freeze()  # what is loaded by now stays: scanning it would stall the loop
         try:
-            self._controller.prepare(self._driver.positions())
-            self._driver.start()
-            self._control()
+            with undisturbed_loop():
+                self._controller.prepare(self._driver.positions())
+                self._driver.start()
+                self._control()
         except ReflexError as error:
             self._withdraw(End.REFLEX, str(error))
             self._recover()
         except ConnectionLostError as error:
             self._withdraw(End.LOST, str(error))
         finally:
-            gc.unfreeze()
             self._teller.close()
         if self._error is not None:
             raise self._error

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +13,8 @@ from blf_dsc_controller.arms.base_parameters import (
     deviations,
     payload_inertia,
 )
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.serial_chain import ROTOR
-from blf_dsc_controller.arms.urdf import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.compiled.layout import filled
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.known_arm import known_arm
@@ -76,12 +77,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     """
     model = model_of(config)
     learned = columns_of(config)
-    m = model.p + len(learned)
-    covariance = prior_covariance(config)
-    initial = (column.initial for column in learned)
-    inertia = _joint_inertia(config)
     row = _row(config)
-    sliding = _window(config)
+    inertia = _joint_inertia(config)
     settings = filled(
         Settings,
         config.learning,
@@ -89,39 +86,61 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         model=model,
         n=model.n,
         p=model.p,
-        m=m,
+        m=model.p + len(learned),
         memory=0,
         has_barrier=int(law_of(config).has_barrier),
-        initial_estimate=np.array((*config.learning.initial_estimate, *initial)),
-        information=inverse(covariance),
-        row_information=inverse(doubting_covariance(config)),
         joint_inertia=inertia,
         robust_gain=np.zeros(model.n),
         truth=_truth(config, model.p),
-        barrier=_barrier(config),
-        surface=_surface(config, row.lag),
-        feedback=_feedback(config),
-        disturbance=filled(disturbance.Settings, config.disturbance, bumpless=1),
-        observer=_observer(config, model.p, row.lag),
-        absorbed=absorbed_friction.Settings(
+        friction=None,  # follows from the others
+        rotors=_rotors(config, row.lag, inertia),
+        **_parts_of_feedback(config, model.p, row.lag),
+        **_parts_of_learning(config, model.p, learned, row),
+    )
+    settings = of_law(config, settings)
+    return settings._replace(friction=friction_settings(settings))
+
+
+def _parts_of_feedback(config: ControllerConfig, p: int, lag: float) -> dict[str, Any]:
+    """Return the settings of what computes a torque by errors, and limits it, by field."""
+    return {
+        'barrier': _barrier(config),
+        'surface': _surface(config, lag),
+        'feedback': _feedback(config),
+        'disturbance': filled(disturbance.Settings, config.disturbance, bumpless=1),
+        'observer': _observer(config, p, lag),
+        'torque': _torque(config),
+    }
+
+
+def _parts_of_learning(
+    config: ControllerConfig,
+    p: int,
+    learned: Sequence[Column],
+    row: prediction.Settings,
+) -> dict[str, Any]:
+    """Return theta^ at first, its prior, and the settings of what learns it, by field."""
+    initial = (column.initial for column in learned)
+    covariance = prior_covariance(config)
+    sliding = _window(config)
+    return {
+        'initial_estimate': np.array((*config.learning.initial_estimate, *initial)),
+        'information': inverse(covariance),
+        'row_information': inverse(doubting_covariance(config)),
+        'columns': _columns(config, p),
+        'row': row,
+        'window': sliding,
+        'excitation': _excitation(config),
+        'adaptation': _adaptation(config, p, learned, covariance),
+        'absorbed': absorbed_friction.Settings(
             filter_pole=row.filter_pole,
             length=sliding.length,
             period=sliding.row_interval * config.sample_time,
             least_weight=sliding.prior_weight + sliding.regularization,
         ),
-        torque=_torque(config),
-        columns=_columns(config, model.p),
-        row=row,
-        window=sliding,
-        excitation=_excitation(config),
-        adaptation=_adaptation(config, model.p, learned, covariance),
-        contact=_contact(config, sliding),
-        friction=None,  # follows from the others
-        rotors=_rotors(config, row.lag, inertia),
-        weighing=_weighing(config, learned, row, sliding),
-    )
-    settings = of_law(config, settings)
-    return settings._replace(friction=friction_settings(settings))
+        'contact': _contact(config, sliding),
+        'weighing': _weighing(config, learned, row, sliding),
+    }
 
 
 def _truth(config: ControllerConfig, p: int) -> truth.Settings:

@@ -27,7 +27,7 @@ from blf_dsc_controller.identification.mounting import gravity_columns
 from blf_dsc_controller.identification.on_disk import Samples, mapped
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.turns import TURN
-from blf_dsc_controller.identification.windows import COLUMNS, rows_of, split
+from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.run import Floats
 
 _QUARTERS = (0, 1, 2, -1)  # turns over 4, of a zero
@@ -96,7 +96,7 @@ def likely_conventions(
     fit = split(rows).fit
     fit = fit[:: max(1, fit.size // _POSTURES)]
     q = rows.over_windows(lambda at: rows.q[at], rows.g)[fit]
-    columns = rows.friction[fit][:, [COLUMNS.index(name) for name in _FRICTION]]
+    columns = rows.friction(fit, _FRICTION)
     gravity = _Gravity(arm, np.array(robot.gravity), q, rows.u(0.0)[fit], columns)
     turning = [i for i, joint in enumerate(arm.joints) if joint.kind != 'prismatic']
     as_is = (_AS_IS,) * q.shape[1]

@@ -14,7 +14,8 @@ from xml.parsers import expat
 
 import numpy as np
 
-from blf_dsc_controller.arms.urdf import Chain, pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.run import Floats
 
 

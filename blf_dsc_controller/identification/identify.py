@@ -37,7 +37,7 @@ from blf_dsc_controller.identification.problem import Effort, Problem, problem_o
 from blf_dsc_controller.identification.problems import is_usable, unexplained_joints
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
-from blf_dsc_controller.identification.regression import fitted
+from blf_dsc_controller.identification.regression import Fit, fitted
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import Selected, select
 from blf_dsc_controller.identification.stiffness import Compliance, compliance_of
@@ -206,6 +206,7 @@ class _Trained(NamedTuple):
     recording: Recording
     problem: Problem
     selected: Selected
+    fit: Fit
     score: Score
 
 
@@ -266,26 +267,33 @@ def _trained(
     """Return the arm that is fitted to a part of the recording: enough to compare others."""
     begin(CHECKING)
     problem = problem_of(recording, robot, effort, picked_up, find_signs=find_signs)
-    rows, windows = problem.rows, problem.windows
+    windows = problem.windows
     begin(SELECTING)
-    selected = select(rows, windows.fit, problem.G, problem.prior)
+    selected = select(problem.rows, windows.fit, problem.G, problem.prior)
     begin(FITTING)
-    trained = fitted(rows, windows.fit, problem.G, selected.prior, selected.found)
-    score = scored(rows, windows, problem.G, problem.prior.mean, trained.values)
-    return _Trained(recording, problem, selected, score)
+    trained = fitted(
+        selected.rows, windows.fit, problem.G, selected.prior, selected.found
+    )
+    score = scored(
+        selected.rows, windows, problem.G, problem.prior.mean, trained.values
+    )
+    return _Trained(recording, problem, selected, trained, score)
 
 
 def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
     """Return the arm that is fitted to all of the recording, with its intervals."""
-    recording, problem, selected, score = trained
-    rows, windows = problem.rows, problem.windows
-    fits = fit_alone(rows, windows.fit, problem.G, problem.prior, COLUMNS)
-    final = fitted(rows, windows.moving, problem.G, selected.prior, selected.found)
+    recording, problem, selected, fit, score = trained
+    windows = problem.windows
+    fits = fit_alone(fit.rows, windows.fit, problem.G, problem.prior, COLUMNS)
+    final = fitted(
+        selected.rows, windows.moving, problem.G, selected.prior, selected.found
+    )
+    rows = final.rows
     dynamics = nearest_friction(rows, windows, final.values)
     size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
-    compliance = _compliance(problem, recording, final.values)
+    compliance = _compliance(problem, recording, final)
     begin(INTERVALS)
-    doubted = doubt(problem, selected.prior, final, selected.distances)
+    doubted = doubt(problem, selected.prior, final)
     return Identified(
         source=recording.source,
         duration=recording.duration,
@@ -316,18 +324,16 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
     )
 
 
-def _compliance(
-    problem: Problem, recording: Recording, values: Floats
-) -> Compliance | None:
+def _compliance(problem: Problem, recording: Recording, fit: Fit) -> Compliance | None:
     """Return the compliances of the gears, if there are positions of motors and links."""
     if recording.twist is None:
         return None
-    links = values.copy()
+    links = fit.values.copy()
     parts(links).terms[:] = 0.0
     parts(links).coupling[:] = 0.0
     theta = (problem.G @ links)[:-1]
     moving = problem.windows.moving
-    return compliance_of(problem.rows, recording.twist, moving, theta, values[-1])
+    return compliance_of(fit.rows, recording.twist, moving, theta, fit.values[-1])
 
 
 def _named(joints: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:

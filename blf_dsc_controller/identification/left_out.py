@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.friction import STRIBECK_SPEED
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.identification.on_disk import OnDisk, mapped
 from blf_dsc_controller.identification.sliding import DISTANCES
@@ -34,7 +33,6 @@ from blf_dsc_controller.identification.values import (
     parts,
 )
 from blf_dsc_controller.identification.windows import (
-    COLUMNS,
     STILL,
     Indices,
     Rows,
@@ -78,13 +76,9 @@ class LeftOut(NamedTuple):
         return found
 
 
-def left_out(
-    rows: Rows, model: SerialChain, G: Floats, values: Floats, distances: Floats
-) -> LeftOut:
-    """Return the columns for the values of a fit, with contacts that slide at `distances` (n,)."""
-    columns = [*_of_friction(rows, values, distances)]
-    rows.set_load((G @ values)[: rows.p])
-    columns += _of_torque(rows, (G @ values)[:-1])
+def left_out(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> LeftOut:
+    """Return the columns for the values of a fit, and the rows that it has (`Fit`)."""
+    columns = [*_of_friction(rows, values), *_of_torque(rows, (G @ values)[:-1])]
     kinds = [KINDS.index(kind) for kind, _ in columns]
     return LeftOut(
         np.stack([column for _, column in columns], axis=1),
@@ -93,24 +87,16 @@ def left_out(
     )
 
 
-def _of_friction(
-    rows: Rows, values: Floats, distances: Floats
-) -> Iterator[tuple[str, Floats]]:
-    """Yield kinds and columns (R, n) of other laws of friction.
-
-    The rows are left with contacts that slide at `distances`, and Stribeck friction as
-    the model has it.
-    """
+def _of_friction(rows: Rows, values: Floats) -> Iterator[tuple[str, Floats]]:
+    """Yield kinds and columns (R, n) of other laws of friction."""
     terms = parts(values).terms
     least = _SMALL * rows.largest_torque
     coulomb = np.maximum(terms[COULOMB], least)
     speed = np.maximum(rows.speed, STILL)
     viscous = np.maximum(terms[VISCOUS], least / speed)
     sliding = [_contact(rows, distance) for distance in DISTANCES]
-    rows.set_sliding(distances)
     for fading in _FADINGS:
-        yield 'fading', coulomb * _fading(rows, *fading)
-    rows.set_stribeck(STRIBECK_SPEED, 2.0)
+        yield 'fading', coulomb * rows.stribeck(*fading)
     for a, b in pairwise(sliding):
         yield 'contact', coulomb * (b - a)
     speeds = rows.over_windows(lambda at: np.abs(rows.dq[at]), rows.g)
@@ -126,20 +112,13 @@ def _of_torque(rows: Rows, theta: Floats) -> Iterator[tuple[str, Floats]]:
     of_bodies[rows.p : rows.unknowns - LOAD] = 0.0
     everything = np.arange(rows.time.size)
     loads = np.abs(rows.torques(everything, of_bodies))
-    yield 'load', loads * rows.friction[:, COLUMNS.index('Coulomb')]
+    yield 'load', loads * rows.columns['Coulomb']
     yield 'gain', rows.torques(everything, theta)
 
 
 def _contact(rows: Rows, distance: float) -> Floats:
-    """Return the column (R, n) of Coulomb friction for a distance; the rows keep it."""
-    rows.set_sliding(np.full(rows.speed.size, distance))
-    return np.array(rows.friction[:, COLUMNS.index('Coulomb')])
-
-
-def _fading(rows: Rows, speed: float, exponent: float) -> Floats:
-    """Return the column (R, n) of Stribeck friction that fades so; the rows keep it."""
-    rows.set_stribeck(speed, exponent)
-    return np.array(rows.friction[:, COLUMNS.index('Stribeck')])
+    """Return the column (R, n) of Coulomb friction for a distance."""
+    return rows.with_sliding(np.full(rows.speed.size, distance)).columns['Coulomb']
 
 
 def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Floats:

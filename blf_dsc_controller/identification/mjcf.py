@@ -13,7 +13,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from blf_dsc_controller.arms.urdf import Joint, pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.urdf import Joint
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.values import ROTOR_INERTIA
 from blf_dsc_controller.run import Floats

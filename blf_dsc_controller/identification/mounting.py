@@ -14,7 +14,7 @@ import numpy as np
 from blf_dsc_controller.arms.urdf import Chain, frames
 from blf_dsc_controller.identification.joint_alone import SIMPLE, Alone
 from blf_dsc_controller.identification.plausibility import inertial_torques
-from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows
+from blf_dsc_controller.identification.windows import Indices, Rows
 from blf_dsc_controller.run import Floats
 
 _UNSEEN = 1e-3  # of its deviation, what a component of gravity counts that is not shown
@@ -59,12 +59,12 @@ def _shown_gravity(
     # what friction does not show is taken to be as in most joints
     most = np.sign(np.sum(alone.friction))
     signs = np.where(alone.friction == 0.0, most or 1.0, alone.friction)
-    friction = [COLUMNS.index(name) for name in SIMPLE]
+    friction = rows.friction(fit, SIMPLE)
     lines = [_towards(given)]
     for i in range(n):
         columns = np.column_stack(
             (
-                rows.friction[fit][:, friction, i],
+                friction[:, :, i],
                 of_gravity[:, i],
                 inertial[:, i],
                 signs[i] * u[:, i],
@@ -72,7 +72,7 @@ def _shown_gravity(
         )
         weight = rows.weight[fit, i, None] / deviation[i]
         R = np.asarray(np.linalg.qr(columns * weight, mode='r'))
-        lines.append(R[len(friction) :, len(friction) :])  # for any friction
+        lines.append(R[len(SIMPLE) :, len(SIMPLE) :])  # for any friction
     A = np.concatenate(lines)
     found, *_ = np.linalg.lstsq(A[:, :-1], A[:, -1], rcond=None)
     # without friction, inertia shows whether all efforts are of the opposite sign

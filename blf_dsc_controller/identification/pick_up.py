@@ -32,7 +32,7 @@ def carried_load(rows: Rows, windows: Split, G: Floats, prior: Prior) -> Carried
     found = regression(rows, moving, G, prior)
     load = indices(prior.joints).load
     with_load, empty = [], found.folds.sum(axis=(0, 1))
-    for products in successive(rows, moving, G, prior, found, steps):
+    for products in successive(moving, G, prior, found, steps):
         added = _columns(products.sum(axis=0), load)
         with_load.append(added)
         empty -= added

@@ -24,7 +24,8 @@ from blf_dsc_controller.arms.base_parameters import (
     deviations,
     payload_inertia,
 )
-from blf_dsc_controller.arms.urdf import Chain, Joint, inertia_of, moved, pseudo_inertia
+from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
+from blf_dsc_controller.arms.urdf import Chain, Joint
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.physical import Cone
 from blf_dsc_controller.identification.values import (

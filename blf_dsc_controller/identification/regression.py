@@ -40,6 +40,7 @@ class Regression(NamedTuple):
     lasting: Floats  # (n,) correlation length of each joint's residual, s
     deviation: Floats  # (n,) of each joint's residual, N m or N
     delay: float  # s, of the torques in A
+    rows: Rows  # of A: with the load friction of the values before
 
 
 def regression(
@@ -66,8 +67,8 @@ def regression(
     counted = np.sum(rows.weight[fit] ** 2, axis=0) - theta.size / deviation.size
     counted = np.maximum(counted, 1.0)
     for _ in range(_PASSES):
-        rows.set_load(theta[: rows.p])
-        weighted = Weighted(rows, fit, float(theta[-1]))
+        loaded = rows.with_load(theta[: rows.p])
+        weighted = Weighted(loaded, fit, float(theta[-1]))
         of_joints = triangle(np.moveaxis(each, 1, 0) for each in weighted.blocks())
         scaled = of_joints / deviation[:, None, None]
         R = triangle([scaled.reshape(-1, theta.size + 1)])
@@ -88,16 +89,17 @@ def regression(
         _lasting(weighted, theta),
         deviation_used,
         weighted.delay,
+        loaded,
     )
-    folds = np.array(list(successive(rows, fit, G, prior, solved, parts)))
+    folds = np.array(list(successive(fit, G, prior, solved, parts)))
     return solved._replace(folds=folds)
 
 
 def successive(
-    rows: Rows, fit: Indices, G: Floats, prior: Prior, found: Regression, parts: int
+    fit: Indices, G: Floats, prior: Prior, found: Regression, parts: int
 ) -> Iterator[Floats]:
-    """Yield the products of `Regression.folds` for so many parts, as the rows are now."""
-    weighted = Weighted(rows, fit, found.delay)
+    """Yield the products of `Regression.folds` for so many parts."""
+    weighted = Weighted(found.rows, fit, found.delay)
     T = to_z(G, prior)
     for products in weighted.products(parts):
         yield T.T @ (products / found.deviation[:, None, None] ** 2) @ T
@@ -194,6 +196,7 @@ class Fit(NamedTuple):
 
     values: Floats  # (17 n + 14,) in the order of `Parts`
     problem: Regression
+    rows: Rows  # with the load friction of these values
 
 
 def fitted(
@@ -207,5 +210,4 @@ def fitted(
     problem = regression(rows, windows, G, prior, near)
     z = solve(problem.A, problem.b, prior.cones, prior.start)
     values = prior.mean + prior.D @ z
-    rows.set_load((G @ values)[: rows.p])
-    return Fit(values, problem)
+    return Fit(values, problem, rows.with_load((G @ values)[: rows.p]))

@@ -12,7 +12,7 @@ from blf_dsc_controller.identification.values import (
     VISCOUS,
     parts,
 )
-from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows, Split
+from blf_dsc_controller.identification.windows import Indices, Rows, Split
 from blf_dsc_controller.run import Floats
 
 
@@ -20,7 +20,7 @@ def scored(
     rows: Rows, windows: Split, G: Floats, prior: Floats, values: Floats
 ) -> Score:
     """Return the score of values that were fitted to `windows.fit`."""
-    rows.set_load((G @ values)[: rows.p])
+    rows = rows.with_load((G @ values)[: rows.p])
     moving = windows.moving
     urdf = np.zeros_like(prior)
     parts(urdf).bodies[:] = parts(prior).bodies
@@ -57,7 +57,7 @@ def nearest_friction(rows: Rows, windows: Split, values: Floats) -> Floats:
     fit = windows.fit
     terms = parts(values).terms[1:].copy()
     terms[OFFSET - 1] = 0.0
-    friction = np.sum(rows.friction[fit] * terms, axis=1)
+    friction = np.sum(rows.friction(fit) * terms, axis=1)
     friction[:, -2:] += rows.coupling[fit] @ parts(values).coupling
     weight = rows.weight[fit]
     friction *= weight
@@ -69,5 +69,5 @@ def nearest_friction(rows: Rows, windows: Split, values: Floats) -> Floats:
 
 def _columns_of_urdf(rows: Rows, windows: Indices) -> Floats:
     """Return the columns (k, 2, n) of viscous and Coulomb friction as a URDF has them."""
-    viscous = rows.friction[windows, COLUMNS.index('viscous')]
+    viscous = rows.columns['viscous'][windows]
     return np.stack((viscous, rows.sliding_at_once()[windows]), axis=1)

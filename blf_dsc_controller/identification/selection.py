@@ -31,22 +31,23 @@ class Selected(NamedTuple):
     """A choice of the model."""
 
     distances: Floats  # (n,) x_s of `sliding`, rad or m
+    rows: Rows  # with these contacts
     prior: Prior  # with the terms that are kept, and their widths
     widths: dict[str, float]  # factors of the groups of the prior
     found: Regression  # with all terms
 
 
 def select(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Selected:
-    """Return the model that predicts best, and set the columns of the rows for its contacts."""
+    """Return the model that predicts best."""
     distances = _contacts(rows, fit, G, full)
-    rows.set_sliding(distances)
+    rows = rows.with_sliding(distances)
     found = regression(rows, fit, G, full, parts=_PARTS)
     folds = found.folds.sum(axis=1, keepdims=True)
     prior = full.only(_worthwhile(found._replace(folds=folds), full))
     pairs = folds[::2] + folds[1::2]
     widths = prior_widths(found._replace(folds=pairs), prior)
     widened = prior.widened(_factors(prior, widths))
-    return Selected(distances, widened, widths, found)
+    return Selected(distances, rows, widened, widths, found)
 
 
 def _contacts(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Floats:
@@ -55,8 +56,8 @@ def _contacts(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Floats:
     found: Regression | None = None
     every = np.ones(full.mean.size)
     for distance in DISTANCES:
-        rows.set_sliding(np.full(rows.speed.size, distance))
-        found = regression(rows, fit, G, full, found)
+        slid = rows.with_sliding(np.full(rows.speed.size, distance))
+        found = regression(slid, fit, G, full, found)
         of_joints = cross_validated(found, every).sum(axis=0)
         errors.append(of_joints * found.deviation**2)
     table = np.array(errors)

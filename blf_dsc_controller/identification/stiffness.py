@@ -89,7 +89,7 @@ def compliance_of(
     needed = rows.torques(windows, links)
     rate = np.gradient(needed, rows.time[windows], axis=0)
     others = np.stack((
-        *np.moveaxis(rows.friction[windows], 1, 0),
+        *np.moveaxis(rows.friction(windows), 1, 0),
         rows.over_windows(lambda at: rows.dq[at], rows.slope)[windows],
         rate,
         rows.over_windows(lambda at: np.sin(rows.q[at]), rows.g)[windows],

@@ -62,10 +62,10 @@ class Doubt(NamedTuple):
     torques: Floats
 
 
-def doubt(problem: Problem, prior: Prior, fit: Fit, distances: Floats) -> Doubt:
-    """Return the doubt in a fit to all motion with this prior, and these distances of contacts."""
+def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
+    """Return the doubt in a fit to all motion with this prior."""
     model = problem.parameters.model
-    columns = left_out(problem.rows, model, problem.G, fit.values, distances)
+    columns = left_out(fit.rows, model, problem.G, fit.values)
     wider = _WiderModel(problem, prior, fit, columns)
     z, H, spread = wider.fit()
     k = wider.k
@@ -178,7 +178,7 @@ def _blocks(
     problem: Problem, prior: Prior, fit: Fit, columns: LeftOut
 ) -> Iterator[Floats]:
     """Yield the weighted rows [A | columns left out | b] (., n, k + e n + n + 1) of all motion."""
-    rows = problem.rows
+    rows = fit.rows
     moving = problem.windows.moving
     T = to_z(problem.G, prior)
     weighted = Weighted(rows, moving, fit.problem.delay)

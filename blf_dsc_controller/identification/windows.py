@@ -17,7 +17,7 @@ sample (Savitzky and Golay, Smoothing and differentiation of data, 1964).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -95,12 +95,14 @@ class Rows(NamedTuple):
     """R windows of n joints and m unknowns [P; COLUMNS of all joints; COUPLING; LOAD].
 
     The N samples are on disk, and so is what is large; `blocks` of windows come into
-    memory.
+    memory.  Rows do not change: `with_sliding` and `with_load` return others, which share
+    all columns but those of friction that they compute.
     """
 
     time: Floats  # (R,) of their centres, s
     inertial: OnDisk  # (R, n p) columns of P
-    friction: Floats  # (R, c, n) COLUMNS of each joint, which are zero for the others
+    # (R, n) by name, one for each of COLUMNS: of each joint, zero for the others
+    columns: Mapping[str, Floats]
     coupling: Floats  # (R, 2, 3) columns of COUPLING for the last two joints
     load: Floats  # (p, 10) columns of P that are those of a load
     carried: Carried
@@ -148,14 +150,18 @@ class Rows(NamedTuple):
         inertial = read[windows - windows[0]].reshape(-1, n, p)
         X[:, :, :p] = inertial
         joints = np.arange(n)
-        for c in range(len(COLUMNS)):
-            X[:, joints, p + c * n + joints] = self.friction[windows, c]
+        for c, name in enumerate(COLUMNS):
+            X[:, joints, p + c * n + joints] = self.columns[name][windows]
         at = X.shape[2] - LOAD - COUPLING
         if n > 1:
             X[:, -2:, at : at + COUPLING] = self.coupling[windows]
         with_load = self.carried.at(self.time[windows])
         X[with_load, :, -LOAD:] = inertial[with_load] @ self.load
         return X
+
+    def friction(self, windows: Indices, names: Sequence[str] = COLUMNS) -> Floats:
+        """Return columns of friction (k, c, n) of some windows: of the c names."""
+        return np.stack([self.columns[name][windows] for name in names], axis=1)
 
     def rms(self, values: Floats, windows: Indices) -> Floats:
         """Return the root mean square (..., n) of values (..., k, n) that are not clipped."""
@@ -191,38 +197,46 @@ class Rows(NamedTuple):
         at = np.arange(samples.start, samples.stop) / self.every - first
         return evenly_interpolated(at, torque)
 
-    def set_load(self, P: Floats) -> None:
-        """Compute the columns of the load friction for the gravity of P (p,)."""
-        self.set_column(
-            'load',
-            lambda rows: np.abs(self.gravity_torque(P, rows)) * self.sliding[rows],
-        )
+    def with_load(self, P: Floats) -> Rows:
+        """Return the rows with load friction for the gravity of P (p,)."""
 
-    def set_sliding(self, distances: Floats) -> None:
-        """Compute the columns of friction for the distances x_s (n,) of `sliding`.
+        def load(rows: slice) -> Floats:
+            return np.abs(self.gravity_torque(P, rows)) * self.sliding[rows]
 
-        Those of the load friction follow with the next `set_load`.
+        return self.with_column('load', load)
+
+    def with_sliding(self, distances: Floats) -> Rows:
+        """Return the rows with friction for the distances x_s (n,) of `sliding`.
+
+        They have no load friction: `with_load` adds it.
         """
+        sliding = OnDisk(self.speed.size)
         last: Floats | None = None
         for rows in blocks_of(len(self.q)):
             before = slice(max(rows.start - 1, 0), rows.stop)
             s = sliding_direction(self.q[before], self.dq[before], distances, last)
-            self.sliding[before] = s
+            sliding.append(s[rows.start - before.start :])
             last = s[-1]
-        self.set_column('Coulomb', lambda rows: self.sliding[rows])
-        self.set_stribeck(STRIBECK_SPEED, 2.0)
+        slid = self._replace(sliding=sliding)
+        columns = {
+            **self.columns,
+            'Coulomb': slid.over_windows(lambda rows: sliding[rows], self.g),
+            'Stribeck': slid.stribeck(STRIBECK_SPEED, 2.0),
+            'load': np.zeros((self.starts.size, self.speed.size)),
+        }
+        return slid._replace(columns=columns)
 
-    def set_stribeck(self, speed: float, exponent: float) -> None:
-        """Compute the columns of the Stribeck friction, s exp(-|v / speed|^exponent).
+    def stribeck(self, speed: float, exponent: float) -> Floats:
+        """Return the column (R, n) of the Stribeck friction, s exp(-|v / speed|^exponent).
 
         That is the shape of `arms.friction`, at |v / speed|^(exponent / 2).
         """
 
-        def stribeck(rows: slice) -> Floats:
+        def fading(rows: slice) -> Floats:
             over = np.abs(self.dq[rows] / speed) ** (0.5 * exponent)
             return self.sliding[rows] * fadings(over, 1.0)
 
-        self.set_column('Stribeck', stribeck)
+        return self.over_windows(fading, self.g)
 
     def sliding_at_once(self) -> Floats:
         """Return the Coulomb column (R, n) of contacts that do not yield: that of a URDF."""
@@ -230,9 +244,10 @@ class Rows(NamedTuple):
             lambda at: slidings(self.dq[at], COULOMB_SPEED), self.g
         )
 
-    def set_column(self, name: str, values: OfSamples) -> None:
-        """Set a column of each joint to the values of the samples, filtered."""
-        self.friction[:, COLUMNS.index(name)] = self.over_windows(values, self.g)
+    def with_column(self, name: str, values: OfSamples) -> Rows:
+        """Return the rows with a column of each joint: the values of the samples, filtered."""
+        column = self.over_windows(values, self.g)
+        return self._replace(columns={**self.columns, name: column})
 
     def u(self, delay: float) -> Floats:
         """Return the right-hand side (R, n) of torques recorded `delay` [s] late."""
@@ -285,10 +300,10 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
     dq = rows.dq
     _add_inertial(rows, model)
     _add_gravity(rows, model)
-    rows.set_sliding(np.zeros(n))
-    rows.set_column('viscous', lambda at: dq[at])
-    rows.set_column('offset', lambda at: np.ones_like(dq[at]))
-    rows.set_column('quadratic', lambda at: dq[at] * np.abs(dq[at]))
+    rows = rows.with_sliding(np.zeros(n))
+    rows = rows.with_column('viscous', lambda at: dq[at])
+    rows = rows.with_column('offset', lambda at: np.ones_like(dq[at]))
+    rows = rows.with_column('quadratic', lambda at: dq[at] * np.abs(dq[at]))
     if n > 1:
         _set_coupling(rows)
 
@@ -305,14 +320,13 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
     """Return the windows and what they are taken from, with columns that are zero or missing."""
     h = recording.period
     n = len(recording.joints)
-    size = recording.gap.size
     g, slope = weighting(h)
     q, dq, near_gap = _smoothed(recording)
     starts = _starts(near_gap, g.size, h)
     return Rows(
         time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
         inertial=OnDisk(n * model.p),
-        friction=np.zeros((starts.size, len(COLUMNS), n)),
+        columns={},  # those of `with_sliding` and `with_column`
         coupling=np.zeros((starts.size, min(n, 2), COUPLING)),
         load=np.zeros((model.p, LOAD)),
         carried=Carried(),
@@ -327,7 +341,7 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
         slope=slope,
         starts=starts,
         period=h,
-        sliding=mapped(size, lambda rows: np.zeros((rows.stop - rows.start, n))),
+        sliding=OnDisk(n),
         gravity=OnDisk(n * model.p),
         every=max(1, round(_GRAVITY / h)),
     )

@@ -16,11 +16,7 @@ from typing import NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.law import feedback, learning
 from blf_dsc_controller.law.clipping import clip
-from blf_dsc_controller.law.compensation import (
-    compensated,
-    correct_feedback,
-    measure_rotors,
-)
+from blf_dsc_controller.law.compensation import compensated, follow_rotors
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -40,9 +36,7 @@ class Backstepping(NamedTuple):
         """Compute the torque (35)."""
         compute_surface(settings, state, signals)
         learning.observe(settings, state, signals, t, dt)
-        if settings.rotors.unsure == 1:
-            measure_rotors(settings, state, signals, dt)
-            correct_feedback(settings, state, signals)
+        follow_rotors(settings, state, signals, dt)
         of = settings.feedback
         begins = state.samples[0] == 0.0
         feedback.advance(of, state.feedback, signals.xi2, begins, dt)

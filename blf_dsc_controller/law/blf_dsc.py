@@ -32,11 +32,7 @@ from typing import NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier, feedback, learning
-from blf_dsc_controller.law.compensation import (
-    compensated,
-    correct_feedback,
-    measure_rotors,
-)
+from blf_dsc_controller.law.compensation import compensated, follow_rotors
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.law.surface import known_rate, virtual_control
@@ -58,9 +54,7 @@ class BlfDsc(NamedTuple):
         """Compute the torque (28)."""
         compute_surface(settings, state, signals, dt)
         learning.observe(settings, state, signals, t, dt)
-        if settings.rotors.unsure == 1:
-            measure_rotors(settings, state, signals, dt)
-            correct_feedback(settings, state, signals)
+        follow_rotors(settings, state, signals, dt)
         begins = state.samples[0] == 0.0
         feedback.advance(settings.feedback, state.feedback, signals.xi2, begins, dt)
         for i in range(settings.n):

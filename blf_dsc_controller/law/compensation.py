@@ -92,6 +92,16 @@ def fill_known_torque(
 
 
 @inner
+def follow_rotors(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Where rotors are guessed, measure their error J~, and let the feedback follow it."""
+    if settings.rotors.unsure == 1:
+        measure_rotors(settings, state, signals, dt)
+        correct_feedback(settings, state, signals)
+
+
+@inner
 def measure_rotors(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:

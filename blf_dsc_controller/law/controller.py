@@ -307,6 +307,15 @@ class Controller:
         self.flags = 0
         # contiguous, of the kernel's type
         self._measurement = np.zeros(3 * self.settings.n)
+        self._compile()
+        self.reset()
+        self.reference_at(0.0)
+        self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
+        self.perceive(1e-3)
+        self.reset()
+
+    def _compile(self) -> None:
+        """Compile the kernels for the types of the vectors, which they are called with."""
         self._vectors = (
             self.settings.model,
             self.settings_vector,
@@ -317,12 +326,12 @@ class Controller:
             self._measurement,
         )
         views = self.settings, self.state, self.signals
-        self.given_law = given = for_kernels(law, *views)
+        self.given_law = given = for_kernels(self.law, *views)
         self._update = direct(
             for_law(update, given),
             given,
             *self._vectors,
-            reference_vector,
+            self.reference_vector,
             0.0,
             0.0,
             True,
@@ -333,11 +342,6 @@ class Controller:
             self._weigh = direct(weigh, *self._vectors[:4], 0.0)
         if self.settings.contact.enabled:
             self._sense = direct(sense, *self._vectors[:5], 0.0)
-        self.reset()
-        self.reference_at(0.0)
-        self.update(0.0, 1e-3, np.zeros(3 * self.settings.n))
-        self.perceive(1e-3)
-        self.reset()
 
     @functools.cached_property
     def kernels(self) -> LawKernels:
@@ -386,10 +390,10 @@ class Controller:
         """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.
 
         The measurement is [q (n,) rad, dq (n,) rad/s, effort (n,) N m]. The effort is
-        that of the last interval, and for the checks alone: the law learns from the
-        torque that it commanded. t [s] is the time since the start, dt [s] since the
-        last sample. If INVALID is among the `flags`, nothing has changed, including the
-        torque.
+        that of the last interval, and for the checks and the load observer alone: the law
+        learns from the torque that it commanded. t [s] is the time since the start, dt
+        [s] since the last sample. If INVALID is among the `flags`, nothing has changed,
+        including the torque.
 
         Raises BlfDscError if the measurement has another shape than (3 n,).
         """

@@ -11,7 +11,6 @@ import json
 from typing import Any
 
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.topics import Topic
 
 TOPICS = (
     *topics.TOPICS,
@@ -29,11 +28,6 @@ LOG = 102
 """For the log of the node: `level` and `text`."""
 STOP = 103
 """`~/stop` was called, and what became of it: text."""
-
-
-def topic_of(kind: int) -> Topic | None:
-    """Return the topic of a kind; None if it is not a topic's."""
-    return TOPICS[kind] if kind < len(TOPICS) else None
 
 
 def encode(content: Any) -> bytes:

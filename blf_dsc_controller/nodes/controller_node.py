@@ -266,6 +266,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if trajectories is not None and trajectories.job is not None:
             trajectories.poll(guard)
         try:
+            if self.load_service is not None:
+                self.load_service.follow(guard, self.config)
             torque = self._torque_for(guard, raw)
             self._write(topics.JOINT_STATES, raw)
             self._command(torque)
@@ -274,7 +276,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.survive(error)
             return
         if guard.has_sample:
-            self._look_at_learning(guard)
+            self._look_at_what_rarely_changes(guard)
         self._publish_telemetry(torque)
         if self.action is not None:
             self.action.poll(guard)
@@ -300,8 +302,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         return True
 
     def _torque_for(self, guard: Guard, raw: bytes) -> np.ndarray | None:
-        if self.load_service is not None:
-            self.load_service.follow(guard, self.config)
+        """Return the torque (n,) [N m] for a joint state; None: command nothing."""
         try:
             stamp = self._decoder.decode(raw)
         except MessageError as error:
@@ -314,7 +315,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             return torque
         return guard.update(stamp, self._decoder.values)
 
-    def _look_at_learning(self, guard: Guard) -> None:
+    def _look_at_what_rarely_changes(self, guard: Guard) -> None:
         """Update from time to time what rarely changes: subscribers, learning, rate."""
         samples = guard.controller.samples
         if (samples - 1) % _RARELY == 0:

@@ -9,7 +9,6 @@ to `/**`.
 
 from __future__ import annotations
 
-import gc
 import signal
 import sys
 import time
@@ -32,6 +31,7 @@ from blf_dsc_controller.configuration.nodes import (
     read,
     unmatched_sections,
 )
+from blf_dsc_controller.control.realtime import undisturbed_loop
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
@@ -96,12 +96,9 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
                     nodes.append(make())
                     ending.callback(_close, nodes[-1])
                     executor.add_node(nodes[-1])
-                # What is loaded by now stays: scanning it again would stall the loop
-                # for 0.1 s.
-                gc.collect()
-                gc.freeze()
-                while not _is_over(nodes):
-                    spin_once(executor, *nodes)
+                with undisturbed_loop():
+                    while not _is_over(nodes):
+                        spin_once(executor, *nodes)
             for failure in filter(None, (node.failure for node in nodes)):
                 raise failure
         except UnknownROSArgsError as error:

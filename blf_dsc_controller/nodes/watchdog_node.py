@@ -228,12 +228,12 @@ class WatchdogNode(PlainNode):
         try:
             if message.handle is topics.JOINT_STATES:
                 stamp = self._states.decode(raw)
-                watchdog.state(stamp, self._states.values, now)
+                watchdog.take_state(stamp, self._states.values, now)
             elif message.handle is topics.COMMANDS and not self._encoder.has_layout(
                 raw
             ):
                 self._commands.decode(raw)
-                watchdog.torque_of_controller(self._commands.values, now)
+                watchdog.take_torque(self._commands.values, now)
         except MessageError as error:
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
 

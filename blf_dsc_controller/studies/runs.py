@@ -52,8 +52,8 @@ from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.compiled_loop import run_loop
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone
+from blf_dsc_controller.studies.distributions import Drawn
 from blf_dsc_controller.studies.monte_carlo import (
-    Drawn,
     Study,
     draw,
     load_study,

@@ -20,9 +20,9 @@ class DeclaredLoads:
         tells = config.load.tell_drive
         self._loads = DriveLoads(config) if tells else None
 
-    def next(self) -> DriveLoad | None:
-        """Return the load to declare to the drives next, None if there is none."""
-        return None if self._loads is None else self._loads.next(self._controller)
+    def begin_step(self) -> DriveLoad | None:
+        """Begin the next step: return the load to declare to the drives; None if there is none."""
+        return None if self._loads is None else self._loads.begin_step(self._controller)
 
     def take(self, config: ControllerConfig, load: DriveLoad) -> None:
         """Subtract the weight of a load that the drives add from now on.
@@ -33,7 +33,7 @@ class DeclaredLoads:
         self._of(config).take(self._controller, load)
 
     def declare(self, config: ControllerConfig, load: DriveLoad) -> None:
-        """Let `next` lead to this load, whatever is weighed.
+        """Let the steps lead to this load, whatever is weighed.
 
         Raises:
             BlfDscError: the drives add no weight.

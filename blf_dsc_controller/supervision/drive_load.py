@@ -103,8 +103,8 @@ class DriveLoads:
         most = controller.settings.observer.most
         most[:] = 0.0 if is_left_out else most_load(controller.settings.torque.limit)
 
-    def next(self, controller: Controller) -> DriveLoad | None:
-        """Return the load to declare next; None if there is none, or too uncertain.
+    def begin_step(self, controller: Controller) -> DriveLoad | None:
+        """Begin the next step: return the load to declare; None if there is none, or too uncertain.
 
         Nothing is declared while something touches the arm.
         """

@@ -285,7 +285,7 @@ class Guard(InCommand):
 
     def load_to_tell(self) -> DriveLoad | None:
         """Return the load to declare to the drives next, None if there is none."""
-        return self.loads.next() if self.has_sample else None
+        return self.loads.begin_step() if self.has_sample else None
 
     def take_over(self, load: DriveLoad) -> None:
         """Subtract the weight of a load that the drives add from the next state on."""

@@ -132,7 +132,7 @@ class TorqueWatchdog:
             self.stands_down = False
             self._forget_controller()
 
-    def state(self, stamp: int, measurement: Vector, now: float) -> None:
+    def take_state(self, stamp: int, measurement: Vector, now: float) -> None:
         """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
         limit = self.config.safety.velocity_limit
         gap = (stamp - self.stamp) * 1e-9
@@ -150,7 +150,7 @@ class TorqueWatchdog:
             self._commanded_at = now
             self._commanded_stamp = stamp
 
-    def torque_of_controller(self, torque: Vector, now: float) -> None:
+    def take_torque(self, torque: Vector, now: float) -> None:
         """Take a torque (n,) [N m] of the controller, and hand over to it."""
         self._safe.commanded[:] = np.nan_to_num(torque)
         self._knows_torque = True

@@ -10,13 +10,12 @@ from __future__ import annotations
 import os
 import sys
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from math import inf, isfinite
+from collections.abc import Mapping, Sequence
+from math import inf
 from typing import Any
 
 import numpy as np
 
-from blf_dsc_controller.analysis.report import LEVELS
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig
 from blf_dsc_controller.configuration.received import without_files
@@ -24,11 +23,6 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import (
-    JointStateDecoder,
-    joint_state_layout,
-    typestore,
-)
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import (
     MOTIONS,
@@ -46,7 +40,15 @@ from blf_dsc_controller.nodes.parameters import declare
 from blf_dsc_controller.nodes.process import PlainNode, run
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.model_error import ModelError
+from blf_dsc_controller.view.newest import (
+    LONGEST,
+    check_positions,
+    newest,
+    state_in,
+)
 from blf_dsc_controller.view.page import PAST, Page, Snapshot, contact_text
+from blf_dsc_controller.view.plant_events import plant_events
+from blf_dsc_controller.view.thinned_run import ThinnedRun
 
 _PERIOD = 1.0 / 30.0  # s
 _PLOTTED = 6  # frames between updates of the plots
@@ -54,11 +56,8 @@ _PAUSE = 1.0  # s without targets, after which another stream is listed
 _SILENCE = 30  # frames without a joint state before the page reports it
 _OUTDATED = 500_000_000  # ns
 _LISTED = 12  # events
-_KEPT = 2000  # snapshots of a run
 _LATE = 1.0  # s, after which a first sample is that of a view that was started later
 _MISSED = 'watches from here on: earlier curves are not sent again, only a bag has them'
-_LONGEST = 300  # characters of an event
-_MOST_PLANNED = 1000  # events of a plant
 _NICE = 10  # lower priority than the loop
 _SHARED = Quality(10, 'best_effort')  # the newest may be those of a gripper
 _LOCAL = ('127.0.0.1', 'localhost')  # hosts that only this computer can reach
@@ -91,7 +90,7 @@ class ViewNode(PlainNode):
     Attributes:
         page: what is served.
         past: the snapshots of the last `PAST` seconds.
-        run: snapshots of the whole run, at most `_KEPT`, evenly spaced.
+        run: snapshots of the whole run.
         config: of the controller that is shown; None: none has been seen.
         plant: parameters of the simulated plant, if there is one.
         sampled: stamp of the last tracking error [ns]; -1 before the first.
@@ -102,8 +101,7 @@ class ViewNode(PlainNode):
         config = declare(self, ViewConfig)
         self.page = Page(config.host, config.port)
         self.past: deque[Snapshot] = deque()
-        self.run: list[Snapshot] = []
-        self._stride, self._taken = 1, 0  # of the snapshots that are kept
+        self.run = ThinnedRun()
         self._is_offered = False  # whether the page offers to replay them
         self.config: ControllerConfig | None = None
         self.plant: dict[str, Any] = {}  # parameters of the simulated plant
@@ -174,16 +172,7 @@ class ViewNode(PlainNode):
         has_ended = self._finished and self._silent >= _SILENCE
         if has_ended != self._is_offered:
             self._is_offered = has_ended
-            self.page.offer_replay(list(self.run) if has_ended else [])
-
-    def _keep_for_replay(self, snapshot: Snapshot) -> None:
-        """Keep every `_stride`-th snapshot of the run; thin them out if too many."""
-        if self._taken % self._stride == 0:
-            self.run.append(snapshot)
-        self._taken += 1
-        if len(self.run) > _KEPT:
-            del self.run[1::2]
-            self._stride *= 2
+            self.page.offer_replay(list(self.run.snapshots) if has_ended else [])
 
     def _health(self) -> tuple[str, str]:
         """Return the state of the controller, or that it or the arm has gone silent."""
@@ -212,7 +201,7 @@ class ViewNode(PlainNode):
             elif topic is topics.TARGETS:
                 self._list_motion(decode(raw))
             elif topic is topics.STATE:
-                self._state = _state_in(raw)
+                self._state = state_in(raw)
             else:
                 self._follow_plant(decode_change(raw))
         except BlfDscError as error:
@@ -220,8 +209,8 @@ class ViewNode(PlainNode):
 
     def _list(self, time: float, kind: str, text: str) -> None:
         """List an event; others may send texts of any length."""
-        shown = text if len(text) <= _LONGEST else f'{text[:_LONGEST]} ...'
-        self._events.append((time, kind[:_LONGEST], shown))
+        shown = text if len(text) <= LONGEST else f'{text[:LONGEST]} ...'
+        self._events.append((time, kind[:LONGEST], shown))
 
     def _follow_plant(self, change: Change) -> None:
         """Follow the parameters of the simulated plant."""
@@ -249,8 +238,7 @@ class ViewNode(PlainNode):
         if event.type is EventType.START:
             self._start, self._noted = event.stamp, -1.0
             self.past.clear()
-            self.run.clear()
-            self._stride, self._taken = 1, 0
+            self.run = ThinnedRun()
         details = [
             f'{content[k]}' for k in ('reason', 'text', 'parameters') if k in content
         ]
@@ -314,12 +302,12 @@ class ViewNode(PlainNode):
         stamps: dict[Topic, int] = {}
         for topic, messages in streams.items():
             try:
-                found = _newest(messages, self._names[topic])
+                found = newest(messages, self._names[topic])
                 if found is None:  # those of a gripper, for instance
                     continue
                 at, values = found
                 if topic is topics.JOINT_STATES:
-                    _check_positions(self._names[topic], values[0])
+                    check_positions(self._names[topic], values[0])
             except MessageError as error:
                 self._pass_over(error)
             else:
@@ -336,11 +324,11 @@ class ViewNode(PlainNode):
 
     def _keep(self, time: float) -> None:
         """Keep a snapshot of the newest values, at a time [s]."""
-        if self._taken == 0 and time > _LATE:
+        if self.run.taken == 0 and time > _LATE:
             self._list(time, 'view', _MISSED)
         now = self._snapshot(time)
         self.past.append(now)
-        self._keep_for_replay(now)
+        self.run.take(now)
         while self.past[0].time < time - PAST - 1.0:
             self.past.popleft()
         self._events += [e for e in self._planned if self._noted < e[0] <= time]
@@ -400,75 +388,6 @@ def _quality(topic: Topic) -> Quality:
         return _SHARED
     is_stream = topic in _STREAMS and topic not in _LATCHED
     return topics.UNRELIABLE if is_stream else topic.requested
-
-
-def _state_in(raw: bytes) -> tuple[str, str]:
-    """Return level and text of the controller's state; BlfDscError if there are none."""
-    try:
-        status: Any = typestore().deserialize_cdr(raw, topics.STATE.type)
-        return LEVELS[int(status.level)], str(status.message)[:_LONGEST]
-    except Exception as error:  # libraries raise nearly anything
-        raise BlfDscError(
-            f'a message of {topics.STATE.resolved} holds no state: {error!r}'
-        ) from error
-
-
-def _newest(
-    messages: Iterable[bytes], names: Sequence[str]
-) -> tuple[int, Floats] | None:
-    """Return stamp [ns] and values (3, m) of the last message with any of these names.
-
-    Missing values are NaN. None: no message has one.
-    """
-    for raw in reversed([*messages]):
-        theirs = joint_state_layout(raw).names
-        if set(theirs).isdisjoint(names):
-            continue
-        decoder = JointStateDecoder(theirs, ())
-        stamp = decoder.decode(raw)
-        known = dict(zip(theirs, decoder.values.reshape(3, -1).T, strict=True))
-        values = np.transpose([known.get(name, (np.nan,) * 3) for name in names])
-        return stamp, values
-    return None
-
-
-def _check_positions(joints: Sequence[str], position: Floats) -> None:
-    """Raise MessageError unless the arm can be drawn at these positions (n,)."""
-    odd = [
-        joint
-        for joint, value in zip(joints, position.tolist(), strict=True)
-        if not isfinite(value)
-    ]
-    if odd:
-        raise MessageError(f'no position of {", ".join(odd)} in the joint states')
-
-
-def plant_events(values: Mapping[str, Any]) -> list[tuple[float, str, str]]:
-    """Return time [s], kind and text of a simulated arm's events."""
-    begin, duration, masses = (
-        _numbers(values.get(f'events.{name}'))
-        for name in ('begin', 'duration', 'payload')
-    )
-    nothing = (0.0,) * len(begin)
-    duration, masses = duration or nothing, masses or nothing
-    found = []
-    for k, (at, lasts, mass) in enumerate(
-        zip(begin, duration, masses, strict=False), 1
-    ):
-        texts = (f'{mass:g} kg picked up', f'{mass:g} kg put down')
-        first, last = texts if mass else (f'event {k} begins', f'event {k} ends')
-        found.append((at, 'plant', first))
-        found += [(at + lasts, 'plant', last)] if lasts else []
-    return sorted(found)
-
-
-def _numbers(given: Any) -> tuple[float, ...]:
-    """Return a list of finite numbers; empty if it is none, or too long to be shown."""
-    is_list = isinstance(given, (list, tuple)) and len(given) <= _MOST_PLANNED
-    is_known = is_list and all(
-        isinstance(each, (int, float)) and isfinite(each) for each in given
-    )
-    return tuple(map(float, given)) if is_known else ()
 
 
 def main() -> int:

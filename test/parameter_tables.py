@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of the page of all parameters.
+
+`python test/parameter_tables.py doc/parameters.md` writes them; what is above them stays.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from blf_dsc_controller.configuration import known_arm, law_file
+from blf_dsc_controller.configuration.law_traits import GAINS
+from blf_dsc_controller.configuration.nodes import CONTROLLER, NODES
+from blf_dsc_controller.configuration.schema import (
+    Parameter,
+    format_value,
+    parameters,
+)
+
+HEADER = (
+    '| name | default | unit | live | description | type and range |\n'
+    '| --- | --- | --- | --- | --- | --- |\n'
+)
+
+
+def with_tables(page: str) -> str:
+    """Return the page of all parameters; what is above its tables stays."""
+    above = page.partition('\n## ')[0]
+    tables: dict[str, str] = {}
+    sections = [
+        _section(node, parameters(cls), tables)
+        + (_optional() if node == CONTROLLER else '')
+        for node, cls in NODES.items()
+    ]
+    return above + ''.join(sections)
+
+
+def _optional() -> str:
+    """Return tables of what the controller has with some laws, or if it is given."""
+    tables = [
+        _of_group(
+            f'Gains of {law}', f'Only the law `{law}` has them.', law_file.GROUP, group
+        )
+        for law, group in GAINS.items()
+    ]
+    known = _of_group(
+        'Known data of the arm',
+        'The controller has them if one is given, or by the law `model_based`.',
+        known_arm.GROUP,
+        known_arm.KnownArm,
+    )
+    return ''.join((*tables, known))
+
+
+def _of_group(heading: str, text: str, group: str, cls: type) -> str:
+    """Return the section of a group that the controller may have."""
+    params = (replace(param, name=f'{group}.{param.name}') for param in parameters(cls))
+    return f'\n### {heading}\n\n{text}\n\n{_table(params)}'
+
+
+def _section(node: str, params: Iterable[Parameter], earlier: dict[str, str]) -> str:
+    """Return a node's section: a table of its parameters for each group.
+
+    One that is among the `earlier` tables, each with its heading, is linked to instead.
+    """
+    groups: dict[str, list[Parameter]] = {}
+    for param in params:
+        group, _, _ = param.name.rpartition('.')
+        groups.setdefault(group, []).append(param)
+    tables = [f'\n## {node}\n']
+    for group, members in groups.items():
+        title = f'{node}: {group}'
+        heading = f'\n### {title}\n' if group else ''
+        table = _table(members)
+        if other := earlier.get(table):
+            table = f'As [{other}](#{_anchor(other)}).\n'
+        earlier.setdefault(table, title)
+        tables.append(f'{heading}\n{table}')
+    return ''.join(tables)
+
+
+_SHORT = (
+    (' array', 's'),
+    ('; entries: joints', ' per joint'),
+    ('; may be empty', ' or []'),
+    ('at least ', '≥ '),
+    ('at most ', '≤ '),
+    ('above ', '> '),
+    ('below ', '< '),
+    (' and ', ', '),
+    ('one of ', ''),
+)
+"""Shorter words for types and ranges, as the head of the page explains them."""
+
+
+def _shortened(kind: str) -> str:
+    for long, short in _SHORT:
+        kind = kind.replace(long, short)
+    return kind
+
+
+def _anchor(heading: str) -> str:
+    """Return how the site links to a heading."""
+    return heading.lower().replace(': ', '-').replace('_', '-')
+
+
+def _table(params: Iterable[Parameter]) -> str:
+    return HEADER + ''.join(map(_row, params))
+
+
+def _row(param: Parameter) -> str:
+    symbol = f' ({param.symbol})' if param.symbol else ''
+    kind = '; '.join(part for part in (param.kind, param.constraints) if part)
+    cells = (
+        f'`{param.name}`',
+        f'`{format_value(param.default)}`',
+        param.unit,
+        '' if param.read_only else '•',
+        f'{param.description}{symbol}',
+        _shortened(kind),
+    )
+    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
+
+
+if __name__ == '__main__':
+    path = Path(sys.argv[1])
+    path.write_text(with_tables(path.read_text(encoding='utf-8')), encoding='utf-8')
