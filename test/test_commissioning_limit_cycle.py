@@ -71,6 +71,26 @@ def test_stick_and_slip_whose_frequency_wanders_is_found():
     assert cycle.frequency == pytest.approx(6.2, abs=0.7)
 
 
+def sticking(amplitude):
+    """Return the error of a joint that sticks and slips while it moves: 3.8 to 4.4 Hz."""
+    phase = 2.0 * np.pi * 4.1 * T + 0.3 / 0.2 * np.sin(2.0 * np.pi * 0.2 * T)
+    return amplitude * np.sin(phase)
+
+
+def test_stick_and_slip_is_found_beside_slower_errors_of_the_motion():
+    """As of a seven-joint arm: no line of its peak is as high as the slower one."""
+    (cycle,) = found(sticking(1.5e-3) + wave(1.1e-3, 1.2), IN_MOTION)
+    assert cycle.amplitude == pytest.approx(1.5e-3, rel=0.2)
+    assert cycle.frequency == pytest.approx(4.1, abs=0.7)
+
+
+def test_what_is_smaller_than_slower_errors_or_rings_after_each_reversal_is_none():
+    assert found(sticking(0.8e-3) + wave(1.5e-3, 1.2), IN_MOTION) == []
+    since = np.mod(T, 2.5)  # s, since the joint reversed
+    rings = 5.3e-3 * np.exp(-since / 0.3) * np.sin(2.0 * np.pi * 4.0 * since)
+    assert found(rings + wave(0.85e-3, 1.2), IN_MOTION) == []
+
+
 @pytest.mark.parametrize(
     'error',
     [

@@ -405,7 +405,10 @@ def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
 
 
 PROVEN = """
-    feedback: {joint_stiffness: [K1, K2], joint_damping: [D1, D2]}
+    feedback:
+      joint_stiffness: [K1, K2]
+      joint_damping: [D1, D2]
+      joint_damping_lag: [0.003, 0.0]
     reference: {type: sinusoids, offset: [0.3, 1.1], amplitude: [0.1, 0.1], frequency: [2.0],
                 phase: [0.0]}
 """
@@ -437,12 +440,14 @@ def test_gains_are_proven_in_three_steps_and_errors_compared(arm, capsys, monkey
     assert [told.find(each) > 0 for each in said] == [True] * 3
     assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 6]
     folder = arm.with_name('proof')
-    gains = []
+    written = blf.load_loop(arm).controller
     for share in (50, 75, 100):
-        content = read_content(folder / f'{share}_of_the_gains').controller_config()
-        gains.append(content.feedback.gain)
-    np.testing.assert_allclose(gains[0], 0.5 * np.array(gains[2]), rtol=1e-9)
-    np.testing.assert_allclose(gains[1], 0.75 * np.array(gains[2]), rtol=1e-9)
+        proven = read_content(folder / f'{share}_of_the_gains').controller_config()
+        assert proven.feedback.joint_damping_lag == (0.003, 0.0)
+        expected = 0.01 * share * np.array(written.feedback.gain)
+        np.testing.assert_allclose(proven.feedback.gain, expected, rtol=1e-9)
+    calm = {'safety.oscillation': 'stop'}
+    assert proven == change(written, calm)  # all of what was written, but for the check
     # the table: the largest error of each joint, as its bag has it, beside one to expect
     run = blf.read_run(folder / '100_of_the_gains')
     for name, error in zip(

@@ -131,12 +131,14 @@ class Loops(NamedTuple):
         C_y, C_v = (each[0] for each in law_responses(feedback, self.sample_time, s))
         L = C_y @ response.position + C_v @ response.velocity
         left, values, right = np.linalg.svd(np.eye(n) + L)
-        # u^H (I + L) v changes by u^H dL v, dL_ij with the deviation rows_i columns_j
-        rows = np.abs(np.diagonal(C_y, axis1=1, axis2=2)) * response.position_noise
-        rows += np.abs(np.diagonal(C_v, axis1=1, axis2=2)) * response.velocity_noise
-        of_rows = np.linalg.norm(left[:, :, -1] * rows, axis=1)
-        of_columns = np.linalg.norm(right[:, -1] * response.columns, axis=1)
-        doubt = DEVIATIONS * of_rows * of_columns
+        # u^H (I + L) v changes by u^H dL v; what two share changes in both at once
+        position, velocity = response.deviations()
+        dL = np.abs(np.diagonal(C_y, axis1=1, axis2=2))[:, :, None] * position
+        dL += np.abs(np.diagonal(C_v, axis1=1, axis2=2))[:, :, None] * velocity
+        parts = np.abs(left[:, :, -1, None]) * dL * np.abs(right[:, -1, None, :])
+        both = parts + np.swapaxes(parts, 1, 2)
+        squares = np.where(response.shared, 0.5 * both**2, parts**2)
+        doubt = DEVIATIONS * np.sqrt(squares.sum(axis=(1, 2)))
         return values[:, -1], np.asarray(doubt), right[:, -1].conj()
 
 

@@ -8,6 +8,10 @@ twentieth of the torque limit.  So the errors of a proof are looked at, at rest 
 A limit cycle is a peak of their spectrum that has most of what there is in the band, and is about
 as high in both halves of the time.  What dies out, drifts, follows from the reference, or is noise
 is none.
+
+The motion has slower errors of its own, and a joint that sticks and slips while it moves has no one
+frequency: its peak is wide, and each line of it may be lower than a slower one.  Then the peak as a
+whole counts, if it lasts all the time: what rings after each reversal of a joint does not.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ _OF_RATE = 0.35  # of the sample rate, the fastest at most
 _LASTS = 0.5  # of the amplitude of one half of the time, that the other has at least
 _PURE = 0.5  # of the mean square in the band, that the peak has at least
 _WIDE, _LINES = 0.2, 2  # reach of a peak: of its frequency, and lines at least
+_STEADY = 0.6  # of its rms, that the median of the amplitude over the time has at least
 _OF_WINDOW = 1.5  # lines of noise that one of a window of Hann has
 
 
@@ -79,8 +84,7 @@ def _peak(error: Floats, T: float, slowest: float) -> tuple[float, float] | None
     fastest = min(_FASTEST, _OF_RATE / T)
     band = np.flatnonzero((frequency >= slowest) & (frequency <= fastest))
     k = int(band[square[band].argmax()])
-    slower = (frequency >= slowest / _BELOW) & (frequency < slowest)
-    if k == band[0] or square[slower].max() > square[k]:  # the end of something slower
+    if k == band[0]:  # the end of something slower
         return None
     reach = max(_WIDE * frequency[k], _LINES * frequency[1])
 
@@ -94,7 +98,21 @@ def _peak(error: Floats, T: float, slowest: float) -> tuple[float, float] | None
     lasts = min(halves) >= _LASTS**2 * max(halves)
     if whole < _LEAST**2 or not (pure and lasts):
         return None
+    slower = (frequency >= slowest / _BELOW) & (frequency < slowest)
+    if square[slower].max() > square[k]:
+        sums = np.convolve(square, np.ones(2 * _LINES + 1), 'same')
+        if sums[slower].max() > whole or not _is_steady(error, T, frequency_at, reach):
+            return None
     return float(np.sqrt(whole)), frequency_at
+
+
+def _is_steady(error: Floats, T: float, frequency: float, reach: float) -> bool:
+    """Whether a wave around a frequency, within `reach` [Hz], is there most of the time."""
+    at = np.fft.fftfreq(error.size, T)
+    near = np.abs(at - frequency) <= reach  # not its mirror image
+    amplitude = np.abs(np.fft.ifft(near * np.fft.fft(np.hanning(error.size) * error)))
+    middle = amplitude[error.size // 4 : -error.size // 4]
+    return bool(np.median(middle) >= _STEADY * np.sqrt((middle**2).mean()))
 
 
 def _spectrum(error: Floats, T: float) -> tuple[Floats, Floats]:

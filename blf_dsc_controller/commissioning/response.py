@@ -16,6 +16,11 @@ counts only if both lines show more of it than noise (`seen`).
 
 Between the lines there is what the motion did not cause: noise, ripple, and what friction
 makes of it.  A line has as much, which gives the standard deviation of each response.
+
+A torque of joint j moves joint i as one of joint i moves joint j: the mass matrix is symmetric,
+and so are G_y and G_v while gears are stiff, at low frequencies.  The one that is moved with
+little torque says little about a strong joint; the other way round more is known.  So both have
+the mean of both there, by their variances, unless they differ by more than noise (`shared`).
 """
 
 from __future__ import annotations
@@ -35,6 +40,8 @@ Complex = NDArray[np.complex128]
 _MOST_LOST = 0.01  # of the samples of a period
 _FINER = 4  # times as many frequencies as there are lines of a joint
 DEVIATIONS = 2.0  # of noise, that count
+# Hz, up to which G is symmetric: links that a motor of 20 Hz turns lag others by up to 0.6 there
+_RECIPROCAL = 12.0
 _BETWEEN = 3  # times n lines to either side, from which the noise is taken
 
 
@@ -52,10 +59,22 @@ class Response(NamedTuple):
     position_noise: Floats  # rad
     velocity_noise: Floats  # rad/s
     columns: Floats  # (f, n) 1/(N m), size of the columns of U^-1
+    shared: NDArray[np.bool_]  # (f, n, n) G_ij and G_ji are the mean of both
     posture: Floats  # (n,) rad, mean
     seen: NDArray[np.bool_]  # (f,) the rest may be noise that looks like a resonance
     speed: Floats  # (n,) rad/s, of all tones: mean square over mean
     friction: Floats  # (n,) N m, a constant one that takes the power of the slow tones
+
+    def deviations(self) -> tuple[Floats, Floats]:
+        """Return the standard deviations (f, n, n) of G_y [rad/(N m)] and G_v [rad/(s N m)]."""
+        own = (
+            noise[:, :, None] * self.columns[:, None, :]
+            for noise in (self.position_noise, self.velocity_noise)
+        )
+        position, velocity = (
+            np.where(self.shared, each * np.sqrt(_weight(each)), each) for each in own
+        )
+        return position, velocity
 
 
 def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
@@ -87,12 +106,42 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
         position_noise=noises[0],
         velocity_noise=noises[1],
         columns=np.asarray(np.linalg.norm(inverse, axis=1)),
+        shared=np.zeros(Y_at.shape, bool),
         posture=np.asarray(position.mean(axis=0)),
         seen=np.ones(len(lines.frequencies), bool),
         speed=speed,
         friction=friction,
     )
-    return refined(at_lines)
+    return refined(reciprocal(at_lines))
+
+
+def reciprocal(response: Response) -> Response:
+    """Return a response, symmetric at low frequencies where it may be so."""
+    deviations = response.deviations()
+    measured = response.position, response.velocity
+    n = response.columns.shape[1]
+    shared = (response.frequency <= _RECIPROCAL)[:, None, None] & ~np.eye(n, dtype=bool)
+    for G, deviation in zip(measured, deviations, strict=True):
+        apart = np.abs(G - _mirrored(G)) ** 2
+        variance = deviation**2 + _mirrored(deviation) ** 2
+        shared = shared & (apart <= DEVIATIONS**2 * variance)
+    position, velocity = (
+        np.where(shared, _mirrored(G) + _weight(deviation) * (G - _mirrored(G)), G)
+        for G, deviation in zip(measured, deviations, strict=True)
+    )
+    return response._replace(position=position, velocity=velocity, shared=shared)
+
+
+def _mirrored(values: NDArray[Any]) -> NDArray[Any]:
+    return np.swapaxes(values, 1, 2)
+
+
+def _weight(deviation: Floats) -> Floats:
+    """Return the weight (f, n, n) of G_ij in the mean with G_ji, by the deviations of both."""
+    other = _mirrored(deviation) ** 2
+    variance = deviation**2 + other
+    weight = np.full_like(other, 0.5)
+    return np.asarray(np.divide(other, variance, out=weight, where=variance > 0.0))
 
 
 def refined(response: Response) -> Response:
@@ -122,6 +171,7 @@ def refined(response: Response) -> Response:
         position_noise=between(response.position_noise),
         velocity_noise=between(response.velocity_noise),
         columns=between(response.columns),
+        shared=response.shared[low] & response.shared[low + 1],
         posture=response.posture,
         seen=_is_seen(response, inverse, inverse_between, low),
         speed=response.speed,
