@@ -145,7 +145,7 @@ class Guard(InCommand):
                 self._wait_for_valid(measurement)
                 return self._safe_at(stamp, measurement)
             self.starting.forget_load_after_gap(stamp, measurement)
-            self.safe_torque.last.take(stamp, measurement, self.slow)
+            self._take(stamp, measurement)
             if not self.starting.start(stamp, measurement):
                 return self.safe(self.config.sample_time)
         elif self.held.after_gap is not None and not self.starting.rejoin(
@@ -157,7 +157,7 @@ class Guard(InCommand):
         if self.controller.flags & INVALID:
             self.findings.stop_at_invalid(stamp, measurement)
             return self._safe_at(stamp, measurement)
-        self.safe_torque.last.take(stamp, measurement, self.slow)
+        self._take(stamp, measurement)
         self._advance_to(stamp)
         self.findings.check_efforts()
         fault = self.samples.check(dt) or self.findings.calm()
@@ -200,6 +200,11 @@ class Guard(InCommand):
         self.findings.compare_velocities(stamp, measurement)
         return self.safe_at(stamp, measurement)
 
+    def _take(self, stamp: int, measurement: Vector) -> None:
+        """Keep a state that the law has used, or is about to."""
+        period = self.config.sample_time
+        self.safe_torque.last.take(stamp, measurement, self.slow, period)
+
     def _advance_to(self, stamp: int) -> None:
         self.reference.last_stamp = stamp
         if (
@@ -226,7 +231,8 @@ class Guard(InCommand):
         self.journal.messages += count
         self.journal.commands += count
         self.has_sample = True
-        self.safe_torque.last.take(stamp, measurement, self.slow)
+        self.safe_torque.last.follow(stamps, self.config.sample_time)
+        self._take(stamp, measurement)
         self.safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp, count)
         self.samples.relax((stamp - self.reference.last_stamp) * NANOSECOND)

@@ -19,8 +19,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.law.sensor import FILTER as SLOW
 from blf_dsc_controller.supervision.recent_motion import is_gap
+from blf_dsc_controller.supervision.state_check import LONG_GAP
 
 Vector = NDArray[np.float64]
+
+_REMEMBERED = 250_000_000  # ns, for which the next gap may be as long as one before
+_LONGEST = 0.25  # s: after a longer one the arm is braked all the same
 
 
 class LastState:
@@ -32,6 +36,8 @@ class LastState:
         slow: v (n,) [rad/s], the velocity to damp.
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         age: time without a usable state [s]; infinite before the first.
+        gap: longest time [s] between two states of the last quarter of a second, in which
+            states were missing, at most 0.25 s; 0 if none were.
     """
 
     def __init__(self, n: int) -> None:
@@ -41,10 +47,15 @@ class LastState:
         self.slow = np.zeros(n)
         self.ddq: Vector | None = None
         self.age = inf
+        self.gap = 0.0
+        self._gap_ended = 0  # ns, stamp of the state after it
         self._stamp = -1
 
-    def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
-        """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
+    def take(
+        self, stamp: int, measurement: Vector, slow: Vector, period: float
+    ) -> None:
+        """Store a valid state with its stamp [ns] and v (n,) [rad/s], as `take_usable`."""
+        self._measure_gap(stamp, period)
         self.measurement[:] = measurement
         self.slow[:] = slow
         self.ddq = None
@@ -66,6 +77,7 @@ class LastState:
             self.miss(period)
             return
         elapsed = (stamp - self._stamp) * 1e-9
+        self._measure_gap(stamp, period)
         is_late = is_gap(elapsed, period)
         is_next = self.age == 0.0 and elapsed > 0.0 and not is_late
         differenced = np.zeros_like(q)
@@ -83,6 +95,12 @@ class LastState:
         self.age = 0.0
         self._stamp = stamp
 
+    def follow(self, stamps: NDArray[np.int64], period: float) -> None:
+        """Measure the gaps between states that others used, with their stamps (k,) [ns]."""
+        for stamp in stamps.tolist():
+            self._measure_gap(stamp, period)
+            self._stamp = stamp
+
     def leads_to(self, stamp: int, q: Vector, fastest: float, period: float) -> bool:
         """Whether the arm at q (n,) [rad] comes from this state: no gap, and no jump.
 
@@ -98,3 +116,12 @@ class LastState:
         self.dq[:] = self.slow[:] = 0.0
         self.ddq = None
         self.age += period
+
+    def _measure_gap(self, stamp: int, period: float) -> None:
+        """Measure the gap that a state with this stamp [ns] ends, if it does."""
+        if stamp - self._gap_ended > _REMEMBERED:
+            self.gap = 0.0
+        gap = (stamp - self._stamp) * 1e-9
+        if self._stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
+            self.gap = min(gap, _LONGEST)
+            self._gap_ended = stamp
