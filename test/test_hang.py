@@ -308,7 +308,7 @@ def test_torque_that_is_left_behind_is_that_of_a_run_sample_by_sample():
 def test_after_a_gap_the_velocity_to_be_damped_is_the_measured_one(gap, slow, ddq):
     """Positions show the mean of the gap, here 3 rad/s; a shorter step lets it in by 0.02/0.03."""
     last = LastState(1)
-    last.take(START, np.zeros(3), np.zeros(1), 1e-3)
+    last.take(START, np.zeros(3), np.zeros(1))
     stamp = START + round(gap * 1e9)
     last.take_usable(stamp, np.array([3.0 * gap, 0.5, 0.0]), 5.0, 1e-3)
     np.testing.assert_allclose(last.slow, slow)

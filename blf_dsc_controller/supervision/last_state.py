@@ -12,6 +12,7 @@ to be braked, and cannot keep up an oscillation of the arm.  It is that of
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import inf
 
 import numpy as np
@@ -51,11 +52,8 @@ class LastState:
         self._gap_ended = 0  # ns, stamp of the state after it
         self._stamp = -1
 
-    def take(
-        self, stamp: int, measurement: Vector, slow: Vector, period: float
-    ) -> None:
-        """Store a valid state with its stamp [ns] and v (n,) [rad/s], as `take_usable`."""
-        self._measure_gap(stamp, period)
+    def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
+        """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
         self.measurement[:] = measurement
         self.slow[:] = slow
         self.ddq = None
@@ -77,7 +75,7 @@ class LastState:
             self.miss(period)
             return
         elapsed = (stamp - self._stamp) * 1e-9
-        self._measure_gap(stamp, period)
+        self.measure_gaps((stamp,), period)
         is_late = is_gap(elapsed, period)
         is_next = self.age == 0.0 and elapsed > 0.0 and not is_late
         differenced = np.zeros_like(q)
@@ -95,12 +93,6 @@ class LastState:
         self.age = 0.0
         self._stamp = stamp
 
-    def follow(self, stamps: NDArray[np.int64], period: float) -> None:
-        """Measure the gaps between states that others used, with their stamps (k,) [ns]."""
-        for stamp in stamps.tolist():
-            self._measure_gap(stamp, period)
-            self._stamp = stamp
-
     def leads_to(self, stamp: int, q: Vector, fastest: float, period: float) -> bool:
         """Whether the arm at q (n,) [rad] comes from this state: no gap, and no jump.
 
@@ -117,11 +109,16 @@ class LastState:
         self.ddq = None
         self.age += period
 
-    def _measure_gap(self, stamp: int, period: float) -> None:
-        """Measure the gap that a state with this stamp [ns] ends, if it does."""
-        if stamp - self._gap_ended > _REMEMBERED:
-            self.gap = 0.0
-        gap = (stamp - self._stamp) * 1e-9
-        if self._stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
-            self.gap = min(gap, _LONGEST)
-            self._gap_ended = stamp
+    def measure_gaps(self, stamps: Iterable[int], period: float) -> None:
+        """Measure the gaps that states with these stamps [ns] end, before one is stored.
+
+        `period` [s] is the usual time between two states.
+        """
+        for stamp in stamps:
+            gap = (stamp - self._stamp) * 1e-9
+            if stamp - self._gap_ended > _REMEMBERED:
+                self.gap = 0.0
+            if self._stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
+                self.gap = min(gap, _LONGEST)
+                self._gap_ended = stamp
+            self._stamp = stamp

@@ -32,7 +32,7 @@ OBSERVER = 60.0, 30.0
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
 # of the damping: an elastic joint that oscillates passes for a light one
 _LIGHTEST = 0.5
-_FASTER = 0.05  # rad/s, of a joint by the torque that a ramp takes back
+_FASTER = 0.02  # rad/s, of a joint by the torque that a ramp takes back
 
 
 def safe_torque(
