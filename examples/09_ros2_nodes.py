@@ -20,14 +20,24 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import blf_dsc_controller as blf
 
 PRESET = str(blf.share_folder() / 'config' / 'panda.yaml')
-STARTED = 'from blf_dsc_controller.cli.main import {0}; raise SystemExit({0}())'
+# A node ends as by Ctrl-C with its input, which is this program's as long as it lives.
+STARTED = """
+import os, signal, sys, threading
+def end_with_parent():
+    sys.stdin.buffer.read()
+    os.kill(os.getpid(), signal.SIGINT)
+threading.Thread(target=end_with_parent, daemon=True).start()
+from blf_dsc_controller.cli.main import {0}
+raise SystemExit({0}())
+"""
 
 
 def started(name: str, *parameters: str) -> subprocess.Popen:
     """Start a node, as `ros2 run blf_dsc_controller NAME` does."""
     given = [word for each in parameters for word in ('-p', each)]
     words = ['--ros-args', '--params-file', PRESET, *given]
-    return subprocess.Popen([sys.executable, '-c', STARTED.format(name), *words])
+    command = [sys.executable, '-c', STARTED.format(name), *words]
+    return subprocess.Popen(command, stdin=subprocess.PIPE)
 
 
 mode = sys.argv[1] if len(sys.argv) > 1 else 'realtime'

@@ -12,7 +12,9 @@ from blf_dsc_controller.law.state import Settings
 Array = NDArray[np.float64]
 
 
-def braking_matrix(settings: Settings, damping: Array, q: Array) -> Array:
+def braking_matrix(
+    settings: Settings, damping: Array, q: Array, gap: float = 0.0
+) -> Array:
     """Return D(q) (n, n) [N m s/rad] with the `damping` (n,) of each joint on its diagonal.
 
     Joints that brake by themselves drag those behind them along: a wrist of a Panda gets
@@ -25,14 +27,53 @@ def braking_matrix(settings: Settings, damping: Array, q: Array) -> Array:
     other way round with less.  D is the product, entry by entry, of two matrices that are
     symmetric and positive semidefinite, and so it is one, too (Schur's product theorem): it
     takes energy out of any motion, that of elastic joints included.  M0 is of the initial
-    estimate; without one, D is diagonal.
+    estimate; without one, D is diagonal.  `gap` [s] bounds it as `within_gap` does.
     """
+    M = _inertia(settings, q)
+    if M is None:
+        return np.diag(damping)
+    rate = _least_rate(damping / np.diagonal(M), gap)
+    return _without_reversal(np.minimum.outer(rate, rate) * M, M, gap)
+
+
+def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Array:
+    """Return the `damping` (n,) [N m s/rad] of joints that a gap of states allows them.
+
+    A torque -D v that is held for h turns v into v - h M^-1 D v.  While no eigenvalue of
+    h M0^-1 D is above 1, it reverses no motion of the model; above 2, each gap leaves a
+    faster one than before.  So no rate is above 1/h, and what the coupling of the joints
+    adds to that divides D.  Without a gap, `gap` is 0.
+    """
+    M = _inertia(settings, q) if gap > 0.0 else None
+    if M is None:
+        return damping
+    inertia = np.diagonal(M)
+    borne = np.diag(_least_rate(damping / inertia, gap) * inertia)
+    return np.diagonal(_without_reversal(borne, M, gap))
+
+
+def accelerations(settings: Settings, torque: Array, q: Array) -> Array | None:
+    """Return M0^-1 tau (n,) [rad/s^2] of a torque (n,) [N m]; None without an estimate."""
+    M = _inertia(settings, q)
+    return None if M is None else np.linalg.solve(M, torque)
+
+
+def _inertia(settings: Settings, q: Array) -> Array | None:
+    """Return M0 (n, n) [kg m^2] at q (n,) [rad]; None without an estimate."""
     M = inertia_matrices(
         settings.model, settings.initial_estimate[: settings.p], q[np.newaxis]
     )[0]
-    inertia = np.diagonal(M)
-    if not (np.isfinite(M).all() and (inertia > 0.0).all()):
-        return np.diag(damping)
-    rate = damping / inertia
-    coupled: Array = np.minimum.outer(rate, rate) * M
-    return coupled
+    is_known = np.isfinite(M).all() and (np.diagonal(M) > 0.0).all()
+    return M if is_known else None
+
+
+def _least_rate(rate: Array, gap: float) -> Array:
+    return np.minimum(rate, 1.0 / gap) if gap > 0.0 else rate
+
+
+def _without_reversal(D: Array, M: Array, gap: float) -> Array:
+    """Return D (n, n), divided by the largest eigenvalue of gap M^-1 D if it is above 1."""
+    if gap == 0.0:
+        return D
+    largest = gap * float(np.linalg.eigvals(np.linalg.solve(M, D)).real.max())
+    return D / max(1.0, largest)

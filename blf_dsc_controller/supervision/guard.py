@@ -15,7 +15,7 @@ declared to the drives.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import perf_counter
 
 import numpy as np
@@ -145,7 +145,7 @@ class Guard(InCommand):
                 self._wait_for_valid(measurement)
                 return self._safe_at(stamp, measurement)
             self.starting.forget_load_after_gap(stamp, measurement)
-            self.safe_torque.last.take(stamp, measurement, self.slow)
+            self._take((stamp,), measurement)
             if not self.starting.start(stamp, measurement):
                 return self.safe(self.config.sample_time)
         elif self.held.after_gap is not None and not self.starting.rejoin(
@@ -157,7 +157,7 @@ class Guard(InCommand):
         if self.controller.flags & INVALID:
             self.findings.stop_at_invalid(stamp, measurement)
             return self._safe_at(stamp, measurement)
-        self.safe_torque.last.take(stamp, measurement, self.slow)
+        self._take((stamp,), measurement)
         self._advance_to(stamp)
         self.findings.check_efforts()
         fault = self.samples.check(dt) or self.findings.calm()
@@ -200,6 +200,12 @@ class Guard(InCommand):
         self.findings.compare_velocities(stamp, measurement)
         return self.safe_at(stamp, measurement)
 
+    def _take(self, stamps: Sequence[int], measurement: Vector) -> None:
+        """Keep the last of some states that the law uses, with their stamps [ns]."""
+        last = self.safe_torque.last
+        last.measure_gaps(stamps, self.config.sample_time)
+        last.take(stamps[-1], measurement, self.slow)
+
     def _advance_to(self, stamp: int) -> None:
         self.reference.last_stamp = stamp
         if (
@@ -226,7 +232,7 @@ class Guard(InCommand):
         self.journal.messages += count
         self.journal.commands += count
         self.has_sample = True
-        self.safe_torque.last.take(stamp, measurement, self.slow)
+        self._take(stamps.tolist(), measurement)
         self.safe_torque.commanded[:] = self.controller.state.torque
         self.states.advance(stamp, count)
         self.samples.relax((stamp - self.reference.last_stamp) * NANOSECOND)

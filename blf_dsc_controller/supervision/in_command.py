@@ -223,10 +223,11 @@ class InCommand:
     def safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
         """Return the safe torque for a state that the law has not used."""
         limit = self.config.safety.velocity_limit
-        dt = self.config.sample_time
-        self.safe_torque.last.take_usable(stamp, measurement, limit, dt)
+        T = self.config.sample_time
+        self.safe_torque.last.take_usable(stamp, measurement, limit, T)
         self._observe_speed()
-        return self.safe(dt)
+        # the states that are missing in a gap: a ramp that counted states would last
+        return self.safe(T * max(1, round(self.readings.gap / T)))
 
     def safe_without_state(self, dt: float) -> Vector | None:
         """Return the safe torque, `dt` [s] later, by the last state."""

@@ -12,6 +12,7 @@ to be braked, and cannot keep up an oscillation of the arm.  It is that of
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import inf
 
 import numpy as np
@@ -19,8 +20,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.law.sensor import FILTER as SLOW
 from blf_dsc_controller.supervision.recent_motion import is_gap
+from blf_dsc_controller.supervision.state_check import LONG_GAP
 
 Vector = NDArray[np.float64]
+
+_REMEMBERED = 250_000_000  # ns, for which the next gap may be as long as one before
+_LONGEST = 0.25  # s: after a longer one the arm is braked all the same
 
 
 class LastState:
@@ -32,6 +37,8 @@ class LastState:
         slow: v (n,) [rad/s], the velocity to damp.
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         age: time without a usable state [s]; infinite before the first.
+        gap: longest time [s] between two states of the last quarter of a second, in which
+            states were missing, at most 0.25 s; 0 if none were.
     """
 
     def __init__(self, n: int) -> None:
@@ -41,6 +48,8 @@ class LastState:
         self.slow = np.zeros(n)
         self.ddq: Vector | None = None
         self.age = inf
+        self.gap = 0.0
+        self._gap_ended = 0  # ns, stamp of the state after it
         self._stamp = -1
 
     def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
@@ -66,6 +75,7 @@ class LastState:
             self.miss(period)
             return
         elapsed = (stamp - self._stamp) * 1e-9
+        self.measure_gaps((stamp,), period)
         is_late = is_gap(elapsed, period)
         is_next = self.age == 0.0 and elapsed > 0.0 and not is_late
         differenced = np.zeros_like(q)
@@ -98,3 +108,17 @@ class LastState:
         self.dq[:] = self.slow[:] = 0.0
         self.ddq = None
         self.age += period
+
+    def measure_gaps(self, stamps: Iterable[int], period: float) -> None:
+        """Measure the gaps that states with these stamps [ns] end, before one is stored.
+
+        `period` [s] is the usual time between two states.
+        """
+        for stamp in stamps:
+            gap = (stamp - self._stamp) * 1e-9
+            if stamp - self._gap_ended > _REMEMBERED:
+                self.gap = 0.0
+            if self._stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
+                self.gap = min(gap, _LONGEST)
+                self._gap_ended = stamp
+            self._stamp = stamp

@@ -79,7 +79,16 @@ class SafeStop:
     def begin_deactivation(self, safety: Safety) -> None:
         """Begin the ramp of a law that leaves command in order."""
         self._swings.begin()
-        self._torque.begin_ramp(safety.deactivation_ramp, self._held.load())
+        load = self._held.load()
+        ramp = safety.deactivation_ramp
+        if safety.torque == 'hold_gravity':
+            ramp = min(
+                ramp,
+                self._torque.longest_ramp(
+                    self._controller.settings, self._samples.estimate, load
+                ),
+            )
+        self._torque.begin_ramp(ramp, load)
 
     def begin_anew(self, safety: Safety, load: Vector) -> None:
         """Begin the ramp of a law that forgets what it has learned, with this load (n,) [N m]."""
