@@ -55,7 +55,7 @@ def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Arra
 def accelerations(settings: Settings, torque: Array, q: Array) -> Array | None:
     """Return M0^-1 tau (n,) [rad/s^2] of a torque (n,) [N m]; None without an estimate."""
     M = _inertia(settings, q)
-    return None if M is None else np.linalg.solve(M, torque)
+    return None if M is None else np.asarray(np.linalg.solve(M, torque))
 
 
 def _inertia(settings: Settings, q: Array) -> Array | None:
