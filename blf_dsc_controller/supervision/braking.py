@@ -52,12 +52,6 @@ def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Arra
     return np.diagonal(_without_reversal(borne, M, gap))
 
 
-def accelerations(settings: Settings, torque: Array, q: Array) -> Array | None:
-    """Return M0^-1 tau (n,) [rad/s^2] of a torque (n,) [N m]; None without an estimate."""
-    M = _inertia(settings, q)
-    return None if M is None else np.asarray(np.linalg.solve(M, torque))
-
-
 def _inertia(settings: Settings, q: Array) -> Array | None:
     """Return M0 (n, n) [kg m^2] at q (n,) [rad]; None without an estimate."""
     M = inertia_matrices(

@@ -31,6 +31,8 @@ WINDING_UP = (
 )
 """Reasons of stops before which the estimates may have wound up."""
 
+_FASTER = 0.02  # rad/s, of a joint while the torque of a deactivation ramps down
+
 
 class SafeStop:
     """The ramp to the safe torque of a controller's arm, and what becomes of the arm."""
@@ -77,18 +79,17 @@ class SafeStop:
         )
 
     def begin_deactivation(self, safety: Safety) -> None:
-        """Begin the ramp of a law that leaves command in order."""
+        """Begin the ramp of a law that leaves command in order.
+
+        A linear ramp of R from the torque of an acceleration a makes a joint faster by
+        a R / 2.  It is so short that this is at most `_FASTER`.
+        """
         self._swings.begin()
-        load = self._held.load()
+        fastest = float(np.abs(self._controller.signals.ddqr).max())
         ramp = safety.deactivation_ramp
-        if safety.torque == 'hold_gravity':
-            ramp = min(
-                ramp,
-                self._torque.longest_ramp(
-                    self._controller.settings, self._samples.estimate, load
-                ),
-            )
-        self._torque.begin_ramp(ramp, load)
+        if safety.torque == 'hold_gravity' and fastest * ramp > 2.0 * _FASTER:
+            ramp = 2.0 * _FASTER / fastest
+        self._torque.begin_ramp(ramp, self._held.load())
 
     def begin_anew(self, safety: Safety, load: Vector) -> None:
         """Begin the ramp of a law that forgets what it has learned, with this load (n,) [N m]."""

@@ -13,11 +13,7 @@ from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST
-from blf_dsc_controller.supervision.braking import (
-    accelerations,
-    braking_matrix,
-    within_gap,
-)
+from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import model_torque, needed_torque
@@ -32,7 +28,6 @@ OBSERVER = 60.0, 30.0
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
 # of the damping: an elastic joint that oscillates passes for a light one
 _LIGHTEST = 0.5
-_FASTER = 0.02  # rad/s, of a joint by the torque that a ramp takes back
 
 
 def safe_torque(
@@ -160,21 +155,6 @@ class SafeTorque:
         self._start[:] = self.commanded
         self._duration = duration
         self._elapsed = 0.0
-
-    def longest_ramp(self, settings: Settings, estimate: Vector, load: Vector) -> float:
-        """Return how long [s] the last torque may ramp to zero without speeding joints up.
-
-        What it has beyond the motion with this `load` (n,) [N m] accelerates the arm by a.
-        A linear ramp of R adds a R/2, of which each joint may get `_FASTER`.
-        """
-        last = self.last
-        steady = needed_torque(
-            settings, estimate, last.q, last.dq, np.zeros(settings.n)
-        )
-        driving = self.commanded - steady - load
-        a = accelerations(settings, driving, last.q)
-        largest = 0.0 if a is None else float(np.abs(a).max())
-        return 2.0 * _FASTER / largest if largest > 0.0 else inf
 
     def yield_to_contact(self) -> None:
         """Give way, with gravity and damping, until the next ramp; observe no load."""
