@@ -146,8 +146,10 @@ def test_positions_of_motors_are_recorded_and_identification_reads_them(wire):
     twist = read.torque[:] / 10_000.0
     known = ~np.isnan(read.twist[:]).any(axis=1)
     assert known.sum() > 500
-    expected = (twist - np.median(twist[known], axis=0))[known]
-    np.testing.assert_allclose(read.twist[:][known], expected, atol=1e-6)
+    # up to a constant: its median is that of the states, before they are interpolated
+    off = (read.twist[:] - twist)[known]
+    np.testing.assert_allclose(off - off.mean(axis=0), 0.0, atol=1e-6)
+    assert np.abs(np.median(read.twist[:][known], axis=0)).max() < 1e-5
     assert_replays(wire.folder / 'bag')
 
 
