@@ -29,8 +29,8 @@ _NOTICED = 0.02  # of the torque of gravity; a few amperes for some fifty N m
 _ALIKE = 0.9  # cosine of the angle between two torques
 _SEND = 'safety.first_torque: send'
 _DRIVER = (
-    '. Under `blf_dsc drive`, whose driver knows robot.drive_compensates and robot.effort of its '
-    f'robot and takes no others, only {_SEND} is left; in a node all of these are'
+    '. A driver of `blf_dsc drive` knows robot.drive_compensates and robot.effort of its robot, '
+    f'and takes no others: if its states do not show that, set {_SEND}'
 )
 
 
