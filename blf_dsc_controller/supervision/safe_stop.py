@@ -31,7 +31,7 @@ WINDING_UP = (
 )
 """Reasons of stops before which the estimates may have wound up."""
 
-_FASTER = 0.02  # rad/s, of a joint while the torque of a deactivation ramps down
+_FASTER = 0.1  # rad/s, of a joint while the torque of a deactivation ramps down
 
 
 class SafeStop:
