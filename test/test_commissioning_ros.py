@@ -124,13 +124,18 @@ def test_log_has_oscillations_of_moves_but_not_of_motions_which_shake_the_arm(
         Calming, 'text', property(lambda found: f'{found.count} so far')
     )
 
+    during = []
+
     def oscillate():
+        during.append(rig.node.guard.config.reference.type)
         rig.node.guard.calming.count += 2
         rig.node.log.warn_of_findings(rig.node.guard)
-        rig.at(4500, oscillate)  # in the motion, too
+        if len(during) == 1:
+            rig.at(4500, oscillate)  # in the motion, too
 
     rig.at(300, oscillate)
     rig.measured(NEAR)
+    assert during == ['waypoints', 'sinusoids']
     assert said == ['2 so far']
     rig.node.log.warns_of_oscillations = True
     rig.node.log.warn_of_findings(rig.node.begin(rig.commissioning.config, ()))

@@ -149,9 +149,8 @@ class OverRos(PostureByPosture):
         if not node.guard or not node.guard.commanding:
             self._others = node.others
         recorder, disturbed = TopicRecorder(bag, in_background=True), _Disturbed()
-        node.log.warns_of_oscillations = not is_motion(
-            config
-        )  # it shakes the arm itself
+        # a motion shakes the arm itself
+        node.log.warns_of_oscillations = not is_motion(config)
         guard = node.begin(config, (recorder, disturbed))
         try:
             end, text = self._until_over(guard, disturbed, duration)
