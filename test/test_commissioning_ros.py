@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
+from blf_dsc_controller.supervision.calming import Calming
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
 
@@ -108,6 +110,36 @@ def test_a_run_goes_on_from_the_torque_that_holds_the_arm(ros, tmp_path):
     np.testing.assert_allclose(before.torque[-1], (1.0, 0.5), atol=0.05)
     np.testing.assert_allclose(after.torque[0], (1.0, 0.5), atol=0.05)
     np.testing.assert_allclose(after.position[100], before.position[-1], atol=2e-3)
+
+
+def test_log_has_oscillations_of_moves_but_not_of_motions_which_shake_the_arm(
+    rig, monkeypatch
+):
+    """Nor an empty warning, where a run begins with fewer than the one before has had."""
+    shorten_motions(monkeypatch)
+    said = []
+    silent = SimpleNamespace(warning=said.append, info=str, fatal=str)
+    monkeypatch.setattr(rig.node.log, '_log', silent)
+    monkeypatch.setattr(
+        Calming, 'text', property(lambda found: f'{found.count} so far')
+    )
+
+    during = []
+
+    def oscillate():
+        during.append(rig.node.guard.config.reference.type)
+        rig.node.guard.calming.count += 2
+        rig.node.log.warn_of_findings(rig.node.guard)
+        if len(during) == 1:
+            rig.at(4500, oscillate)  # in the motion, too
+
+    rig.at(300, oscillate)
+    rig.measured(NEAR)
+    assert during == ['waypoints', 'sinusoids']
+    assert said == ['2 so far']
+    rig.node.log.warns_of_oscillations = True
+    rig.node.log.warn_of_findings(rig.node.begin(rig.commissioning.config, ()))
+    assert said == ['2 so far']
 
 
 def calm(rig):

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.commissioning.motion import is_motion
 from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.commissioning.postures import (
     Answer,
@@ -148,6 +149,8 @@ class OverRos(PostureByPosture):
         if not node.guard or not node.guard.commanding:
             self._others = node.others
         recorder, disturbed = TopicRecorder(bag, in_background=True), _Disturbed()
+        # a motion shakes the arm itself
+        node.log.warns_of_oscillations = not is_motion(config)
         guard = node.begin(config, (recorder, disturbed))
         try:
             end, text = self._until_over(guard, disturbed, duration)

@@ -19,11 +19,13 @@ class ControllerLog:
 
     Attributes:
         warns_of_gains: whether to warn, once, of gains whose margin nobody has measured.
+        warns_of_oscillations: whether to warn of oscillations, which may be meant.
     """
 
     def __init__(self, node: PlainNode) -> None:
         """Write to the log of a node."""
         self.warns_of_gains = True
+        self.warns_of_oscillations = True
         self._node = node
         self._log = node.get_logger()
         self._phase = Phase.INACTIVE, 0, False, ''  # stops, silenced, text of a stop
@@ -101,7 +103,8 @@ class ControllerLog:
             self._log.warning(contacts.last.text)
         if guard.calming.count != self._oscillations:
             self._oscillations = guard.calming.count
-            self._log.warning(guard.calming.text)
+            if self.warns_of_oscillations:
+                self._log.warning(guard.calming.text)
         if guard.findings.untrusted != self._untrusted:
             self._untrusted = guard.findings.untrusted
             if self._untrusted:

@@ -89,6 +89,7 @@ class RunByRunNode(ControllerNode):
         acting, self._acting = self._acting, None
         self._loop = GuardedLoop(config, self._steady, self._wall)
         self.config, self.guard = config, self._loop.guard
+        self.log.begin()
         for output in outputs:
             self.outputs.add(output)
         if acting is None:
