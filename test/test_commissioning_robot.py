@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import sys
 from pathlib import Path
 
@@ -331,7 +332,10 @@ def test_gains_too_soft_for_any_bound_are_refused(whole, capsys, monkeypatch):
     coarsen(whole, '4.0e-4')
     assert commission(whole, 'plant', '--yes', '--torque', '0.01') == 1
     told, why = capsys.readouterr()
-    assert 'too soft for any bound: joint1 would be off by up to 2.5 rad' in why
+    off = re.search(
+        r'too soft for any bound: joint1 would be off by up to (.*) rad', why
+    )
+    assert float(off[1]) > 0.35  # the widest bound; how far, noise decides
     assert '--torque' in why
     assert 'as assumed' in told
     assert nothing_looks_whole(whole)
