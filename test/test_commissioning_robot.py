@@ -331,7 +331,7 @@ def test_gains_too_soft_for_any_bound_are_refused(whole, capsys, monkeypatch):
     coarsen(whole, '4.0e-4')
     assert commission(whole, 'plant', '--yes', '--torque', '0.01') == 1
     told, why = capsys.readouterr()
-    assert 'too soft for any bound: joint1 would be off by up to 1.4 rad' in why
+    assert 'too soft for any bound: joint1 would be off by up to 2.8 rad' in why
     assert '--torque' in why
     assert 'as assumed' in told
     assert nothing_looks_whole(whole)
