@@ -211,6 +211,13 @@ def test_pick_up_past_the_bound_is_named_with_what_would_hold():
         assert of_bound(changes) == []
 
 
+def test_no_bound_beyond_half_a_turn_is_advised():
+    found = of_bound({'feedback.stiffness': 0.02})
+    assert len(found) == 2
+    for text in found:
+        assert re.search('no bound below half a turn is wide enough; give [a-z]', text)
+
+
 @pytest.mark.parametrize(('bandwidth', 'sensed'), [(60.0, True), (0.0, False)])
 def test_expectation_says_that_torque_sensors_are_not_in_it(bandwidth, sensed):
     config = change(

@@ -26,7 +26,6 @@ Floats = NDArray[np.float64]
 _STIFFENING = 0.6
 _ROOM = 1.1  # recommended bound over the errors to expect
 _WIDEST_BOUND = 0.35  # rad, 20 degrees
-_NO_BOUND = 'no bound fits, as pi rad is half a turn'
 
 
 def width_warnings(
@@ -93,10 +92,7 @@ def _of_unmodelled(
     if not errors[worst] > bound[worst]:
         return
     parameter = 'barrier.bound'
-    wide_enough = f'{_ROOM * errors[worst]:.2g} rad'
-    remedy = f'give {wide_enough}, or stiffer gains, if the arm bears them'
-    if _ROOM * errors[worst] > math.pi:
-        remedy = f'{_NO_BOUND}: give stiffer gains, if the arm bears them'
+    remedy = f'{_wide_enough(errors[worst])} stiffer gains, if the arm bears them'
     if of_tool := _tool_parameter(config):
         parameter = of_tool
         wider = float(errors[worst] / bound[worst])
@@ -132,6 +128,14 @@ def _guessed_rotors(config: ControllerConfig) -> str:
     )
 
 
+def _wide_enough(error: float) -> str:
+    """Return what to give against an error [rad], before what else helps."""
+    wide_enough = _ROOM * error
+    if wide_enough > math.pi:
+        return 'no bound below half a turn is wide enough; give'
+    return f'give {wide_enough:.2g} rad, or'
+
+
 def _of_pick_up(
     config: ControllerConfig, bound: Floats, errors: Floats
 ) -> Iterator[str]:
@@ -142,17 +146,15 @@ def _of_pick_up(
         return
     share = bound[worst] / peak
     parameter = 'barrier.bound'
-    wide_enough = f'give {_ROOM * peak:.2g} rad'
-    if _ROOM * peak > math.pi:
-        wide_enough = f'{_NO_BOUND}: give less robot.payload, if the arm carries less'
+    wide_enough = _wide_enough(peak)
     if of_tool := _tool_parameter(config):
         parameter = of_tool
-        wide_enough = f'give {_ROOM / share:.2g} times this bound at the tool'
+        wide_enough = f'give {_ROOM / share:.2g} times this bound at the tool, or'
     payload = config.robot.payload
     yield (
         f'{parameter}: when {payload:g} kg (robot.payload) are picked '
         f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} rad from its '
-        f'reference, past its bound of {bound[worst]:g} rad: {wide_enough}, or '
+        f'reference, past its bound of {bound[worst]:g} rad: {wide_enough} '
         f'{_remedy_of_pick_up(config, share)}, or pick up at most {share * payload:.2g} kg'
     )
 
