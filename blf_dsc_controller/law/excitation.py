@@ -22,8 +22,8 @@ parts of a period never agree about a lasting disturbance.
 A window that is not full does not average out disturbances.  It is learned from all the
 same after a change of the arm (see `change`) and, if configured, from the start, but its
 solution is pulled to the estimate before, most strongly in weakly excited directions.
-Likewise, a full window with an unusually
-large residual is pulled to an earlier solution, kept once per window.
+Likewise, a full window with an unusually large residual is pulled to an earlier solution,
+kept once per window.
 """
 
 from typing import Annotated, NamedTuple
