@@ -47,6 +47,7 @@ class LockstepDriver(DamiaoDriver):
     """A driver that brings its motors, once for each bus."""
 
     arrange = None
+    patience = PATIENCE  # s, for motors at rest; less where answers are lost on purpose
     at: ClassVar = {}  # number of a state: what is done before it
     made = None  # the driver that was made last
 
@@ -72,6 +73,7 @@ class LockstepDriver(DamiaoDriver):
             target=self.motors.serve_in_lockstep, daemon=True
         )
         self.thread.start()
+        self._motors.patience = self.patience
         return super().connect()
 
     def read(self):

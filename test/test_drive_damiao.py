@@ -244,7 +244,7 @@ def test_an_error_frame_ends_the_run(made):
 def test_motors_that_cannot_be_driven_are_named(
     made, arrange, given, text, monkeypatch
 ):
-    monkeypatch.setattr('blf_dsc_controller.drive.damiao_motors._ANSWER', 2.0)
+    monkeypatch.setattr(LockstepDriver, 'patience', 2.0)
     with pytest.raises(DriverError, match=text):
         made(arrange, **given)
 

@@ -18,7 +18,6 @@ from blf_dsc_controller.motors.damiao import Register, Status
 from blf_dsc_controller.motors.frame import Frame, Ranges
 
 Vector = NDArray[np.float64]
-_ANSWER = 0.5  # s, for a motor at rest to answer
 _SECOND = 0.02  # s, in which a second motor with the same identifier answers, too
 _TRIES = 3
 
@@ -29,8 +28,11 @@ class DamiaoMotors:
     Attributes:
         ranges: what frames to them carry, as values of the joints.
         state: q, dq, torque (3, n) [rad, rad/s, N m] of the joints, as they sent it last.
+        patience: how long a motor at rest may take to answer [s]; a busy computer may
+            take long to hear it.
     """
 
+    patience = 2.0
     ranges: Ranges
     _at_motors: Ranges
 
@@ -187,7 +189,7 @@ class DamiaoMotors:
         """
         self._bus.clear()
         self.ask()
-        self._insist(self.collect(_ANSWER))
+        self._insist(self.collect(self.patience))
 
     def collect(self, timeout: float) -> list[int]:
         """Take a state of each; return the joints of those that sent none in time [s]."""
@@ -222,7 +224,7 @@ class DamiaoMotors:
             data = damiao.request_data(each, damiao.READ, register)
             self._bus.send(damiao.TO_ALL, data)
         found: dict[int, float] = {}
-        for joint, data in self._answers(_ANSWER):
+        for joint, data in self._answers(self.patience):
             value = damiao.reading_of(data, self._ids[joint], register)
             if value is not None:
                 found[joint] = value
