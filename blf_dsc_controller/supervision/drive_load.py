@@ -10,7 +10,8 @@ it,
 so that the whole torque of the joint does not change.  But the drives decide when the
 change takes effect.  A command that is on its way belongs to the earlier load, and is
 wrong by the change for one cycle.  So the load is declared in steps that change no
-torque by more than `_STEP` of its limit, each after the one before has taken effect.
+torque by more than `_STEP` of its limit, each after the one before has taken effect:
+`load_declaration` has the sequence.
 """
 
 from __future__ import annotations
@@ -37,9 +38,6 @@ _NARROW = 0.05  # kg, half of the interval of a mass that is declared
 _SHARE = 0.05  # or this part of the mass
 _CENTRE = 0.03  # m, likewise of its centre
 _STEP = 0.005  # of the torque limit
-
-EVERY = 20
-"""States from one step of a load that is declared to the next."""
 
 
 class DriveLoad(NamedTuple):
