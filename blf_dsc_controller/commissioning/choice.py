@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains, linear
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.linear_loop import (
     SLOWEST,
     Joints,
@@ -40,9 +41,6 @@ from blf_dsc_controller.commissioning.response import DEVIATIONS, Response
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-MARGIN = 0.5
-"""Modulus margin of the gains that are chosen."""
 
 BARELY = 0.1
 """Modulus margin, noise not counted, with which an arm nearly oscillates."""

@@ -18,6 +18,7 @@ from blf_dsc_controller.arms.joint_gains import (
     largest_share,
     unknown_arm,
 )
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
@@ -25,7 +26,6 @@ from blf_dsc_controller.commissioning.better_known import as_measured, known_fri
 from blf_dsc_controller.commissioning.choice import (
     BARELY,
     LAGS,
-    MARGIN,
     Choice,
     Loops,
     RigidArm,

@@ -12,6 +12,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, WATCHDOG
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.errors import TareError
@@ -62,7 +63,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(topics.CONTROLLER, ControllerConfig, **options)
+        super().__init__(CONTROLLER, ControllerConfig, **options)
         joints = self.config.joints
         self.guard: Guard | None = None
         self.outputs = Outputs()
@@ -290,7 +291,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _is_simulated(self) -> bool:
         """Whether all joint states are of this package's simulated arm."""
         found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
-        return all(each.node_name == topics.PLANT for each in found)
+        return all(each.node_name == PLANT for each in found)
 
     def survive(self, error: Exception) -> bool:
         """Make a safe stop after an unexpected error."""
@@ -431,7 +432,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         commands = self._outputs.get(topics.COMMANDS)
         if commands is None or process.interrupted():
             return
-        there = self._subscribers(commands, topics.WATCHDOG_NODE) > 0
+        there = self._subscribers(commands, WATCHDOG) > 0
         if self._watchdog.look(there=there):
             self.get_logger().error(self._watchdog.problem)
 

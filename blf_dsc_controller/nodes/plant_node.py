@@ -28,6 +28,7 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
 from blf_dsc_controller.messages import topics
@@ -77,7 +78,7 @@ class PlantNode(LoopNode[PlantConfig]):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(topics.PLANT, PlantConfig, **options)
+        super().__init__(PLANT, PlantConfig, **options)
         parameters.on_change(self, PlantConfig, self._reconfigure)
         self.latency = Latency()
         joints = self.config.joints
@@ -96,7 +97,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
         self._tell_parameters()
-        self._controller = self.create_client(Trigger, f'{topics.CONTROLLER}/reset')
+        self._controller = self.create_client(Trigger, f'{CONTROLLER}/reset')
         self.plant: Plant
         self.deactivate()
         self.start()
