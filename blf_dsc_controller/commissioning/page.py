@@ -47,33 +47,23 @@ def description(planned: Planned) -> str:
     )
 
 
+# what it is, whether it was measured or chosen, and its unit
+_COLUMNS = (
+    ('', '', ''),  # the joint
+    ('inertia', 'measured', 'kg m^2'),
+    ('as assumed', '', 'kg m^2'),
+    ('damping', 'measured', 'N m s/rad'),
+    ('friction', 'measured', 'N m'),
+    ('resonance', 'measured', 'Hz'),
+    ('stiffness', 'chosen', 'N m/rad'),
+    ('damping', 'chosen', 'N m s/rad'),
+    ('its lag', 'chosen', 'ms'),
+)
+
+
 def table(found: Commissioned) -> str:
     """Return what was measured and chosen for each joint, beside what was assumed."""
-    heads = (
-        '',
-        'inertia',
-        'as assumed',
-        'damping',
-        'friction',
-        'resonance',
-        'stiffness',
-        'damping',
-        'its lag',
-    )
-    units = (
-        '',
-        'kg m^2',
-        'kg m^2',
-        'N m s/rad',
-        'N m',
-        'Hz',
-        'N m/rad',
-        'N m s/rad',
-        'ms',
-    )
-    measured = ('measured',) * 3
-    above = ('', 'measured', '', *measured, *('chosen',) * 3)
-    rows: list[Sequence[str]] = [heads, above, units]
+    rows: list[Sequence[str]] = list(zip(*_COLUMNS, strict=True))
     gains = found.choice.gains
     lags = np.broadcast_to(gains.damping_lag, gains.damping.shape)
     for j, joint in enumerate(found.joints):
