@@ -78,7 +78,10 @@ def _reference() -> Callable[..., int]:
 
 
 def reference_rows(duration: float) -> np.ndarray:
-    """Return rows (samples, 9) of a run in C, without the sample at `duration`."""
+    """Return rows (samples, 9) of a run in C, without the sample at `duration`.
+
+    Raises MemoryError if the C program gets none.
+    """
     settings = _settings()
     rows = np.zeros((round(duration / T), _COLUMNS))
     if _reference()(settings.ctypes.data, len(rows), rows.ctypes.data) != 0:
@@ -144,7 +147,7 @@ def disturbance(t: float) -> np.ndarray:
 
 
 def run(duration: float, state: State, step: Step) -> np.ndarray:
-    """Close the loop around a simulator with the numpy law."""
+    """Return the errors (samples, 2) [rad] of the numpy law in a loop with a simulator."""
     law = PlainLaw(settings_of_config(LAW))
     times = T * np.arange(round(duration / T))
     errors = np.zeros((times.size, 2))
@@ -159,7 +162,10 @@ def run(duration: float, state: State, step: Step) -> np.ndarray:
 
 
 def pinocchio_loop(duration: float) -> np.ndarray:
-    """Run the arm of our URDF by pinocchio's articulated-body algorithm, a DP5 step in numpy."""
+    """Run our URDF by pinocchio's articulated-body algorithm, a DP5 step in numpy.
+
+    Return the errors (samples, 2) [rad].
+    """
     import pinocchio
 
     model = pinocchio.buildModelFromUrdf(str(_ROOT / 'config/two_link.urdf'))
