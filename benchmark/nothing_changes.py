@@ -52,6 +52,7 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Span
 from blf_dsc_controller.simulation.loop import Record, new_record
+from blf_dsc_controller.supervision.drive_load import widest_interval
 from sim_plant.plant import plant_of
 
 ARMS = ('panda', 'ur5e', 'fr3', 'panda_rigid', 'ur5e_rigid', 'fr3_rigid')
@@ -61,7 +62,6 @@ LOAD = 2.0  # kg
 READINGS = 0.1  # s
 SETTLED = 1.0  # s after the pick-up: readings before are of both
 WRONG = 0.1  # kg
-CERTAIN = (0.05, 0.05)  # kg, or of the mass: `supervision.drive_load`
 FRICTION = (0.2, 1.8)  # times the assumed one
 STRIBECK = (0.0, 0.7)
 STRIBECK_SPEED = (0.02, 0.2)  # rad/s
@@ -266,10 +266,7 @@ def outside(readings: Floats) -> Floats:
 
 def certain(readings: Floats) -> Floats:
     """Return which readings (k, 4) have an interval (k,) narrow enough to be declared."""
-    least, share = CERTAIN
-    return np.asarray(
-        readings[:, INTERVAL] < np.maximum(least, share * abs(readings[:, WEIGHED]))
-    )
+    return np.asarray(readings[:, INTERVAL] < widest_interval(readings[:, WEIGHED]))
 
 
 class Pair(NamedTuple):

@@ -20,7 +20,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
@@ -38,6 +38,11 @@ _NARROW = 0.05  # kg, half of the interval of a mass that is declared
 _SHARE = 0.05  # or this part of the mass
 _CENTRE = 0.03  # m, likewise of its centre
 _STEP = 0.005  # of the torque limit
+
+
+def widest_interval(mass: ArrayLike) -> Vector:
+    """Return half of the widest 95 % intervals [kg] with which masses [kg] are declared."""
+    return np.maximum(_NARROW, _SHARE * np.abs(mass))
 
 
 class DriveLoad(NamedTuple):
@@ -141,7 +146,7 @@ class DriveLoads:
         """Return mass and moments (4,) that the drives should get; None: no change."""
         load = controller.state.weighing.load
         half = TWO_SIDED * load[DEVIATION]
-        narrow = max(_NARROW, _SHARE * abs(load[MASS]))
+        narrow = widest_interval(load[MASS])
         if not 0.0 < half < narrow:
             return None
         picked_up = np.zeros(4)
