@@ -371,7 +371,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.action.poll(guard)
         if guard is None:
             return False
-        held = self.starting.release(guard)
+        held = self.starting.take_held(guard)
         if held is not None:
             self._on_joint_state(held)
         self._command(guard.watch())

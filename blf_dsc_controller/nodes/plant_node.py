@@ -210,6 +210,7 @@ class PlantNode(LoopNode[PlantConfig]):
         return self._controller.call_async(Trigger.Request()) if ready else None
 
     def _offer(self) -> None:
+        """Publish the first state, after incomplete ones; if a torque waits, go on at once."""
         if not self._lockstep:
             self.start_stamp = self._wall() - self.plant.elapsed_ns
         self.is_offered = True
@@ -225,6 +226,7 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish_state()
 
     def _on_command(self, raw: bytes) -> None:
+        """Take a torque: the first one releases the brake, and in lock-step each is a step."""
         try:
             size = self._decoder.decode(raw)
         except MessageError as error:
@@ -244,11 +246,12 @@ class PlantNode(LoopNode[PlantConfig]):
         self.has_torque = True
         if not self._running:
             self.get_logger().info('first torque received: brake off')
-            self._release()
+            self._release_brake()
         if self._lockstep:
             self._advance()
 
-    def _release(self) -> None:
+    def _release_brake(self) -> None:
+        """Let the arm move from the present sample on."""
         self._running = True
         self._began = self._now()
         self.latency = Latency()  # without the wait for the controller's start
@@ -276,6 +279,7 @@ class PlantNode(LoopNode[PlantConfig]):
             )
 
     def _advance(self) -> None:
+        """Integrate a sample with the last torque, if it is not too old; publish the state."""
         if self._end_if_over():
             return
         was_stale = self._stale
@@ -304,6 +308,7 @@ class PlantNode(LoopNode[PlantConfig]):
         )
 
     def _step(self) -> None:
+        """Integrate a sample; say so if a reflex of the drives has stopped the arm."""
         torque = self.input.torque
         self.plant.step(torque)
         if self._halt or not self.plant.is_stopped:

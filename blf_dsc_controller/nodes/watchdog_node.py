@@ -159,6 +159,7 @@ class WatchdogNode(PlainNode):
             self._given = given
 
     def _heed(self, meaning: Meaning) -> None:
+        """Stand by if the controller is back, and stand down if it is silent on purpose."""
         watchdog = self.watchdog
         if watchdog is None:
             self._report_problem(
