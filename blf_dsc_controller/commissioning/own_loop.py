@@ -22,16 +22,15 @@ from blf_dsc_controller.commissioning.better_known import (
     is_known_by_urdf_only,
 )
 from blf_dsc_controller.commissioning.choice import LAGS
-from blf_dsc_controller.commissioning.commissioning import (
+from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.motion import SLOW_TONES
+from blf_dsc_controller.commissioning.planned import (
     TORQUE,
     TRAVEL,
-    Commissioned,
     Planned,
-    commissioned,
     plan,
     postures_of,
 )
-from blf_dsc_controller.commissioning.motion import SLOW_TONES
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate

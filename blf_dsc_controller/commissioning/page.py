@@ -16,13 +16,10 @@ from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST
 from blf_dsc_controller.commissioning.better_known import FAR_ABOVE, known_friction
-from blf_dsc_controller.commissioning.commissioning import (
-    CREEPING,
-    Commissioned,
-    Planned,
-)
+from blf_dsc_controller.commissioning.commissioning import CREEPING, Commissioned
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
+from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
@@ -151,7 +148,7 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
 
 def _of_lags(found: Commissioned) -> Iterator[str]:
     """Yield whose damping lags, and what the gains owe to that."""
-    if not found.lags:
+    if not found.has_lags:
         return
     choice = found.choice
     lags = ', '.join(
