@@ -25,7 +25,8 @@ from command import finished
 from own_domain import own_domain
 
 from blf_dsc_controller.cli import domains, session
-from blf_dsc_controller.cli.session import ProgressMonitor, localhost_environment
+from blf_dsc_controller.cli.isolation import localhost_environment
+from blf_dsc_controller.cli.progress_monitor import ProgressMonitor
 from blf_dsc_controller.configuration.nodes import dump, load_loop
 from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.control.realtime import request_realtime
