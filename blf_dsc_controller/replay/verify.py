@@ -22,7 +22,6 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.event_content import FORMAT
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.replay.comparison import Comparison, Difference, compared
@@ -136,9 +135,8 @@ def _rerun(
     Raises:
         BlfDscError: the first state is missing, or an event cannot be repeated.
     """
-    errors: dict[int, MessageError] = {}
-    states = content.topics[topics.JOINT_STATES].joint_states(
-        content.names.joints_of(config.joints), ('position',), errors
+    states, errors = content.topics[topics.JOINT_STATES].readable_states(
+        content.names.joints_of(config.joints), ('position',)
     )
     _check_first_state(content.path, events, states)
     messages = content.topics[topics.TRACKING_ERROR]
