@@ -19,6 +19,7 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import INVALID, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.checks import check_sample
 from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.velocity import Velocity
@@ -39,7 +40,7 @@ def law():
 
 
 def sample_check(config, law):
-    return SampleCheck(config, law, Calming(config, law))
+    return SampleCheck(config, law, Calming(config, law), KeptEstimates(law))
 
 
 def verdict(law, error_ratio=1.0):
@@ -485,10 +486,10 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
     if on_a_ramp:
         rig.guard.deactivate()
     torque = rig.guard.release()
-    samples = rig.guard.samples
+    estimate = rig.guard.estimates.estimate
     q = rig.guard.safe_torque.last.q
-    load = rig.guard.held.recent.load(rig.guard.controller.settings, samples.estimate)
-    holding = dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + load
+    load = rig.guard.held.recent.load(rig.guard.controller.settings, estimate)
+    holding = dynamics(estimate[:3], 9.8, q, (0.0, 0.0))[2] + load
     np.testing.assert_allclose(
         torque, holding if safety == 'hold_gravity' else [0.0, 0.0]
     )
