@@ -119,7 +119,7 @@ def test_what_is_learned_at_the_torque_limit_is_kept_while_it_is_tolerated(law):
     law.flags = verdict(law)
     assert law.flags == SUSPECT
     assert check.check(DT) is None
-    assert (check.estimate == 0.5).all()
+    assert (law.checks.estimates.kept[: law.settings.m] == 0.5).all()
 
 
 @pytest.mark.parametrize(
@@ -184,21 +184,20 @@ def test_estimates_of_before_a_restart_are_consistent_with_it(law):
     law.state.estimate[:] = 0.5
     law.state.disturbance[:] = 0.25
     law.state.rotors.gain_scale[:] = 0.75
-    check.keep()
+    estimates = KeptEstimates(law)
     check.restart()
-    check.return_to_consistent()
-    assert (check.estimate == 0.5).all()
-    assert (check.disturbance == 0.25).all()
+    estimates.return_to_consistent()
+    assert (estimates.estimate == 0.5).all()
+    assert (estimates.disturbance == 0.25).all()
     assert (law.checks.estimates.consistent_scale == 0.75).all()
 
 
 def test_law_continues_with_the_kept_estimates_after_a_stop(law):
-    check = sample_check(ControllerConfig(), law)
     law.state.estimate[:] = 0.5
     law.state.disturbance[:] = 0.25
-    check.keep()
+    estimates = KeptEstimates(law)
     law.state.estimate[:] = law.state.disturbance[:] = 9.0  # by what made it stop
-    check.restore()
+    estimates.restore()
     assert (law.state.estimate == 0.5).all()
     assert (law.state.disturbance == 0.25).all()
     assert law.samples == 0
