@@ -822,7 +822,7 @@ def test_stop_that_winds_the_estimates_up_holds_with_those_from_before(reason, g
             after_gap=np.zeros(2) if gap else None,
             load=lambda: 'of the torque that holds it',
         ),
-        _samples=SimpleNamespace(disturbance='from before'),
+        _estimates=SimpleNamespace(disturbance='from before'),
     )
     winds_up = reason in AFTER_WINDING_UP and not gap
     expected = 'from before' if winds_up else 'of the torque that holds it'
