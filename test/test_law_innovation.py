@@ -17,6 +17,7 @@ from blf_dsc_controller.law.innovation import (
     has_begun,
     noise_of,
     normalized_square,
+    raise_noise,
     row_variance,
     update,
 )
@@ -183,3 +184,25 @@ def test_noise_of_a_window_shorter_than_what_is_assumed_is_not_trusted_more():
     """Of half a second, whose rows are fewer than the assumed ones."""
     state = begun()
     assert alarm(state, PERIOD, 50.0) == pytest.approx(8.0 * 0.1)
+
+
+@pytest.mark.parametrize(
+    ('rows', 'recent', 'raised'),
+    [
+        (400.0, 5.0, 5.0),
+        (40.0, 5.0, 5.0),
+        (400.0, 0.01, 0.1),  # never lowered
+    ],
+)
+def test_raised_noise_is_that_of_the_last_rows_and_falls_with_those_that_fit(
+    rows, recent, raised
+):
+    """It is halved within a second of rows, not after the five of a window."""
+    state = begun()
+    state.rows[0], state.recent[0] = rows, recent
+    raise_noise(state)
+    assert state.noise[0] == raised
+    forget_recent(state)
+    for _ in range(100):
+        assert not update(state, 0.0, 1.0, 1.0, PERIOD, MOST)
+    assert state.noise[0] < 0.5 * raised + 0.05

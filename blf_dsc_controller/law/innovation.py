@@ -86,6 +86,17 @@ def forget_recent(state: State) -> None:
 
 
 @inner
+def raise_noise(state: State) -> None:
+    """Take the last rows for noise: there is a torque that no theta explains.
+
+    It counts as few rows, so that s^2 falls again soon after that torque has gone.
+    """
+    state.noise[0] = max(state.noise[0], state.recent[0])
+    state.mean[0] = state.noise[0]
+    state.rows[0] = min(state.rows[0], _ASSUMED_ROWS)
+
+
+@inner
 def row_variance(state: State, period: float) -> float:
     """Return a, with a row each `period` [s]: s^2 times the number of rows that count as one."""
     return float(state.noise[0] * CORRELATION / period)
