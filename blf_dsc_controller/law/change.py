@@ -15,7 +15,7 @@ was not fitted to (`learning.detect_change`).
 
 Something may push the arm for seconds, with a torque that no parameters explain.  Rows
 would contradict those before again and again, and nothing would ever be learned.  So
-after three changes in a row the contradiction is taken for noise of the rows.
+after three changes in a row the contradiction is taken for noise for a while.
 """
 
 from typing import Annotated, NamedTuple
