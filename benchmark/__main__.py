@@ -9,7 +9,8 @@ import sys
 from collections.abc import Sequence
 
 from benchmark.tables import BENCH, GROUPS, TABLES, module_of
-from blf_dsc_controller.cli.main import INTERRUPTED, end_at_signals, keep_to_one_thread
+from blf_dsc_controller.cli.main import end_at_signals, keep_to_one_thread
+from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.errors import BlfDscError
 
 

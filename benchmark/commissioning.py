@@ -68,9 +68,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmark.elastic import FREE
 from benchmark.harness import print_table
 from benchmark.studies import load_study
 from blf_dsc_controller.arms.joint_gains import linear
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.linear_loop import (
     SLOWEST,
     Feedback,
@@ -83,13 +85,9 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.choice import LAGS, Loops
-from blf_dsc_controller.commissioning.commissioning import (
-    Commissioned,
-    commissioned,
-    measuring_gains,
-    postures_of,
-)
+from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
 from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
+from blf_dsc_controller.commissioning.planned import measuring_gains, postures_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -104,7 +102,6 @@ STUDIES = (
     'monte_carlo_elastic_panda',
     'monte_carlo_elastic_ur5e',
 )
-MARGIN = 0.5
 LONG, SHORT = 60.0, 16.0  # s
 BEGIN = 3.0  # s, from which errors in motion are counted
 PICK_UP, LOADED = 8.0, 4.0  # s, and for how long after it errors are counted
@@ -118,7 +115,6 @@ MOST, HALVINGS = (
 )  # the largest factor on the gains that is tried, and how finely
 SEEN = 120.0  # Hz, the fastest line of the motion
 STIFFER = (1.0, 2.0, 4.0)  # times the gains of the preset
-FREE = 0.3  # rad, a bound that no law leaves unless it shakes
 
 
 class Outcome(NamedTuple):

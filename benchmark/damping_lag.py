@@ -28,6 +28,7 @@ import numpy as np
 from benchmark import random_arms
 from benchmark.harness import print_table
 from benchmark.random_arms import Result
+from benchmark.soft_arms import PLAY, POSTURES
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -38,9 +39,7 @@ LAG = 0.003  # s
 LAGS = (0.0, 0.001, 0.002, 0.003, 0.004, 0.005, 0.0075)  # s
 OSCILLATE = (143, 362, 411, 417, 424, 442)
 CALM = (3, 5, 8)
-PLAY = 4e-4  # rad
 GUESSES = (1.0, 2.0, 3.0, 5.0, 7.0)
-POSTURES = 3
 LARGE = 3  # joints of shoulder and elbow
 SETTINGS = {  # how many joints lag, by how much [s]
     'none': (0, 0.0),

@@ -13,7 +13,7 @@ from time import perf_counter
 
 import numpy as np
 
-from benchmark.harness import Ratio, ratio
+from benchmark.harness import FULL, Ratio, ratio
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.run import FIRST_STAMP
@@ -21,7 +21,6 @@ from blf_dsc_controller.simulation.loop import simulate
 
 _ROUNDS = 15
 _STATES = 1000  # in each turn
-_FULL = 10.0  # s, after which learning has begun and the window is full
 _BASELINE = 'without both'
 _TOOL: Mapping[str, object] = {
     'barrier.bound': None,
@@ -46,7 +45,7 @@ class Contestant:
             f'events.{each}': [] for each in ('begin', 'duration', 'payload')
         }
         states = (_ROUNDS + 1) * _STATES
-        plant = {'duration': _FULL + 1e-3 * states, **quiet}
+        plant = {'duration': FULL + 1e-3 * states, **quiet}
         loop = load_loop('panda_rigid', {PLANT: plant, CONTROLLER: given})
         record = simulate(loop.controller, loop.plant)
         stamps = (FIRST_STAMP + record.stamps).tolist()
@@ -55,7 +54,7 @@ class Contestant:
         self._loop.guard.starting.activate()
         self.answer(len(stamps) - states)
         if not self._loop.guard.controller.sample.latched[0]:
-            raise RuntimeError(f'nothing is learned in {_FULL:g} s')
+            raise RuntimeError(f'nothing is learned in {FULL:g} s')
 
     def answer(self, count: int) -> tuple[float, float]:
         """Return the times of a state [s]: until its torque is known, and until all is done."""

@@ -25,6 +25,9 @@ from blf_dsc_controller import __version__
 
 _PACKAGES = ('numpy', 'numba', 'scipy', 'mujoco', 'pin', 'ros-jazzy-rclpy')
 
+FULL = 10.0
+"""Time [s] after which learning has begun and its window is full."""
+
 
 class Ratio(NamedTuple):
     """Ratio of a contestant's measurement to the baseline of its group."""

@@ -27,7 +27,11 @@ import numpy as np
 
 from benchmark.harness import print_table
 from benchmark.nothing_changes import (
+    HELD,
+    INTERVAL,
     PICK_UP,
+    TIME,
+    WEIGHED,
     Found,
     certain,
     found,
@@ -76,9 +80,9 @@ def draws(arms: Sequence[str], runs: int) -> Iterator[Weighed]:
 
 
 def readings_of(runs: Iterable[Weighed], *, held: bool) -> Floats:
-    """Return the readings after the pick-up, or before."""
+    """Return the readings (k, 4) after the pick-up, or before."""
     readings = np.concatenate([each.run.readings for each in runs])
-    chosen: Floats = readings[(readings[:, 0] > PICK_UP) == held]
+    chosen: Floats = readings[(readings[:, TIME] > PICK_UP) == held]
     return chosen
 
 
@@ -86,7 +90,7 @@ def worst(readings: Floats) -> str:
     """Return the largest error over half of the interval."""
     if not readings.size:
         return '-'
-    return f'{np.max(np.abs(readings[:, 2] - readings[:, 1]) / readings[:, 3]):.1f}'
+    return f'{np.max(np.abs(readings[:, WEIGHED] - readings[:, HELD]) / readings[:, INTERVAL]):.1f}'
 
 
 def after(runs: Iterable[Weighed], seconds: float) -> str:
@@ -94,12 +98,12 @@ def after(runs: Iterable[Weighed], seconds: float) -> str:
     found = []
     for each in runs:
         of = each.run.readings
-        found.append(of[of[:, 0] >= PICK_UP + seconds][:1])
+        found.append(of[of[:, TIME] >= PICK_UP + seconds][:1])
     readings = np.concatenate(found)
     if not readings.size:
         return '-'
-    error = np.median(np.abs(readings[:, 2] - readings[:, 1]))
-    return f'{1e3 * error:.0f} (± {1e3 * np.median(readings[:, 3]):.0f})'
+    error = np.median(np.abs(readings[:, WEIGHED] - readings[:, HELD]))
+    return f'{1e3 * error:.0f} (± {1e3 * np.median(readings[:, INTERVAL]):.0f})'
 
 
 def row(name: str, runs: list[Weighed]) -> list[str]:

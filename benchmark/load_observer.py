@@ -43,6 +43,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmark.elastic import FREE
 from benchmark.harness import print_table
 from benchmark.options import add_runs
 from benchmark.studies import load_study
@@ -70,6 +71,7 @@ from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.studies.monte_carlo import draw, plant_with
 from blf_dsc_controller.supervision.expected_errors import linear_feedback
@@ -81,7 +83,6 @@ PICK_UP = 8.0  # s
 LATER = 3.5  # s
 SECONDS = 16.0
 WEIGHT = 2.0  # kg
-FREE = 0.3  # rad, a bound that no law leaves unless it shakes
 BANDWIDTH = 60.0  # rad/s
 
 BANDWIDTHS = (0.0, 40.0, 60.0, 100.0)
@@ -478,7 +479,6 @@ def declarations() -> Iterator[list[str]]:
 
 FAILS = 3.0  # s
 AFTER_FAILURE = 3.0  # s
-START = 1_000_000_000  # ns
 
 
 class Failure(NamedTuple):
@@ -528,13 +528,13 @@ def failed(preset: str, failure: str) -> list[str]:
             effort = FAILURES[failure].read(measurement[2 * n :], before)
             measurement[2 * n :] = effort
             largest = max(largest, np.abs(guard.controller.sample.xi1).max())
-        torque = guard.update(START + k * period, measurement)
+        torque = guard.update(FIRST_STAMP + k * period, measurement)
         if torque is None or not guard.supervisor.running:
             break
         arm.step(torque)
     kinds = EventType.TORQUE_SENSORS, EventType.STOP
     said = [
-        f'{1e-9 * (each.stamp - START) - FAILS:.3f} s: {each.content["text"][:60]}'
+        f'{1e-9 * (each.stamp - FIRST_STAMP) - FAILS:.3f} s: {each.content["text"][:60]}'
         for each in guard.journal.pending
         if each.type in kinds
     ]

@@ -156,7 +156,7 @@ def ranges_of(arm: str, joints: int) -> Ranges:
 def frames_of(
     law: str, feedback: str, controller: ArmController, ranges: Ranges, latency: float
 ) -> Callable[[np.ndarray, np.ndarray], Frame]:
-    """Return what is sent for a torque of the law, at measured positions."""
+    """Return what is sent for a torque (n,) [N m] of the law, at positions (n,) [rad]."""
     if law != 'maker':
         motors = MotorFeedback(controller, ranges, latency)
         inside = feedback == 'motor'

@@ -52,6 +52,7 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Span
 from blf_dsc_controller.simulation.loop import Record, new_record
+from blf_dsc_controller.supervision.drive_load import widest_interval
 from sim_plant.plant import plant_of
 
 ARMS = ('panda', 'ur5e', 'fr3', 'panda_rigid', 'ur5e_rigid', 'fr3_rigid')
@@ -61,7 +62,6 @@ LOAD = 2.0  # kg
 READINGS = 0.1  # s
 SETTLED = 1.0  # s after the pick-up: readings before are of both
 WRONG = 0.1  # kg
-CERTAIN = (0.05, 0.05)  # kg, or of the mass: `supervision.drive_load`
 FRICTION = (0.2, 1.8)  # times the assumed one
 STRIBECK = (0.0, 0.7)
 STRIBECK_SPEED = (0.02, 0.2)  # rad/s
@@ -71,12 +71,16 @@ Waypoints = Iterator[tuple[float, Floats, Floats]]
 """Seconds since the point before, position and velocity of each."""
 
 
+TIME, HELD, WEIGHED, INTERVAL = range(4)
+"""Columns of readings: when, what is held, the mass found, and half of its interval."""
+
+
 class Found(NamedTuple):
     """What a run says; a reading has the truth beside it."""
 
     changes: Floats  # s
     contacts: int
-    readings: Floats  # (k, 4): time [s], truth, mass and half interval [kg]
+    readings: Floats  # (k, 4): TIME [s], HELD, WEIGHED and half INTERVAL [kg]
 
 
 def moved(q: Floats, goal: Floats, speed: float) -> Waypoints:
@@ -254,14 +258,15 @@ def found(record: Record, load: float) -> Found:
 
 
 def outside(readings: Floats) -> Floats:
-    """Return which readings' intervals do not hold the truth."""
-    return np.asarray(np.abs(readings[:, 2] - readings[:, 1]) > readings[:, 3])
+    """Return which readings (k, 4) have an interval (k,) that does not hold the truth."""
+    return np.asarray(
+        np.abs(readings[:, WEIGHED] - readings[:, HELD]) > readings[:, INTERVAL]
+    )
 
 
 def certain(readings: Floats) -> Floats:
-    """Return which readings are narrow enough to be declared."""
-    least, share = CERTAIN
-    return np.asarray(readings[:, 3] < np.maximum(least, share * abs(readings[:, 2])))
+    """Return which readings (k, 4) have an interval (k,) narrow enough to be declared."""
+    return np.asarray(readings[:, INTERVAL] < widest_interval(readings[:, WEIGHED]))
 
 
 class Pair(NamedTuple):
@@ -316,7 +321,7 @@ def empty_row(name: str, runs: list[Found]) -> list[str]:
     """Return what runs say in which nothing changes."""
     changes = np.array([run.changes.size for run in runs])
     readings = np.concatenate([run.readings for run in runs])
-    wrong = [np.abs(run.readings[outside(run.readings), 2]) for run in runs]
+    wrong = [np.abs(run.readings[outside(run.readings), WEIGHED]) for run in runs]
     heavy = [each.max(initial=0.0) > WRONG for each in wrong]
     told = readings[certain(readings)]
     return [
@@ -337,15 +342,17 @@ def loaded_row(name: str, runs: list[Found]) -> list[str]:
     delays = np.array([delay_of(run) for run in runs])
     is_found = delays[delays < 2.0]
     changes = sum(run.changes.size for run in runs)
-    held = [run.readings[run.readings[:, 0] > PICK_UP] for run in runs]
+    held = [run.readings[run.readings[:, TIME] > PICK_UP] for run in runs]
     cells = []
     for seconds in (3.0, 8.0):
         at = [
-            abs(of[of[:, 0] >= PICK_UP + seconds][:1, 2] - LOAD)
+            abs(of[of[:, TIME] >= PICK_UP + seconds][:1, WEIGHED] - LOAD)
             for of in held
             if of.size
         ]
-        half = [of[of[:, 0] >= PICK_UP + seconds][:1, 3] for of in held if of.size]
+        half = [
+            of[of[:, TIME] >= PICK_UP + seconds][:1, INTERVAL] for of in held if of.size
+        ]
         cells.append(
             f'{grams(np.concatenate(at))} (± {grams(np.concatenate(half)).split(",")[0]})'
             if at

@@ -9,7 +9,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from blf_dsc_controller.messages.topics import COMMANDS, CONTROLLER, JOINT_STATES
+from blf_dsc_controller.configuration.nodes import CONTROLLER
+from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES
 from blf_dsc_controller.nodes.endpoints import qos_profile
 
 

@@ -22,13 +22,12 @@ import numpy as np
 from plain_law import PlainLaw, dynamics
 from scipy.integrate import RK45
 
-from benchmark.harness import Ratio, interleaved, ratio
+from benchmark.harness import FULL, Ratio, interleaved, ratio
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.messages import topics
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import simulate
@@ -43,7 +42,6 @@ _AGREEMENT = 10.0  # s
 _ROUNDS = 5
 _GROWTH_ROUNDS = 9
 _UPDATES = 2000
-_FULL = 10.0  # s, after which learning has begun and the window is full
 SOURCE = Path(__file__).with_name('reference.c')
 # The package's kernels are compiled for the native processor too; contraction would
 # change the numbers that are compared.
@@ -54,9 +52,8 @@ _P = 3
 _COLUMNS = 9
 Step = Callable[[float, np.ndarray], None]
 State = Callable[[], tuple[np.ndarray, np.ndarray]]
-CONTROLLER = ControllerConfig()
-PLANT = PlantConfig()
-T = PLANT.sample_time
+LAW, ARM = ControllerConfig(), PlantConfig()  # as in the paper
+T = ARM.sample_time
 
 
 @cache
@@ -81,7 +78,10 @@ def _reference() -> Callable[..., int]:
 
 
 def reference_rows(duration: float) -> np.ndarray:
-    """Return rows (samples, 9) of a run in C, without the sample at `duration`."""
+    """Return rows (samples, 9) of a run in C, without the sample at `duration`.
+
+    Raises MemoryError if the C program gets none.
+    """
     settings = _settings()
     rows = np.zeros((round(duration / T), _COLUMNS))
     if _reference()(settings.ctypes.data, len(rows), rows.ctypes.data) != 0:
@@ -91,10 +91,10 @@ def reference_rows(duration: float) -> np.ndarray:
 
 def _settings() -> np.ndarray:
     """Lay out `struct settings` of the C file: the same fields in order, integers as long."""
-    law = settings_of_config(CONTROLLER)
-    arm = PLANT.arm
-    torque = PLANT.disturbance
-    reference = CONTROLLER.reference
+    law = settings_of_config(LAW)
+    arm = ARM.arm
+    torque = ARM.disturbance
+    reference = LAW.reference
     values: dict[str, Any] = {
         **{name: getattr(arm, name) for name in ('l1', 'l2', 'm1', 'm2', 'gravity')},
         **{
@@ -105,8 +105,8 @@ def _settings() -> np.ndarray:
             name: getattr(torque, name)
             for name in ('viscous', 'coulomb', 'coulomb_velocity')
         },
-        'q0': PLANT.initial.position,
-        'dq0': PLANT.initial.velocity,
+        'q0': ARM.initial.position,
+        'dq0': ARM.initial.velocity,
         'offset': reference.offset,
         'swing': reference.amplitude,
         'tone': reference.frequency[0],
@@ -141,17 +141,17 @@ def _settings() -> np.ndarray:
 
 def disturbance(t: float) -> np.ndarray:
     """Return tau_dist (2,) [N m]."""
-    d = PLANT.disturbance
+    d = ARM.disturbance
     wave = np.sin(np.multiply(d.frequency, t) + d.phase)
     return np.add(d.constant, np.multiply(d.amplitude, wave))
 
 
 def run(duration: float, state: State, step: Step) -> np.ndarray:
-    """Close the loop around a simulator with the numpy law."""
-    law = PlainLaw(settings_of_config(CONTROLLER))
+    """Return the errors (samples, 2) [rad] of the numpy law in a loop with a simulator."""
+    law = PlainLaw(settings_of_config(LAW))
     times = T * np.arange(round(duration / T))
     errors = np.zeros((times.size, 2))
-    for k, (qr, dqr, ddqr) in enumerate(sampled(reference_of(CONTROLLER), times)):
+    for k, (qr, dqr, ddqr) in enumerate(sampled(reference_of(LAW), times)):
         q, dq = state()
         law.tau = law.update(
             times[k], T, qr, dqr, ddqr, np.concatenate((q, dq, law.tau))
@@ -162,11 +162,14 @@ def run(duration: float, state: State, step: Step) -> np.ndarray:
 
 
 def pinocchio_loop(duration: float) -> np.ndarray:
-    """Run the arm of our URDF by pinocchio's articulated-body algorithm, a DP5 step in numpy."""
+    """Run our URDF by pinocchio's articulated-body algorithm, a DP5 step in numpy.
+
+    Return the errors (samples, 2) [rad].
+    """
     import pinocchio
 
     model = pinocchio.buildModelFromUrdf(str(_ROOT / 'config/two_link.urdf'))
-    model.gravity.linear = np.array([0.0, 0.0, -PLANT.arm.gravity])
+    model.gravity.linear = np.array([0.0, 0.0, -ARM.arm.gravity])
     data = model.createData()
 
     def acceleration(q: np.ndarray, dq: np.ndarray, torque: np.ndarray) -> np.ndarray:
@@ -181,8 +184,8 @@ def mujoco_loop(duration: float) -> np.ndarray:
 
     model = mujoco.MjModel.from_xml_path(str(_ROOT / 'benchmark/two_link.xml'))
     data = mujoco.MjData(model)
-    data.qpos[:] = PLANT.initial.position
-    data.qvel[:] = PLANT.initial.velocity
+    data.qpos[:] = ARM.initial.position
+    data.qvel[:] = ARM.initial.velocity
 
     def step(t: float, torque: np.ndarray) -> None:
         data.qfrc_applied[:] = torque - disturbance(t + 0.5 * T)
@@ -193,7 +196,7 @@ def mujoco_loop(duration: float) -> np.ndarray:
 
 def _integrated(acceleration: Callable[..., np.ndarray], duration: float) -> np.ndarray:
     """Run an arm and a Dormand-Prince step in numpy."""
-    x = np.concatenate((PLANT.initial.position, PLANT.initial.velocity))
+    x = np.concatenate((ARM.initial.position, ARM.initial.velocity))
     k = np.zeros((6, 4))
 
     def step(t: float, torque: np.ndarray) -> None:
@@ -210,7 +213,7 @@ def _integrated(acceleration: Callable[..., np.ndarray], duration: float) -> np.
 def _numpy_acceleration(
     q: np.ndarray, dq: np.ndarray, torque: np.ndarray
 ) -> np.ndarray:
-    arm = PLANT.arm
+    arm = ARM.arm
     P = ((arm.m1 + arm.m2) * arm.l1**2, arm.m2 * arm.l2**2, arm.m2 * arm.l1 * arm.l2)
     M, C, G = dynamics(P, arm.gravity / arm.l1, q, dq)
     return np.linalg.solve(M, torque - C @ dq - G)
@@ -242,15 +245,15 @@ def measure() -> Iterator[Ratio]:
 def disagreement() -> float:
     """Return the largest difference to C over 10 s in errors [rad], torques and estimates."""
     rows = reference_rows(_AGREEMENT)
-    record = simulate(CONTROLLER, replace(PLANT, duration=_AGREEMENT), supervised=False)
+    record = simulate(LAW, replace(ARM, duration=_AGREEMENT), supervised=False)
     samples = [record.sample(k) for k in range(len(rows))]
     mine = np.array([np.concatenate((s.xi1, s.torque, s.estimate)) for s in samples])
     return float(np.abs(mine - rows).max())
 
 
 def _package(duration: float) -> Callable[[], int]:
-    plant = replace(PLANT, duration=duration)
-    return lambda: simulate(CONTROLLER, plant, supervised=False).stamps.size
+    plant = replace(ARM, duration=duration)
+    return lambda: simulate(LAW, plant, supervised=False).stamps.size
 
 
 def updates(name: str) -> tuple[str, Callable[[], int], int]:
@@ -264,8 +267,8 @@ def updates(name: str) -> tuple[str, Callable[[], int], int]:
     quiet: dict[str, object] = {
         f'events.{each}': [] for each in ('begin', 'duration', 'payload')
     }
-    duration = _FULL + T * ahead
-    loop = load_loop(name, {topics.PLANT: {'duration': duration, **quiet}})
+    duration = FULL + T * ahead
+    loop = load_loop(name, {PLANT: {'duration': duration, **quiet}})
     record = simulate(loop.controller, loop.plant, supervised=False)
     rows = zip((1e-9 * record.stamps).tolist(), record.measurements, strict=True)
     controller = controller_of(loop.controller)
@@ -283,7 +286,7 @@ def updates(name: str) -> tuple[str, Callable[[], int], int]:
         'disturbances)'
     )
     if not controller.sample.latched[0]:
-        raise RuntimeError(f'{name}: {size}: nothing is learned in {_FULL:g} s')
+        raise RuntimeError(f'{name}: {size}: nothing is learned in {FULL:g} s')
     return size, lambda: update(_UPDATES), controller.state_vector.nbytes
 
 

@@ -46,6 +46,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmark import elastic
+from benchmark.elastic import FREE
 from benchmark.harness import print_table
 from benchmark.studies import load_study
 from blf_dsc_controller.arms.linear_loop import (
@@ -82,7 +83,6 @@ AFTER_STOP = 1.5  # s, for which a stop is followed
 AT_REST = 1.0  # s, after which it should be
 SLOWEST = 8.0  # Hz, of what shakes
 SHAKES = 0.05  # of the torque limit, rms
-FREE = 0.3  # rad, a bound that no law leaves unless it shakes
 
 JOINT_PD = str(Path(__file__).with_name('joint_pd.py').resolve())
 THIS, STOCK, PD, CT = 'this law', 'stock PD', 'PD', 'computed torque'

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from benchmark.rollouts import spec_of
+from benchmark.rollouts import THICKENED, spec_of
 from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.prior import Prior
@@ -61,7 +61,6 @@ _MASS = np.array((0.05, 20.0))  # times that of the URDF: bounds
 _STRETCH = np.array((0.01, 100.0))  # times that of the URDF, of squares
 _SHEAR = np.array((-5.0, 5.0))
 _STEP = 1e-6  # of differences
-_ROUNDED = 1e-6  # of moments of inertia, by which flat bodies are made thicker
 _RANK = 1e-10  # of the largest eigenvalue of the information
 
 
@@ -212,7 +211,7 @@ def _of_body(spec: Any, model: Any, link: str) -> Any:
         mass = ten[0]
         c = ten[1:4] / mass
         I = ten[4:].reshape(3, 3) - mass * (c @ c * np.eye(3) - np.outer(c, c))
-        I += _ROUNDED * np.trace(I) * np.eye(3)
+        I += THICKENED * np.trace(I) * np.eye(3)
         body = changed.body(link)
         body.mass = mass
         body.ipos = c

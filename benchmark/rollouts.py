@@ -27,7 +27,8 @@ LENGTH = 0.2
 _STEP = 0.002  # s, longest
 _FAR = 100.0  # rad or m
 _MOMENTS = (4, 6, 9)  # Ixx, Iyy, Izz among the ten of a body
-_ROUNDED = 1e-6  # of the moments of inertia, by which flat bodies are made thicker
+THICKENED = 1e-6
+"""Part of the sum of its moments of inertia, by which a flat body is made thicker."""
 
 
 class Rollouts(NamedTuple):
@@ -85,7 +86,7 @@ def spec_of(
     """Return the arm with these values and friction (2, n), and a motor of each joint."""
     rounded = values.copy()
     moments = parts(rounded).bodies[:, _MOMENTS]
-    parts(rounded).bodies[:, _MOMENTS] += _ROUNDED * moments.sum(axis=1, keepdims=True)
+    parts(rounded).bodies[:, _MOMENTS] += THICKENED * moments.sum(axis=1, keepdims=True)
     arm = found._replace(values=rounded, dynamics=friction)
     spec = mujoco.MjSpec.from_string(mjcf(arm, gravity, ''))
     spec.option.timestep = step

@@ -68,6 +68,7 @@ from benchmark.harness import print_table
 from benchmark.load_observer import LATER, PICK_UP, Law
 from benchmark.options import positive
 from benchmark.random_arms import CT, PD, RANGES, ROBOTS, THIS
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.linear_loop import Feedback
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -83,7 +84,6 @@ RIVALS = (PD, CT, DOB, RISE)
 LAWS = (THIS, NO_SENSORS, NO_LEARNING, *RIVALS)
 MOMENTUM = str(Path(__file__).with_name('momentum_observer.py').resolve())
 ROBUST = str(Path(__file__).with_name('rise.py').resolve())
-MARGIN = 0.5  # of gains that are chosen
 FACTORS = 0.01, 1.0  # on the maker's gains, among them
 POLES = 0.1, 100.0  # rad/s, of the DOB
 SHARES = (0.5, 0.75, 1.0)  # of the PD's factor, in the DOB

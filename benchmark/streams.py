@@ -172,7 +172,7 @@ def chunk(number: int) -> tuple[Floats, Floats]:
 
 
 def followed_chunks(fields: int) -> tuple[Floats, Floats]:
-    """Return times and the reference of this package for chunks with the first fields."""
+    """Return times (k,) [s] and this package's reference (k, 3, 2) for chunks with first fields."""
     settings = config()
 
     def plans() -> Iterator[tuple[float, Callable[[Floats], Floats]]]:

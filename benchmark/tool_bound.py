@@ -89,7 +89,10 @@ def random_motions(
 
 
 def try_motions(config: ControllerConfig, runs: int, seed: int = 0) -> Motions:
-    """Return the errors at the tool of random motions with random joint errors."""
+    """Return the errors at the tool of random motions with random joint errors.
+
+    Raises BlfDscError without a bound at the tool.
+    """
     tool = tool_of(config)
     if tool is None:
         raise BlfDscError('a bound at the tool is needed: give barrier.tool_bound')
@@ -141,7 +144,10 @@ def closed_loop(seed: int, arm: str, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def bounded(bound: float) -> dict[str, Any]:
-    """Return the parameters of a bound at the tool [m] instead of joint bounds."""
+    """Return the parameters of a bound at the tool [m] instead of joint bounds.
+
+    Raises BlfDscError if it is not above 0.
+    """
     if not bound > 0.0:
         raise BlfDscError(f'--bound: got {bound:g} m, but it must be above 0')
     return {'barrier.bound': None, 'barrier.tool_bound': bound}

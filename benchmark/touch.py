@@ -215,7 +215,11 @@ def run(
     insertions: Sequence[Insertion],
     act: Callable[[Controller], object] | None,
 ) -> tuple[Floats, Any]:
-    """Run the law along a motion, and let it `act` at the end of each rest."""
+    """Run the law along a motion, and let it `act` at the end of each rest.
+
+    Return the times (k,) [s] and the columns of the samples. Raises RuntimeError if a check
+    ends the run.
+    """
     config = loop.controller
     controller = controller_of(config)
     record = new_record(controller, config, loop.plant, Journal())

@@ -32,11 +32,14 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmark import random_arms, soft_arms
+from benchmark.elastic import FREE
 from benchmark.harness import print_table
-from benchmark.load_observer import FREE, SECONDS
+from benchmark.load_observer import SECONDS
 from benchmark.load_observer import largest as largest_errors
 from benchmark.random_arms import Described
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.linear_loop import (
+    SLOWEST,
     Complex,
     Feedback,
     Floats,
@@ -61,8 +64,6 @@ CROSSING = 10.0  # w, rad/s
 FACTORS = np.geomspace(0.02, 8.0, 61)  # 10 % apart
 RATIOS = (0.6, 1.0, 1.6)
 LOWEST, FASTEST, COUNT = 0.05, 0.48, 240  # Hz, of the sample rate, of frequencies
-SLOWEST = 5.0  # Hz, above which there is a margin
-MARGIN = 0.5
 NOTHING = 1e-3  # a singular value that passes for 0
 
 

@@ -10,6 +10,11 @@ from __future__ import annotations
 import os
 import sys
 
+ONE_THREAD = dict.fromkeys(
+    ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'), '1'
+)
+"""Environment variables by which linear algebra uses one thread, once it is loaded."""
+
 _WITHOUT_CURRENT = 'import sys; sys.path[:] = filter(None, sys.path); '
 _RUN = 'from runpy import run_module; run_module({!r}, run_name="__main__", alter_sys=True)'
 

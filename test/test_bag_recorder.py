@@ -33,6 +33,7 @@ from sensor_msgs.msg import JointState
 from blf_dsc_controller.analysis.report import read_bag
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.recovery import recover
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
@@ -442,10 +443,7 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     assert timing['rate'] > 0.0
     assert list(timing['latency']) == ['p50', 'p99', 'p99.9', 'max']
     assert timing['late_steps'] >= 0
-    logs = [
-        (out / 'logs' / f'{node}.log').read_text()
-        for node in (topics.PLANT, topics.CONTROLLER)
-    ]
+    logs = [(out / 'logs' / f'{node}.log').read_text() for node in (PLANT, CONTROLLER)]
     numbers, stamps = defaultdict(list), []
     with (out / 'bag' / 'bag_0.mcap').open('rb') as stream:
         for _, channel, message in make_reader(stream).iter_messages():

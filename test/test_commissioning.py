@@ -39,11 +39,7 @@ from blf_dsc_controller.commissioning.choice import (
     choose,
 )
 from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
-from blf_dsc_controller.commissioning.commissioning import (
-    commissioned,
-    measuring_gains,
-    plan,
-)
+from blf_dsc_controller.commissioning.commissioning import commissioned
 from blf_dsc_controller.commissioning.findings import findings_of
 from blf_dsc_controller.commissioning.motion import (
     SETTLING,
@@ -53,6 +49,7 @@ from blf_dsc_controller.commissioning.motion import (
 )
 from blf_dsc_controller.commissioning.own_loop import REPEATS
 from blf_dsc_controller.commissioning.page import errors_table, sentences, table
+from blf_dsc_controller.commissioning.planned import measuring_gains, plan
 from blf_dsc_controller.commissioning.postures import PostureByPosture
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.response import (

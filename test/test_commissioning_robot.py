@@ -21,8 +21,8 @@ from blf_dsc_controller.cli import commission as cli_commission
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import motion as motions
 from blf_dsc_controller.commissioning import proof
-from blf_dsc_controller.commissioning.commissioning import plan, postures_of
 from blf_dsc_controller.commissioning.driven import Driven
+from blf_dsc_controller.commissioning.planned import plan, postures_of
 from blf_dsc_controller.commissioning.postures import SPEED, EndedError, move
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.configuration.controller import ControllerConfig

@@ -24,9 +24,9 @@ from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import DriverError, Facts, disagreements
+from blf_dsc_controller.drive.driver_declaration import DriverDeclaration
 from blf_dsc_controller.drive.drivers import driver_of, find_driver, is_nearly_simulated
 from blf_dsc_controller.drive.latency import Latency
-from blf_dsc_controller.drive.load_teller import LoadTeller
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages import topics
@@ -357,14 +357,14 @@ def test_load_is_taken_over_when_it_is_in_force_not_when_it_is_accepted(
     monkeypatch.setattr(controller, 'take_over', taken.append)
     driver = ReportingDriver('', config, DriveConfig())
     driver.in_force = 0.0 if reports else None
-    teller = LoadTeller(driver, controller)
+    declaration = DriverDeclaration(driver)
     for _ in range(20):  # from one step to the next
-        teller.follow()
-    teller.close()  # it has answered
-    teller.follow()
+        declaration.follow(controller, in_motion=True)
+    declaration.close()  # it has answered
+    declaration.follow(controller, in_motion=True)
     assert taken == ([] if reports else [load])
     driver.in_force = np.float32(1.0 + 5e-6) if reports else None
-    teller.follow()
+    declaration.follow(controller, in_motion=True)
     assert taken == [load]
 
 

@@ -23,7 +23,7 @@ from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change, flatten
 from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.nodes import load_service
+from blf_dsc_controller.nodes import service_declaration
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.process import drain
@@ -81,7 +81,7 @@ class Arm:
         self.plant = ros.add(PlantNode, flatten(FR3.plant) | EVENT | waiting)
         self.law = ros.add(ControllerNode, given)
         # the law looks for the service by the clock, lock-step does not wait for it
-        ros.until(lambda: self.law.load_service.client or self.law.load_service.problem)
+        ros.until(lambda: self.law.declaration.client or self.law.declaration.problem)
         assert configure(ros, self.plant)
         assert activate(ros, self.plant)
 
@@ -145,7 +145,7 @@ def test_driver_that_refuses_is_asked_once(services, ros):
     arm.run_until(8.0)
     assert len(arm.requests) == 1
     asked = f'/driver/set_load refused {arm.requests[0].mass:.2f} kg'
-    assert arm.law.load_service.problem == f'{asked}: a controller is active'
+    assert arm.law.declaration.problem == f'{asked}: a controller is active'
     assert arm.requests[0].center_of_mass[2] != 0.0
     assert arm.law.guard.supervisor.running
 
@@ -154,7 +154,7 @@ def told_two_kilograms(ros, services):
     """Run an arm whose drives have been told what it picked up."""
     arm = Arm(ros, services['ur'], **{'load.in_motion': True})
     arm.run_until(8.5)
-    assert arm.law.load_service.told.mass == pytest.approx(2.0, abs=0.1)
+    assert arm.law.declaration.in_force.mass == pytest.approx(2.0, abs=0.1)
     return arm
 
 
@@ -189,7 +189,7 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     ros.until(lambda: guard.is_settled)
     assert cleanup(ros, arm.law)
     assert configure(ros, arm.law)
-    problem = arm.law.load_service.problem
+    problem = arm.law.declaration.problem
     assert problem.startswith('a load of 2.0')
     assert 'set it back to robot.drive_payload, and restart the node' in problem
     assert activate(ros, arm.law)
@@ -210,7 +210,7 @@ def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
     ros.tester.create_service(Trigger, SERVICE, lambda *_: None)
     law = ros.add(ControllerNode, given)
     assert configure(ros, law)
-    service = law.load_service
+    service = law.declaration
     ros.until(lambda: service.look() or service.problem)
     assert re.fullmatch(
         r'/driver/set_load is a std_srvs/srv/Trigger, but only ur_msgs/srv/SetPayload and .* '
@@ -220,7 +220,7 @@ def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
     service.problem = ''
     types = [(SERVICE, ['nowhere_msgs/srv/SetLoad'])]
     monkeypatch.setattr(law, 'get_service_names_and_types', lambda: types)
-    monkeypatch.setitem(load_service._FILLS, 'nowhere_msgs/srv/SetLoad', None)
+    monkeypatch.setitem(service_declaration._FILLS, 'nowhere_msgs/srv/SetLoad', None)
     service.look()
     assert 'nowhere_msgs cannot be imported: source the workspace' in service.problem
 
@@ -249,7 +249,9 @@ def test_bad_values_are_named_with_a_remedy(given, problem):
 def test_centre_is_in_the_frame_that_the_service_wants(ros):
     """The flange, link 8, is 0.107 m beyond the frame of the last joint, link 7."""
     given = TOLD | {'robot.tip': 'fr3_link7', 'load.frame': 'fr3_link8'}
-    service = load_service.LoadService(ros.tester, change(FR3.controller, given))
+    service = service_declaration.ServiceDeclaration(
+        ros.tester, change(FR3.controller, given)
+    )
     found = service.to_frame @ (0.01, 0.02, 0.03, 1.0)
     np.testing.assert_allclose(found[:3], (0.01, 0.02, 0.03 - 0.107), atol=1e-12)
 
@@ -266,10 +268,12 @@ def test_load_that_is_put_down_has_no_centre(services, ros, kind, mass):
         return response
 
     ros.tester.create_service(services[kind], SERVICE, take)
-    service = load_service.LoadService(ros.tester, change(FR3.controller, given))
+    service = service_declaration.ServiceDeclaration(
+        ros.tester, change(FR3.controller, given)
+    )
     ros.until(lambda: service.look() or service.client)
     ros.until(service.client.service_is_ready)
-    service.ask(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
+    service.declare(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
     ros.until(lambda: requests)
     (request,) = requests
     at = getattr(request, 'center_of_gravity', None)

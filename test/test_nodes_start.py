@@ -13,6 +13,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from ros_rig import JOINTS, START, FakeClock, PatientClock
 
 from blf_dsc_controller.configuration.files import share_folder
+from blf_dsc_controller.configuration.nodes import WATCHDOG
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
@@ -144,7 +145,7 @@ def test_torques_of_the_watchdog_do_not_count_as_those_of_another_controller(ros
             states.get_subscription_count() and commands.get_subscription_count() > 1
         )
     )
-    torque = Float64MultiArrayEncoder(2, topics.WATCHDOG_NODE).encode(np.ones(2))
+    torque = Float64MultiArrayEncoder(2, WATCHDOG).encode(np.ones(2))
     encoder = JointStateEncoder(JOINTS)
     stamps = iter(range(10**9, 10**12, 10**6))
 

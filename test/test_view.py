@@ -35,7 +35,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.main import INTERRUPTED, main
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError

@@ -118,8 +118,7 @@ def measure(run: Run) -> Metrics:
     check_type('run', run, Run, 'simulate(...).run() and read_run return one')
     step = float(run.time[1]) if run.stamp.size > 1 else math.nan
     ratio = _largest_ratio(run)
-    (violation, joint) = first_violation(run)
-    held = None if math.isnan(ratio) else True
+    violation, joint = first_violation(run)
     estimates = estimates_of(run)
 
     def each(reduce: Callable[[Floats], float], name: str) -> tuple[float, ...]:
@@ -139,7 +138,7 @@ def measure(run: Run) -> Metrics:
         torque_limit=each(_least, 'torque_limit'),
         torque_rate=each(lambda torque: rms(np.diff(torque)) / step, 'torque'),
         max_error_ratio=ratio,
-        held=held if math.isnan(violation) else False,
+        held=_held(ratio, violation),
         first_violation=violation,
         violating_joint=joint,
         stops=[
@@ -156,6 +155,13 @@ def measure(run: Run) -> Metrics:
         timing=_timing(run),
         **({} if estimates is None else _learning(estimates)),
     )
+
+
+def _held(ratio: float, violation: float) -> bool | None:
+    """Whether no joint left its bound, by its largest `ratio` and the time of a `violation` [s]."""
+    if not math.isnan(violation):
+        return False
+    return None if math.isnan(ratio) else True
 
 
 def _learning(of: Estimates) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from blf_dsc_controller.bags.older_parameters import (
 from blf_dsc_controller.bags.sources import BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.configuration.received import (
     with_law,
     without_files,
@@ -186,16 +187,16 @@ class Content:
         for _, event in self.events:
             if event.type is EventType.CONFIGURE:
                 recorded = renamed(event.content['parameters'])
-                found.setdefault(topics.CONTROLLER, recorded)
+                found.setdefault(CONTROLLER, recorded)
         for change in self.changes:
             if change.configured:
-                found[topics.PLANT] = change.parameters
+                found[PLANT] = change.parameters
         return found
 
     @property
     def unknown_parameters(self) -> list[str]:
         """Recorded parameters of the controller that this version does not have."""
-        recorded = without_law(self.configurations.get(topics.CONTROLLER, {}))
+        recorded = without_law(self.configurations.get(CONTROLLER, {}))
         known = known_names(recorded)
         return [name for name in recorded if name not in known]
 
@@ -239,7 +240,7 @@ class Content:
 
     def _recorded(self) -> tuple[Mapping[str, Any], str]:
         """Return the parameters of the controller, and where they are from."""
-        values = self.configurations.get(topics.CONTROLLER)
+        values = self.configurations.get(CONTROLLER)
         if values is None:
             raise BagError(
                 f'{self.path} does not hold the configuration of a controller: it was recorded by '

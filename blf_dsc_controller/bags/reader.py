@@ -15,6 +15,7 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_con
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
 from blf_dsc_controller.configuration.law_traits import OWN
+from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
@@ -178,7 +179,7 @@ def _arrays(
 
 def _may_wrap(content: Content) -> bool:
     """Return whether the controller counts turns on for a joint, as a continuous one."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
+    if content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
         with suppress(BlfDscError):
             return bool(turns_freely(content.controller_config()).any())
     return False
@@ -300,7 +301,7 @@ def _joints(content: Content) -> tuple[str, ...]:
 
 def _arm(content: Content) -> tuple[LearnedArm | None, list[str]]:
     """Return the arm of the recorded configuration, and what to say if it cannot be built."""
-    if not content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
+    if not content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
         return None, []
     from blf_dsc_controller.factory.estimate import learned_arm  # slow: compiles
 
@@ -314,7 +315,7 @@ def _arm(content: Content) -> tuple[LearnedArm | None, list[str]]:
 
 def _sliding(content: Content) -> tuple[str, ...]:
     """Return the joints that slide by the recorded configuration; none if it is unknown."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
+    if content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
         with suppress(BlfDscError):
             config = content.controller_config()
             return config.robot.sliding(config.joints)
@@ -323,7 +324,7 @@ def _sliding(content: Content) -> tuple[str, ...]:
 
 def _tool(content: Content) -> ToolErrors | None:
     """Return the errors at the tool as configured; None without a bound there."""
-    if content.configurations.get(topics.CONTROLLER, {}).get('robot.urdf'):
+    if content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
         from blf_dsc_controller.configuration.tool_bound import tool_of  # as above
 
         with suppress(BlfDscError):
@@ -348,7 +349,7 @@ def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
 
 def _contacts(content: Content, events: Iterable[Event]) -> tuple[Contact, ...] | None:
     """Return the contacts in the journal; None if nothing looked for any."""
-    given = content.configurations.get(topics.CONTROLLER, {})
+    given = content.configurations.get(CONTROLLER, {})
     if not given.get('contact.enabled'):
         return None
     return tuple(

@@ -18,7 +18,6 @@ import numpy as np
 from blf_dsc_controller.cli.drive import signals_to
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.commissioning import page
-from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.driven import Driven
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.own_loop import (
@@ -27,6 +26,7 @@ from blf_dsc_controller.commissioning.own_loop import (
     Measured,
     measured_in,
 )
+from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
 from blf_dsc_controller.commissioning.proof import Errors, Step, steps
 from blf_dsc_controller.commissioning.strength import MOST

@@ -9,7 +9,6 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.cli.result_folder import (
     discard_unbegun,
     expect_folder,
@@ -17,6 +16,7 @@ from blf_dsc_controller.cli.result_folder import (
 )
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.run import STOPPED
+from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate

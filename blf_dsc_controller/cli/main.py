@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from blf_dsc_controller import writing
+from blf_dsc_controller import child, writing
 from blf_dsc_controller.cli.parser import (
     check_command,
     check_text,
@@ -27,12 +27,8 @@ from blf_dsc_controller.cli.parser import (
 )
 from blf_dsc_controller.cli.result_folder import discard_unbegun
 from blf_dsc_controller.cli.ros_check import require_ros
+from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.errors import BlfDscError
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
-
-_THREADS = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -138,8 +134,8 @@ def keep_to_one_thread() -> None:
     The matrices here are small. The threads would spin, beside nodes that run at the
     same time and, in a real-time node, at its priority.
     """
-    for name in _THREADS:
-        os.environ.setdefault(name, '1')
+    for name, count in child.ONE_THREAD.items():
+        os.environ.setdefault(name, count)
 
 
 def end_at_signals(program: str) -> None:

@@ -17,8 +17,8 @@ import numpy as np
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.domains import check_network
-from blf_dsc_controller.cli.main import INTERRUPTED
 from blf_dsc_controller.cli.result_folder import BAG, make_folder, refuse_existing
+from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.compiled.kernel_cache import ship
 from blf_dsc_controller.configuration.controller import ControllerConfig

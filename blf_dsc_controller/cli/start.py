@@ -12,12 +12,13 @@ from functools import partial
 from importlib import import_module
 
 _MAIN = 'blf_dsc_controller.cli.main'
-_INTERRUPTED = 130
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
 
 
 def main() -> int:
     """Run the command `blf_dsc` and return its exit code."""
-    _exit_at_signals(_INTERRUPTED, b'blf_dsc: interrupted\n')
+    _exit_at_signals(INTERRUPTED, b'blf_dsc: interrupted\n')
     code: int = import_module(_MAIN).main()
     return code
 

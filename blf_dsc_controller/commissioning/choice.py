@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains, linear
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.linear_loop import (
     SLOWEST,
     Joints,
@@ -40,9 +41,6 @@ from blf_dsc_controller.commissioning.response import DEVIATIONS, Response
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-
-MARGIN = 0.5
-"""Modulus margin of the gains that are chosen."""
 
 BARELY = 0.1
 """Modulus margin, noise not counted, with which an arm nearly oscillates."""
@@ -157,22 +155,22 @@ def choose(
     """
     n = len(start.damping)
 
-    def gains(factors: Floats, lag: Floats) -> JointGains:
+    def gains(lag: Floats, factors: Floats) -> JointGains:
         return by_factors(factors)._replace(damping_lag=lag)
 
-    def is_borne(factors: Floats, lag: Floats) -> bool:
-        return rigid.margin(gains(factors, lag), loops.inertia) >= margin
+    def is_borne(lag: Floats, factors: Floats) -> bool:
+        return rigid.margin(gains(lag, factors), loops.inertia) >= margin
 
     def has_margin(lag: Floats, factors: Floats) -> bool:
-        measured = loops.margin(gains(factors, lag)).value
-        return measured >= margin and is_borne(factors, lag)
+        measured = loops.margin(gains(lag, factors)).value
+        return measured >= margin and is_borne(lag, factors)
 
     lag = np.zeros(n)
     without_lag = factors = _without_lag(n, partial(has_margin, lag))
     if has_margin(lag, factors):
         fastest = min(each.frequency[-1] for each in loops.responses)
         factors, lag = _with_lags(factors, has_margin, lags, fastest)
-    chosen = gains(factors, lag)
+    chosen = gains(lag, factors)
     raised = factors * np.where(np.eye(n, dtype=bool), _STEP, 1.0)
     return Choice(
         gains=chosen,
@@ -180,7 +178,7 @@ def choose(
         without_lag=without_lag,
         margin=loops.margin(chosen),
         measured=loops.margin(start),
-        by_inertia=np.array([not is_borne(each, lag) for each in raised]),
+        by_inertia=np.array([not is_borne(lag, each) for each in raised]),
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commissioning of an arm from a URDF: the motions to run, and what follows from the runs."""
+"""Commissioning of an arm from a URDF: what follows from the runs of its motions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.arms.joint_gains import (
-    BESIDE,
     JointGains,
     damped_arm,
     largest_share,
-    unknown_arm,
 )
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
@@ -25,7 +24,6 @@ from blf_dsc_controller.commissioning.better_known import as_measured, known_fri
 from blf_dsc_controller.commissioning.choice import (
     BARELY,
     LAGS,
-    MARGIN,
     Choice,
     Loops,
     RigidArm,
@@ -38,49 +36,22 @@ from blf_dsc_controller.commissioning.chosen import (
     with_gains,
 )
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
+from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import Response, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
-from blf_dsc_controller.configuration.plausibility import hint_at_degrees
-from blf_dsc_controller.configuration.schema import Value, change
+from blf_dsc_controller.configuration.schema import Value
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run
 from blf_dsc_controller.supervision.digits import two_digits
-from blf_dsc_controller.supervision.reference_load import along
 
 Floats = NDArray[np.float64]
 
-TORQUE = 0.03
-"""Torque of the motion, rms, as a share of the rated one."""
-TRAVEL = 0.01
-"""How far the tool may travel in the motion, from its middle [m]."""
-POSTURES = 3
 CREEPING = 1.5
 """Times the measured friction, to expect of a joint that hardly slid while it was measured.
 
 A joint that friction damps more than its gains do follows less than half of its swings, and shows
 only a part of its friction.  The factor is the one that is taken for breakaway.
 """
-
-
-class Planned(NamedTuple):
-    """A motion to run, and how far it goes."""
-
-    config: ControllerConfig
-    # parameters of `config` that differ from those of the arm in use
-    values: dict[str, object]
-    posture: Floats  # (n,) rad
-    excitation: motion.Excitation
-    share: float = 1.0  # of the gains of the arm in use
-    torque: float = TORQUE  # rms, as a share of the rated one, at most
-
-    @property
-    def duration(self) -> float:
-        """Time [s] that a run needs, a little more than the period that counts.
-
-        Swings end where they vanish.
-        """
-        more = motion.BEAT if self.excitation.sliding else 0.5
-        return motion.SETTLING + self.excitation.period + more
 
 
 class Commissioned(NamedTuple):
@@ -108,7 +79,7 @@ class Commissioned(NamedTuple):
         return self.choice.margin.value >= self.aim
 
     @property
-    def lags(self) -> bool:
+    def has_lags(self) -> bool:
         """Whether the damping of a joint is to lag."""
         return bool(np.any(self.choice.gains.damping_lag))
 
@@ -158,7 +129,7 @@ class Commissioned(NamedTuple):
             of_arm['robot.rotor_inertia'] = _rounded(self.rotors)
         if self.coulomb is not None:
             of_arm['robot.coulomb'] = _rounded(self.coulomb)
-        if self.lags or any(self.before.feedback.lags):
+        if self.has_lags or any(self.before.feedback.lags):
             of_arm['feedback.joint_damping_lag'] = _rounded(
                 np.asarray(gains.damping_lag)
             )
@@ -173,71 +144,6 @@ class Commissioned(NamedTuple):
             'commissioning.friction': _rounded(self.friction),
             'commissioning.unseen_inertia': _rounded(self.unseen),
         }
-
-
-def postures_of(
-    config: ControllerConfig, count: int = POSTURES, here: Floats | None = None
-) -> Floats:
-    """Return postures (count, n) [rad] that the configured reference visits.
-
-    One to hold visits only `here` (n,) [rad], where the arm is. Raises BlfDscError if it
-    is not known.
-    """
-    if config.reference.type == 'hold':
-        if here is None:
-            raise BlfDscError(
-                'reference.type: got hold, with which the arm stays where it begins: give the '
-                'postures in which to measure it (--posture ANGLE ... [rad]), or a reference '
-                'that moves'
-            )
-        return here[None]
-    return np.asarray(along(config, count)[0])
-
-
-def plan(
-    config: ControllerConfig,
-    postures: Floats,
-    *,
-    torque: float = TORQUE,
-    travel: float = TRAVEL,
-    sliding: bool = False,
-    share: float = 1.0,
-) -> list[Planned]:
-    """Return the motions around postures (k, n) [rad] by which an arm is measured.
-
-    `sliding` adds swings that keep joints sliding which would stick without.  The arm has a
-    `share` of the gains of the configuration.
-
-    Raises BlfDscError if the arm is not from a URDF, or if its feedback acts through the
-    inertia matrix, which may make an arm with elastic joints unstable.
-    """
-    if config.model != 'urdf':
-        raise BlfDscError(
-            'robot.urdf: got none, but commissioning needs an arm from a URDF'
-        )
-    if config.feedback.inertia != 'none':
-        raise BlfDscError(
-            f'feedback.inertia: got {config.feedback.inertia}, but an arm is measured with '
-            'gains of its joints, each on its own: give none'
-        )
-    gains = _softer(config, share)
-    arm = with_gains(config, gains) if gains else config
-    planned = []
-    for posture in postures:
-        _check_posture(config, posture)
-        excitation = motion.excitation(arm, posture, torque, travel, sliding=sliding)
-        values = {**gains, **motion.shaking_parameters(arm, excitation, posture)}
-        made = change(arm, values)
-        planned.append(Planned(made, values, posture, excitation, share, torque))
-    return planned
-
-
-def _softer(config: ControllerConfig, share: float) -> dict[str, Value]:
-    """Return a share of the gains of the measurement, by dotted name: none, if it is all."""
-    if share == 1.0:
-        return {}
-    gains = measuring_gains(config).scaled(share)
-    return as_parameters(gains.stiffness, gains.damping)
 
 
 def commissioned(
@@ -378,46 +284,6 @@ def _unseen(found: Findings, assumed: Floats) -> Floats:
     """
     beyond = (found.hidden - assumed).clip(0.0).min(axis=0)
     return np.asarray(np.where(np.isnan(found.inertia), beyond, 0.0))
-
-
-def measuring_gains(config: ControllerConfig) -> JointGains:
-    """Return the gains with which an arm is measured."""
-    arm, _ = design_of(config)
-    gains = arm.joints or unknown_arm(arm.rotors)
-    lag = np.array(config.feedback.lags)
-    return gains.scaled(arm.stiffness)._replace(damping_lag=lag, share=BESIDE)
-
-
-def _check_posture(config: ControllerConfig, posture: Floats) -> None:
-    n = len(config.joints)
-    if posture.shape != (n,):
-        raise BlfDscError(
-            f'posture: got {posture.size} angles, but the arm has {n} joint{"s" * (n > 1)}'
-        )
-    limits = zip(
-        config.joints,
-        posture,
-        config.limits.position_lower,
-        config.limits.position_upper,
-        strict=True,
-    )
-    for joint, at, lower, upper in limits:
-        if not lower + _FROM_LIMITS <= at <= upper - _FROM_LIMITS:
-            raise BlfDscError(
-                f'posture: {joint} would be at {at:.4g} rad, '
-                f'{_beyond(float(at), lower, upper)}'
-            )
-
-
-_FROM_LIMITS = 0.05  # rad
-
-
-def _beyond(at: float, lower: float, upper: float) -> str:
-    """Return how an angle [rad] is past or near the limits of its joint, with a hint at degrees."""
-    limits = f'its limits, {lower:g} to {upper:g} rad'
-    if lower <= at <= upper:
-        return f'less than {_FROM_LIMITS:g} rad from {limits}'
-    return f'beyond {limits}{hint_at_degrees(at, lower, upper)}'
 
 
 def _rounded(values: Floats) -> tuple[float, ...]:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.commissioning.motion import OF_RATE
 from blf_dsc_controller.run import Run
 
 Floats = NDArray[np.float64]
@@ -35,7 +36,6 @@ _SEEN = {AT_REST: 5.0, IN_MOTION: 10.0}  # s, the last ones of a run
 _SLOWEST = {AT_REST: 1.5, IN_MOTION: 3.0}  # Hz: below, a motion has errors of its own
 _BELOW = 3.0  # of the slowest, down to which nothing is larger
 _FASTEST = 40.0  # Hz
-_OF_RATE = 0.35  # of the sample rate, the fastest at most
 _LASTS = 0.5  # of the amplitude of one half of the time, that the other has at least
 _PURE = 0.5  # of the mean square in the band, that the peak has at least
 _WIDE, _LINES = 0.2, 2  # reach of a peak: of its frequency, and lines at least
@@ -81,7 +81,7 @@ def limit_cycles(run: Run, when: str) -> list[LimitCycle]:
 def _peak(error: Floats, T: float, slowest: float) -> tuple[float, float] | None:
     """Return amplitude and frequency [Hz] of a peak in an error (N,), every `T` [s]; None: none."""
     frequency, square = _spectrum(error, T)
-    fastest = min(_FASTEST, _OF_RATE / T)
+    fastest = min(_FASTEST, OF_RATE / T)
     band = np.flatnonzero((frequency >= slowest) & (frequency <= fastest))
     k = int(band[square[band].argmax()])
     if k == band[0]:  # the end of something slower

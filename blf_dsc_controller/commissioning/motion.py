@@ -53,9 +53,11 @@ BEAT = 2.0
 SLIDING = 0.1
 """Largest speed of the swings [rad/s]."""
 
+OF_RATE = 0.35
+"""Part of the sample rate, above which nothing is excited or looked for."""
+
 _LINES = 80  # of each joint, at most
 _SLOWEST, _FASTEST = 2.0, 120.0  # Hz
-_OF_RATE = 0.35  # of the sample rate, the fastest line at most
 _SECONDS = 4.0  # of the period, for each joint
 _SLOW, _SWING = 1.0, 4.0  # Hz, of slow tones and of swings
 _LEAST_SWING = 0.05  # of slow tones, below which the lines shrink, too
@@ -346,7 +348,7 @@ _WIDE_BOUND = 0.1  # rad, bound of the errors
 
 def _bins(n: int, period: float, sample_time: float) -> Ints:
     """Return the lines (n, K) of the joints: half of the spectrum stays free, for noise."""
-    fastest = min(_FASTEST, _OF_RATE / sample_time)
+    fastest = min(_FASTEST, OF_RATE / sample_time)
     wanted = np.geomspace(_SLOWEST, fastest, _LINES) * period / (2 * n)
     middle = np.unique(np.rint(wanted).astype(np.int64))
     return np.asarray(2 * n * middle + np.arange(n)[:, None])

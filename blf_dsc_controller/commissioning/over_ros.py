@@ -30,12 +30,12 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.nodes.run_by_run import RunByRunNode
+from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 Floats = NDArray[np.float64]
 
-_NANO = 1e-9
 # s without joint states, or anybody who takes torques: longer than the watchdog of the
 # law waits, which is for stamps of the wall clock only
 _PATIENCE = 10.0
@@ -178,7 +178,7 @@ class OverRos(PostureByPosture):
                 return trouble
             if text := disturbed.text or self._look_for_others():
                 return End.STOPPED, text
-            passed = (guard.journal.stamp - guard.reference.start_stamp) * _NANO
+            passed = (guard.journal.stamp - guard.reference.start_stamp) * NANOSECOND
             if guard.commanding and passed >= duration:
                 return End.DURATION, ''
 
@@ -223,6 +223,6 @@ class OverRos(PostureByPosture):
         since = guard.journal.stamp
         while guard.commanding and not guard.is_settled and self._requests < 2:
             self._spin()
-            is_late = (guard.journal.stamp - since) * _NANO > _SETTLING
+            is_late = (guard.journal.stamp - since) * NANOSECOND > _SETTLING
             if is_late or time.monotonic() - self._node.heard > _PATIENCE:
                 return

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.commissioning.better_known import (
@@ -20,17 +21,16 @@ from blf_dsc_controller.commissioning.better_known import (
     better_configuration,
     is_known_by_urdf_only,
 )
-from blf_dsc_controller.commissioning.choice import LAGS, MARGIN
-from blf_dsc_controller.commissioning.commissioning import (
+from blf_dsc_controller.commissioning.choice import LAGS
+from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.motion import SLOW_TONES
+from blf_dsc_controller.commissioning.planned import (
     TORQUE,
     TRAVEL,
-    Commissioned,
     Planned,
-    commissioned,
     plan,
     postures_of,
 )
-from blf_dsc_controller.commissioning.motion import SLOW_TONES
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate

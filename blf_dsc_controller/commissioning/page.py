@@ -16,13 +16,10 @@ from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST
 from blf_dsc_controller.commissioning.better_known import FAR_ABOVE, known_friction
-from blf_dsc_controller.commissioning.commissioning import (
-    CREEPING,
-    Commissioned,
-    Planned,
-)
+from blf_dsc_controller.commissioning.commissioning import CREEPING, Commissioned
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
+from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
@@ -47,33 +44,23 @@ def description(planned: Planned) -> str:
     )
 
 
+# what it is, whether it was measured or chosen, and its unit
+_COLUMNS = (
+    ('', '', ''),  # the joint
+    ('inertia', 'measured', 'kg m^2'),
+    ('as assumed', '', 'kg m^2'),
+    ('damping', 'measured', 'N m s/rad'),
+    ('friction', 'measured', 'N m'),
+    ('resonance', 'measured', 'Hz'),
+    ('stiffness', 'chosen', 'N m/rad'),
+    ('damping', 'chosen', 'N m s/rad'),
+    ('its lag', 'chosen', 'ms'),
+)
+
+
 def table(found: Commissioned) -> str:
     """Return what was measured and chosen for each joint, beside what was assumed."""
-    heads = (
-        '',
-        'inertia',
-        'as assumed',
-        'damping',
-        'friction',
-        'resonance',
-        'stiffness',
-        'damping',
-        'its lag',
-    )
-    units = (
-        '',
-        'kg m^2',
-        'kg m^2',
-        'N m s/rad',
-        'N m',
-        'Hz',
-        'N m/rad',
-        'N m s/rad',
-        'ms',
-    )
-    measured = ('measured',) * 3
-    above = ('', 'measured', '', *measured, *('chosen',) * 3)
-    rows: list[Sequence[str]] = [heads, above, units]
+    rows: list[Sequence[str]] = list(zip(*_COLUMNS, strict=True))
     gains = found.choice.gains
     lags = np.broadcast_to(gains.damping_lag, gains.damping.shape)
     for j, joint in enumerate(found.joints):
@@ -161,7 +148,7 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
 
 def _of_lags(found: Commissioned) -> Iterator[str]:
     """Yield whose damping lags, and what the gains owe to that."""
-    if not found.lags:
+    if not found.has_lags:
         return
     choice = found.choice
     lags = ', '.join(

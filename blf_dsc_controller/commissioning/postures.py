@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.commissioning import motion
-from blf_dsc_controller.commissioning.commissioning import Planned
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.own_loop import (
     REPEATS,
@@ -30,6 +29,7 @@ from blf_dsc_controller.commissioning.own_loop import (
     Measured,
     measured_in,
 )
+from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import (
     Errors,
     Step,

@@ -104,7 +104,10 @@ def cycles_in(still: Path, moved: Path, config: ControllerConfig) -> list[LimitC
 
 
 def errors_of(bag: Path, config: ControllerConfig) -> Errors:
-    """Return the largest errors of a run, and those to expect along its reference."""
+    """Return the largest errors (n,) [rad] of a run, and those to expect along its reference.
+
+    Raises BlfDscError if the bag has no tracking errors.
+    """
     run = read_run(bag)
     if run.error is None:
         raise BlfDscError(f'{bag} has no tracking errors')

@@ -20,9 +20,9 @@ import numpy as np
 
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning.choice import BARELY, Loops
-from blf_dsc_controller.commissioning.commissioning import measuring_gains
 from blf_dsc_controller.commissioning.findings import rubs
 from blf_dsc_controller.commissioning.motion import lines_in
+from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import HiddenError, response_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.run import Run

@@ -29,8 +29,8 @@ from blf_dsc_controller.drive.driver import (
     ReflexError,
     RobotState,
 )
+from blf_dsc_controller.drive.driver_declaration import DriverDeclaration
 from blf_dsc_controller.drive.latency import Latency
-from blf_dsc_controller.drive.load_teller import LoadTeller
 from blf_dsc_controller.drive.motor_feedback import MotorFeedback
 from blf_dsc_controller.supervision.supervisor import Phase
 
@@ -95,7 +95,8 @@ class DriveLoop:
         self._controller = controller
         self._duration = duration
         self._settle_time = settle_time
-        self._teller = LoadTeller(driver, controller)
+        self._declaration = DriverDeclaration(driver)
+        self._load_in_motion = driver.facts_for(controller.config).load_in_motion
         self._feedback: MotorFeedback | None = None
         if feedback == 'motor':
             self._feedback = MotorFeedback(controller, driver.ranges, driver.latency)
@@ -112,7 +113,7 @@ class DriveLoop:
     @property
     def remark(self) -> str:
         """Why the robot is told no more loads, or empty."""
-        return self._teller.problem
+        return self._declaration.problem
 
     def request_end(self) -> None:
         """Bring the arm to rest and end; a second request ends at once.
@@ -141,7 +142,7 @@ class DriveLoop:
         except ConnectionLostError as error:
             self._withdraw(End.LOST, str(error))
         finally:
-            self._teller.close()
+            self._declaration.close()
         if self._error is not None:
             raise self._error
         return Outcome(self._end or End.REQUESTED, self._text, self._states)
@@ -166,7 +167,7 @@ class DriveLoop:
         """
         self._states += 1
         try:
-            self._teller.follow()
+            self._declaration.follow(self._controller, in_motion=self._load_in_motion)
             self._controller.update(*state, send=self._send)
             if self._beside is not None:
                 self._beside.follow()

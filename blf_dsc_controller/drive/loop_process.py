@@ -30,7 +30,6 @@ from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.script_link import ArmState
 
 _MODULE = 'blf_dsc_controller.drive.script_process'
-_ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 _POLL = 0.1  # s
 _SILENCE = 60.0  # s without a word of a loop that runs
 _END = 5.0  # s, for a process that was told to end at once
@@ -67,7 +66,7 @@ class LoopProcess:
                 [*child.running_module(_MODULE), f'{theirs.fileno()}'],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                env=dict.fromkeys(_ONE_THREAD, '1') | os.environ | child.places(),
+                env=child.ONE_THREAD | os.environ | child.places(),
                 start_new_session=True,  # Ctrl-C is for the script, which brakes
             )
         self._link = Link(ours)

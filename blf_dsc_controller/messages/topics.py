@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-CONTROLLER = 'blf_dsc_controller'
-PLANT = 'sim_plant'
-WATCHDOG_NODE = 'torque_watchdog'
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, WATCHDOG
 
 FOREVER = 2**63 - 1  # ns
 
@@ -98,7 +96,7 @@ STATE = Topic(
     LATCHED_QUALITY,
 )
 WATCHDOG_STATE = Topic(
-    WATCHDOG_NODE,
+    WATCHDOG,
     '~/state',
     'diagnostic_msgs/msg/DiagnosticStatus',
     LATCHED_QUALITY,

@@ -42,6 +42,7 @@ from blf_dsc_controller.control.goal_messages import (
     decode,
     encode,
 )
+from blf_dsc_controller.messages.codecs import NANOSECONDS
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.nodes.action_process import KIND
 from blf_dsc_controller.run import NANOSECOND
@@ -49,7 +50,6 @@ from blf_dsc_controller.run import NANOSECOND
 _LARGEST = 1 << 30  # bytes of goals that wait
 _PATIENCE = 10.0  # s, until a controller takes a goal
 _POLL = 1.0  # s
-_SECOND = 1_000_000_000
 Result = FollowJointTrajectory.Result
 
 
@@ -149,7 +149,7 @@ class TrajectoryActionServer:
         if handle is None:
             return
         feedback = FollowJointTrajectory.Feedback()
-        seconds, nanoseconds = divmod(message.stamp, _SECOND)
+        seconds, nanoseconds = divmod(message.stamp, NANOSECONDS)
         feedback.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
         feedback.joint_names = self._joints
         feedback.desired = _point(message.time, message.desired)

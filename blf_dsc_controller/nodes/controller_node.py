@@ -12,6 +12,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, WATCHDOG
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.errors import TareError
@@ -26,7 +27,7 @@ from blf_dsc_controller.nodes.controller_log import ControllerLog
 from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
-from blf_dsc_controller.nodes.load_service import LoadService
+from blf_dsc_controller.nodes.service_declaration import ServiceDeclaration
 from blf_dsc_controller.nodes.start_conditions import WAITING_PERIOD, StartConditions
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
@@ -56,19 +57,19 @@ class ControllerNode(LoopNode[ControllerConfig]):
         starting: what is looked at before the first state is used.
         status: diagnostics and events; its `trajectories` are the motions that were asked for.
         action: offers trajectories as an action; None: nobody can ask for any.
-        load_service: declares loads to the drives; None: nothing does.
+        declaration: declares loads to the drives; None: nothing does.
         log: logs what is new of the law.
         warned_at: stamp of the start that the last warning was about [ns].
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(topics.CONTROLLER, ControllerConfig, **options)
+        super().__init__(CONTROLLER, ControllerConfig, **options)
         joints = self.config.joints
         self.guard: Guard | None = None
         self.outputs = Outputs()
         self._loop: GuardedLoop | None = None
         self._load: ReferenceLoad | None = None
-        self.load_service: LoadService | None = None
+        self.declaration: ServiceDeclaration | None = None
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
         self._started = False
@@ -131,9 +132,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Declare loads to the driver's service, if there is one; warn if one is missing."""
         load = self.config.load
         if load.service:
-            if self.load_service is None:
-                self.load_service = LoadService(self, self.config)
-            self.load_service.begin()
+            if self.declaration is None:
+                self.declaration = ServiceDeclaration(self, self.config)
+            self.declaration.begin()
         elif load.tell_drive:
             self.get_logger().warning(
                 'load.tell_drive: without load.service no load is declared to the '
@@ -266,8 +267,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
         if trajectories is not None and trajectories.job is not None:
             trajectories.poll(guard)
         try:
-            if self.load_service is not None:
-                self.load_service.follow(guard, self.config)
+            if self.declaration is not None:
+                self.declaration.follow(guard, in_motion=self.config.load.in_motion)
             torque = self._torque_for(guard, raw)
             self._write(topics.JOINT_STATES, raw)
             self._command(torque)
@@ -290,7 +291,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _is_simulated(self) -> bool:
         """Whether all joint states are of this package's simulated arm."""
         found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
-        return all(each.node_name == topics.PLANT for each in found)
+        return all(each.node_name == PLANT for each in found)
 
     def survive(self, error: Exception) -> bool:
         """Make a safe stop after an unexpected error."""
@@ -370,7 +371,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             self.action.poll(guard)
         if guard is None:
             return False
-        held = self.starting.release(guard)
+        held = self.starting.take_held(guard)
         if held is not None:
             self._on_joint_state(held)
         self._command(guard.watch())
@@ -418,8 +419,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def on_second(self) -> None:
         """Look for what may appear or vanish beside this node, and report."""
         self._look_for_watchdog()
-        if self.load_service is not None:
-            self.load_service.look()
+        if self.declaration is not None:
+            self.declaration.look()
         super().on_second()
         guard = self.guard
         if guard is not None and guard.reference.start_stamp != self.warned_at:
@@ -431,7 +432,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         commands = self._outputs.get(topics.COMMANDS)
         if commands is None or process.interrupted():
             return
-        there = self._subscribers(commands, topics.WATCHDOG_NODE) > 0
+        there = self._subscribers(commands, WATCHDOG) > 0
         if self._watchdog.look(there=there):
             self.get_logger().error(self._watchdog.problem)
 

@@ -92,8 +92,11 @@ class ControllerStart:
                 guard.starting.take_over_from(acting)
         return False
 
-    def release(self, guard: Guard) -> bytes | None:
-        """Return the state held, once it may be used; call it every 8 ms."""
+    def take_held(self, guard: Guard) -> bytes | None:
+        """Return the state held, once it may be used, and hold none; call it every 8 ms.
+
+        An arm that is not supported is refused instead.
+        """
         waits = self._gate.poll()
         if self.held is None or not self._note_observers():
             return None
@@ -134,10 +137,9 @@ class ControllerStart:
             return False
         guard.observe(stamp, self._decoder.values)
         state = self._gate.take(stamp)
-        self.held = raw
+        self.held = raw if state is GateState.MEASURING else None
         if state is GateState.MEASURING:
             return True
-        self.held = None
         if state is GateState.REFUSED:
             guard.starting.refuse(StartError(self._gate.problem))
         return self._refuse_unsupported(guard)

@@ -17,10 +17,11 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import WATCHDOG
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.topics import WATCHDOG_NODE, Message, Topic
+from blf_dsc_controller.messages.topics import Message, Topic
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.endpoints import (
     PollingTimer,
@@ -207,7 +208,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
             publisher = next(iter(self._outputs.values()))
             found = self.get_publishers_info_by_topic(publisher.topic_name)
             before = self.others
-            self.others = sum(each.node_name != WATCHDOG_NODE for each in found) - 1
+            self.others = sum(each.node_name != WATCHDOG for each in found) - 1
             if self.others > before:
                 self.get_logger().warning(
                     f'another node publishes on {publisher.topic_name}, too: stop one of the two '
@@ -232,7 +233,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         wanted = self.config.wait_for_subscribers
         publishers = [*self._outputs.values()]
         others = publishers[0].get_subscription_count()
-        others -= self._subscribers(publishers[0], WATCHDOG_NODE)
+        others -= self._subscribers(publishers[0], WATCHDOG)
         others -= self._subscribers(publishers[0], subscriptions_of(self))
         recorders = (self._subscribers(each, _RECORDER) for each in publishers)
         return others > wanted and (wanted == 0 or min(recorders) >= wanted)

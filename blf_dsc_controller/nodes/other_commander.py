@@ -19,6 +19,7 @@ from math import inf
 import numpy as np
 from rclpy.node import Node
 
+from blf_dsc_controller.configuration.nodes import WATCHDOG
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
@@ -59,7 +60,7 @@ class OtherCommander:
         self._steady = steady
         self._listening = _LISTENING + random.uniform(0.0, _SPREAD)  # noqa: S311
         self._of_watchdog: RawMessage | None = None  # its last torque
-        self._watchdogs = Float64MultiArrayEncoder(joints, topics.WATCHDOG_NODE)
+        self._watchdogs = Float64MultiArrayEncoder(joints, WATCHDOG)
         self._subscriptions = RawSubscriptions(node)
         quality = Quality(depth=1, reliability='best_effort')
         type_name = topics.COMMANDS.type
@@ -112,5 +113,5 @@ class OtherCommander:
     def _has_others(self) -> bool:
         """Whether other nodes than the watchdog publish torques, besides the own one."""
         found = self._node.get_publishers_info_by_topic(self.topic)
-        others = [each for each in found if each.node_name != topics.WATCHDOG_NODE]
+        others = [each for each in found if each.node_name != WATCHDOG]
         return len(others) > 1

@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -107,46 +106,15 @@ def on_change(
     thread: poll what is returned.
     """
     names = {parameter.name for parameter in parameters(cls)}
-    changes = _Changes(read(node, cls), check)
-
-    def validate(requested: list[RosParameter]) -> SetParametersResult:
-        values = {each.name: each.value for each in requested if each.name in names}
-        if not values:
-            return SetParametersResult(successful=True)
-        try:
-            change = changes.find(values)
-        except ConfigurationError as error:
-            return SetParametersResult(
-                successful=False, reason='\n'.join(error.problems)
-            )
-        found = [*change.problems, *(problems(change.after) if problems else [])]
-        changes.candidate = change.after
-        return SetParametersResult(successful=not found, reason='\n'.join(found))
-
-    def apply_changes(changed: list[RosParameter]) -> None:
-        if any(each.name in names for each in changed):
-            changes.config = changes.candidate
-            apply(changes.config)
-
-    node.add_on_set_parameters_callback(validate)
-    node.add_post_set_parameters_callback(apply_changes)
+    changes = _Changes(read(node, cls), names, apply, problems, check)
+    node.add_on_set_parameters_callback(changes.validate)
+    node.add_post_set_parameters_callback(changes.put_in_force)
     answers = LateAnswers()
     if check is not None:
         for service in node.services:
             if service.srv_type in {SetParameters, SetParametersAtomically}:
-                answers.delay(service, partial(_prepare, changes, names))
+                answers.delay(service, changes.prepare_request)
     return answers
-
-
-def _prepare(changes: _Changes[Any], names: set[str], request: Any) -> None:
-    """Build and check what a request changes, as if all of it were accepted."""
-    is_atomic = isinstance(request, SetParametersAtomically.Request)
-    given = [RosParameter.from_parameter_msg(each) for each in request.parameters]
-    config = changes.config
-    for group in [given] if is_atomic else [[each] for each in given]:
-        values = {each.name: each.value for each in group if each.name in names}
-        if values:
-            config = changes.prepare(config, values).after
 
 
 class _Change(NamedTuple, Generic[Config]):
@@ -159,17 +127,65 @@ class _Change(NamedTuple, Generic[Config]):
 
 
 class _Changes(Generic[Config]):
-    """The configuration in force, the last checked one, and prepared changes."""
+    """The configuration in force, the one that was accepted last, and prepared changes.
+
+    Parameters of other `names` are not its own.
+    """
 
     def __init__(
-        self, config: Config, check: Callable[[Config, Config], list[str]] | None
+        self,
+        config: Config,
+        names: set[str],
+        apply: Callable[[Config], None],
+        problems: Callable[[Config], list[str]] | None,
+        check: Callable[[Config, Config], list[str]] | None,
     ) -> None:
-        self.config = config
-        self.candidate = config
+        self._config = config
+        self._accepted = config
+        self._names = names
+        self._apply = apply
+        self._problems = problems
         self._check = check
         self._prepared: tuple[_Change[Config], ...] = ()
 
-    def prepare(self, before: Config, values: dict[str, Any]) -> _Change[Config]:
+    def validate(self, requested: list[RosParameter]) -> SetParametersResult:
+        """Accept the complete configuration that results, or say why not."""
+        values = self._own(requested)
+        if not values:
+            return SetParametersResult(successful=True)
+        try:
+            found = self._find(values)
+        except ConfigurationError as error:
+            return SetParametersResult(
+                successful=False, reason='\n'.join(error.problems)
+            )
+        reasons = [*found.problems]
+        if self._problems is not None:
+            reasons += self._problems(found.after)
+        self._accepted = found.after
+        return SetParametersResult(successful=not reasons, reason='\n'.join(reasons))
+
+    def put_in_force(self, changed: list[RosParameter]) -> None:
+        """Apply the configuration that was accepted last."""
+        if self._own(changed):
+            self._config = self._accepted
+            self._apply(self._config)
+
+    def prepare_request(self, request: Any) -> None:
+        """Build and check what a request changes, as if all of it were accepted."""
+        is_atomic = isinstance(request, SetParametersAtomically.Request)
+        given = [RosParameter.from_parameter_msg(each) for each in request.parameters]
+        config = self._config
+        for group in [given] if is_atomic else [[each] for each in given]:
+            values = self._own(group)
+            if values:
+                config = self._prepare(config, values).after
+
+    def _own(self, given: list[RosParameter]) -> dict[str, Any]:
+        """Return the values of own parameters by name."""
+        return {each.name: each.value for each in given if each.name in self._names}
+
+    def _prepare(self, before: Config, values: dict[str, Any]) -> _Change[Config]:
         """Build and check a change; raise ConfigurationError with its problems."""
         after = change(before, values)
         found = self._check(before, after) if self._check else []
@@ -177,12 +193,12 @@ class _Changes(Generic[Config]):
         self._prepared = (*self._prepared[-_PREPARED:], prepared)
         return prepared
 
-    def find(self, values: dict[str, Any]) -> _Change[Config]:
+    def _find(self, values: dict[str, Any]) -> _Change[Config]:
         """Return a change of the configuration in force, prepared only once."""
         for each in self._prepared:
-            if each.before is self.config and each.values == values:
+            if each.before is self._config and each.values == values:
                 return each
-        return self.prepare(self.config, values)
+        return self._prepare(self._config, values)
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:

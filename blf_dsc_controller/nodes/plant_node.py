@@ -28,6 +28,7 @@ from rclpy.timer import Timer
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
 from blf_dsc_controller.messages import topics
@@ -77,7 +78,7 @@ class PlantNode(LoopNode[PlantConfig]):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(topics.PLANT, PlantConfig, **options)
+        super().__init__(PLANT, PlantConfig, **options)
         parameters.on_change(self, PlantConfig, self._reconfigure)
         self.latency = Latency()
         joints = self.config.joints
@@ -96,7 +97,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self._changed: dict[str, Value] = {}
         self._changes = create_publisher(self, topics.CHANGES)
         self._tell_parameters()
-        self._controller = self.create_client(Trigger, f'{topics.CONTROLLER}/reset')
+        self._controller = self.create_client(Trigger, f'{CONTROLLER}/reset')
         self.plant: Plant
         self.deactivate()
         self.start()
@@ -209,6 +210,7 @@ class PlantNode(LoopNode[PlantConfig]):
         return self._controller.call_async(Trigger.Request()) if ready else None
 
     def _offer(self) -> None:
+        """Publish the first state, after incomplete ones; if a torque waits, go on at once."""
         if not self._lockstep:
             self.start_stamp = self._wall() - self.plant.elapsed_ns
         self.is_offered = True
@@ -224,6 +226,7 @@ class PlantNode(LoopNode[PlantConfig]):
             self._publish_state()
 
     def _on_command(self, raw: bytes) -> None:
+        """Take a torque: the first one releases the brake, and in lock-step each is a step."""
         try:
             size = self._decoder.decode(raw)
         except MessageError as error:
@@ -243,11 +246,12 @@ class PlantNode(LoopNode[PlantConfig]):
         self.has_torque = True
         if not self._running:
             self.get_logger().info('first torque received: brake off')
-            self._release()
+            self._release_brake()
         if self._lockstep:
             self._advance()
 
-    def _release(self) -> None:
+    def _release_brake(self) -> None:
+        """Let the arm move from the present sample on."""
         self._running = True
         self._began = self._now()
         self.latency = Latency()  # without the wait for the controller's start
@@ -275,6 +279,7 @@ class PlantNode(LoopNode[PlantConfig]):
             )
 
     def _advance(self) -> None:
+        """Integrate a sample with the last torque, if it is not too old; publish the state."""
         if self._end_if_over():
             return
         was_stale = self._stale
@@ -303,6 +308,7 @@ class PlantNode(LoopNode[PlantConfig]):
         )
 
     def _step(self) -> None:
+        """Integrate a sample; say so if a reflex of the drives has stopped the arm."""
         torque = self.input.torque
         self.plant.step(torque)
         if self._halt or not self.plant.is_stopped:

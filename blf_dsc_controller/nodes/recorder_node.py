@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.configuration.nodes import RecorderConfig
+from blf_dsc_controller.configuration.nodes import RECORDER, RecorderConfig
 from blf_dsc_controller.messages.codecs import UnknownTypeError, joint_state_stamp
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.topics import JOINT_STATES
@@ -69,7 +69,7 @@ class BagRecorderNode(PlainNode):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('bag_recorder', enable_rosout=False, **options)
+        super().__init__(RECORDER, enable_rosout=False, **options)
         self._config = declare(self, RecorderConfig)
         self._chosen = {self.resolve_topic_name(name) for name in self._config.topics}
         self._raw_subscriptions = RawSubscriptions(self)

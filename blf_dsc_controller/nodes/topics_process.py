@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
+from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.messages import topic_link, topics
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.topic_link import (
@@ -126,7 +127,7 @@ def main() -> int:
     os.nice(_NICE)
     link = Link(socket.socket(fileno=int(descriptor)))
     rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
-    node = Node(topics.CONTROLLER, namespace=namespace, start_parameter_services=False)
+    node = Node(CONTROLLER, namespace=namespace, start_parameter_services=False)
     loop = LoopTopics(node, link, [int(kind) for kind in kinds.split(',')], joints)
     with EventsExecutor() as executor:
         executor.add_node(node)

@@ -23,7 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import WatchdogConfig, load
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    WATCHDOG,
+    WatchdogConfig,
+    load,
+)
 from blf_dsc_controller.configuration.received import without_files
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError
@@ -79,7 +84,7 @@ class WatchdogNode(PlainNode):
     def __init__(
         self, *, steady: Callable[[], int] = time.monotonic_ns, **options: Any
     ) -> None:
-        super().__init__(topics.WATCHDOG_NODE, **options)
+        super().__init__(WATCHDOG, **options)
         self._steady = steady
         self._config = declare(self, WatchdogConfig)
         self.watchdog: TorqueWatchdog | None = None
@@ -101,7 +106,7 @@ class WatchdogNode(PlainNode):
         )
         self._diagnostics = DiagnosticsPublisher(self, ())
         self._latched = create_publisher(self, topics.WATCHDOG_STATE)
-        self._controller = f'{self.get_namespace().rstrip("/")}/{topics.CONTROLLER}'
+        self._controller = f'{self.get_namespace().rstrip("/")}/{CONTROLLER}'
         self._timer = PollingTimer(self, _PERIOD, self._poll)
         create_steady_timer(self, _LOOK_PERIOD, self._look)
         create_steady_timer(self, _REPORT_PERIOD, self._report)
@@ -154,6 +159,7 @@ class WatchdogNode(PlainNode):
             self._given = given
 
     def _heed(self, meaning: Meaning) -> None:
+        """Stand by if the controller is back, and stand down if it is silent on purpose."""
         watchdog = self.watchdog
         if watchdog is None:
             self._report_problem(
@@ -191,7 +197,7 @@ class WatchdogNode(PlainNode):
             return
         self._states = JointStateDecoder(config.joints, required=('position',))
         self._commands = Float64MultiArrayDecoder(count)
-        self._encoder = Float64MultiArrayEncoder(count, topics.WATCHDOG_NODE)
+        self._encoder = Float64MultiArrayEncoder(count, WATCHDOG)
         self.watchdog = TorqueWatchdog(
             config, self._config.timeout, armed=self._config.armed
         )

@@ -20,6 +20,7 @@ from blf_dsc_controller.bags.topic_messages import (
 )
 from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
@@ -207,7 +208,7 @@ def verify(
 
 def _newer_parameters(content: Content, config: ControllerConfig) -> list[str]:
     """Return the parameters that the recorded configuration does not have, by name."""
-    recorded = content.configurations[topics.CONTROLLER]
+    recorded = content.configurations[CONTROLLER]
     return sorted(flatten(config).keys() - recorded.keys() - {'insist'})
 
 

@@ -10,7 +10,8 @@ it,
 so that the whole torque of the joint does not change.  But the drives decide when the
 change takes effect.  A command that is on its way belongs to the earlier load, and is
 wrong by the change for one cycle.  So the load is declared in steps that change no
-torque by more than `_STEP` of its limit, each after the one before has taken effect.
+torque by more than `_STEP` of its limit, each after the one before has taken effect:
+`load_declaration` has the sequence.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
@@ -38,8 +39,10 @@ _SHARE = 0.05  # or this part of the mass
 _CENTRE = 0.03  # m, likewise of its centre
 _STEP = 0.005  # of the torque limit
 
-EVERY = 20
-"""States from one step of a load that is declared to the next."""
+
+def widest_interval(mass: ArrayLike) -> Vector:
+    """Return half of the widest 95 % intervals [kg] with which masses [kg] are declared."""
+    return np.maximum(_NARROW, _SHARE * np.abs(mass))
 
 
 class DriveLoad(NamedTuple):
@@ -143,7 +146,7 @@ class DriveLoads:
         """Return mass and moments (4,) that the drives should get; None: no change."""
         load = controller.state.weighing.load
         half = TWO_SIDED * load[DEVIATION]
-        narrow = max(_NARROW, _SHARE * abs(load[MASS]))
+        narrow = widest_interval(load[MASS])
         if not 0.0 < half < narrow:
             return None
         picked_up = np.zeros(4)

@@ -289,7 +289,7 @@ class ViewNode(PlainNode):
     # Samples.
 
     def _time(self, stamp: int) -> float:
-        """Return the time [s] since the controller's start, or the first stamp."""
+        """Return the time [s] of a stamp [ns] since the start; the first may stand for that."""
         if self._start < 0 <= stamp:
             self._start = stamp
         return max(0.0, (stamp - self._start) * 1e-9)
@@ -326,6 +326,9 @@ class ViewNode(PlainNode):
         """Keep a snapshot of the newest values, at a time [s]."""
         if self.run.taken == 0 and time > _LATE:
             self._list(time, 'view', _MISSED)
+        if np.isnan(self._first_truth).all():
+            self._first_truth = self._values[topics.TRUTH][0]
+        self._note_latch(time)
         now = self._snapshot(time)
         self.past.append(now)
         self.run.take(now)
@@ -344,10 +347,7 @@ class ViewNode(PlainNode):
         estimate, tool, rest = np.split(
             monitor, [truth.size, truth.size + len(topics.TOOL)]
         )
-        *load, lambda_min, contact, latched = rest.tolist()
-        self._note_latch(time, latched)
-        if np.isnan(self._first_truth).all():
-            self._first_truth = truth
+        *load, lambda_min, contact, _ = rest.tolist()
         return Snapshot(
             time=time,
             position=position,
@@ -368,8 +368,9 @@ class ViewNode(PlainNode):
             touched=bool(contact > 0.0),
         )
 
-    def _note_latch(self, time: float, latched: float) -> None:
+    def _note_latch(self, time: float) -> None:
         """Note an event where learning begins or restarts."""
+        latched = float(self._values[topics.MONITOR][0][-1])
         if latched != self._latched and np.isfinite(self._latched):
             text = (
                 'excited window latched' if latched else 'restarts: the arm has changed'

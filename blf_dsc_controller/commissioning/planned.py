@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motions by which an arm from a URDF is measured, and with which gains."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.joint_gains import BESIDE, JointGains, unknown_arm
+from blf_dsc_controller.commissioning import motion
+from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
+from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.configuration.plausibility import hint_at_degrees
+from blf_dsc_controller.configuration.schema import Value, change
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.supervision.reference_load import along
+
+Floats = NDArray[np.float64]
+
+TORQUE = 0.03
+"""Torque of the motion, rms, as a share of the rated one."""
+TRAVEL = 0.01
+"""How far the tool may travel in the motion, from its middle [m]."""
+POSTURES = 3
+"""Postures of the reference in which an arm is measured, if nothing else is asked for."""
+
+_FROM_LIMITS = 0.05  # rad
+
+
+class Planned(NamedTuple):
+    """A motion to run, and how far it goes."""
+
+    config: ControllerConfig
+    # parameters of `config` that differ from those of the arm in use
+    values: dict[str, object]
+    posture: Floats  # (n,) rad
+    excitation: motion.Excitation
+    share: float = 1.0  # of the gains of the arm in use
+    torque: float = TORQUE  # rms, as a share of the rated one, at most
+
+    @property
+    def duration(self) -> float:
+        """Time [s] that a run needs, a little more than the period that counts.
+
+        Swings end where they vanish.
+        """
+        more = motion.BEAT if self.excitation.sliding else 0.5
+        return motion.SETTLING + self.excitation.period + more
+
+
+def postures_of(
+    config: ControllerConfig, count: int = POSTURES, here: Floats | None = None
+) -> Floats:
+    """Return postures (count, n) [rad] that the configured reference visits.
+
+    One to hold visits only `here` (n,) [rad], where the arm is. Raises BlfDscError if it
+    is not known.
+    """
+    if config.reference.type == 'hold':
+        if here is None:
+            raise BlfDscError(
+                'reference.type: got hold, with which the arm stays where it begins: give the '
+                'postures in which to measure it (--posture ANGLE ... [rad]), or a reference '
+                'that moves'
+            )
+        return here[None]
+    return np.asarray(along(config, count)[0])
+
+
+def plan(
+    config: ControllerConfig,
+    postures: Floats,
+    *,
+    torque: float = TORQUE,
+    travel: float = TRAVEL,
+    sliding: bool = False,
+    share: float = 1.0,
+) -> list[Planned]:
+    """Return the motions around postures (k, n) [rad] by which an arm is measured.
+
+    `sliding` adds swings that keep joints sliding which would stick without.  The arm has a
+    `share` of the gains of the configuration.
+
+    Raises BlfDscError if the arm is not from a URDF, or if its feedback acts through the
+    inertia matrix, which may make an arm with elastic joints unstable.
+    """
+    if config.model != 'urdf':
+        raise BlfDscError(
+            'robot.urdf: got none, but commissioning needs an arm from a URDF'
+        )
+    if config.feedback.inertia != 'none':
+        raise BlfDscError(
+            f'feedback.inertia: got {config.feedback.inertia}, but an arm is measured with '
+            'gains of its joints, each on its own: give none'
+        )
+    gains = _softer(config, share)
+    arm = with_gains(config, gains) if gains else config
+    planned = []
+    for posture in postures:
+        _check_posture(config, posture)
+        excitation = motion.excitation(arm, posture, torque, travel, sliding=sliding)
+        values = {**gains, **motion.shaking_parameters(arm, excitation, posture)}
+        made = change(arm, values)
+        planned.append(Planned(made, values, posture, excitation, share, torque))
+    return planned
+
+
+def _softer(config: ControllerConfig, share: float) -> dict[str, Value]:
+    """Return a share of the gains of the measurement, by dotted name: none, if it is all."""
+    if share == 1.0:
+        return {}
+    gains = measuring_gains(config).scaled(share)
+    return as_parameters(gains.stiffness, gains.damping)
+
+
+def measuring_gains(config: ControllerConfig) -> JointGains:
+    """Return the gains with which an arm is measured."""
+    arm, _ = design_of(config)
+    gains = arm.joints or unknown_arm(arm.rotors)
+    lag = np.array(config.feedback.lags)
+    return gains.scaled(arm.stiffness)._replace(damping_lag=lag, share=BESIDE)
+
+
+def _check_posture(config: ControllerConfig, posture: Floats) -> None:
+    n = len(config.joints)
+    if posture.shape != (n,):
+        raise BlfDscError(
+            f'posture: got {posture.size} angles, but the arm has {n} joint{"s" * (n > 1)}'
+        )
+    limits = zip(
+        config.joints,
+        posture,
+        config.limits.position_lower,
+        config.limits.position_upper,
+        strict=True,
+    )
+    for joint, at, lower, upper in limits:
+        if not lower + _FROM_LIMITS <= at <= upper - _FROM_LIMITS:
+            raise BlfDscError(
+                f'posture: {joint} would be at {at:.4g} rad, '
+                f'{_beyond(float(at), lower, upper)}'
+            )
+
+
+def _beyond(at: float, lower: float, upper: float) -> str:
+    """Return how an angle [rad] is past or near the limits of its joint, with a hint at degrees."""
+    limits = f'its limits, {lower:g} to {upper:g} rad'
+    if lower <= at <= upper:
+        return f'less than {_FROM_LIMITS:g} rad from {limits}'
+    return f'beyond {limits}{hint_at_degrees(at, lower, upper)}'

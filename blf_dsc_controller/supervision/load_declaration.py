@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Declare a weighed load to the drives, one step after the other has taken effect.
+
+This is the sequence, whatever reaches the drives: the SDK of a robot (`drive/`) or a ROS
+service of its driver (`nodes/`).  Which steps there are is said by `drive_load`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Protocol
+
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.supervision.drive_load import DriveLoad
+
+_EVERY = 20  # states, from one step that is in force to the next
+
+
+class DeclarationError(BlfDscError):
+    """The drives cannot be told a load, or refuse it."""
+
+
+class LawWithLoad(Protocol):
+    """What declares its load: a `Guard` or an `ArmController`."""
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the reference and the arm rest."""
+
+    def load_to_tell(self) -> DriveLoad | None:
+        """Return the next step; None if there is none."""
+
+    def take_over(self, load: DriveLoad) -> None:
+        """Subtract the weight of this load from the next state on."""
+
+
+class LoadDeclaration(ABC):
+    """Declares the load of a law in steps; the law takes over each that is in force.
+
+    Attributes:
+        problem: why no more loads are declared, or empty.
+        in_force: the load that the law has taken over last; None: none.
+        states: since the last step was declared or taken over.
+    """
+
+    def __init__(self) -> None:
+        self.problem = ''
+        self.in_force: DriveLoad | None = None
+        self.states = 0
+        self._declared: DriveLoad | None = None  # not yet in force
+
+    def follow(self, law: LawWithLoad, *, in_motion: bool) -> None:
+        """Before each state: let the law take over a step in force, or declare the next.
+
+        `in_motion`: whether the drives may be told a load while the arm moves.
+        """
+        if self.problem:
+            return
+        self.states += 1
+        try:
+            if self._declared is not None:
+                self._take_over_in_force(law, self._declared)
+            elif self.states >= _EVERY and self.can_declare():
+                self.states = 0
+                load = law.load_to_tell() if in_motion or law.is_at_rest else None
+                if load is not None:
+                    self.declare(load)
+                    self._declared = load
+        except DeclarationError as error:
+            self.give_up(str(error))
+
+    def _take_over_in_force(self, law: LawWithLoad, load: DriveLoad) -> None:
+        if self.is_in_force(load):
+            self.states = 0
+            self.in_force, self._declared = load, None
+            law.take_over(load)
+
+    def give_up(self, problem: str) -> None:
+        """Declare no more loads, for this reason."""
+        self.problem = problem
+
+    def can_declare(self) -> bool:
+        """Whether the drives can be told a load now."""
+        return True
+
+    @abstractmethod
+    def declare(self, load: DriveLoad) -> None:
+        """Begin to tell the drives a load in the frame of the tip, without waiting.
+
+        Raises:
+            DeclarationError: they cannot be told.
+        """
+
+    @abstractmethod
+    def is_in_force(self, load: DriveLoad) -> bool:
+        """Whether the drives add the weight of this load, which was declared last.
+
+        Raises:
+            DeclarationError: they have refused it, or do not answer.
+        """
