@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether motions that are sent make elastic arms ring, and what shaping them is worth.
 
-    python -m benchmark shaping sent [--truths N] [--arms NAME...] [--keep FILE]
-    python -m benchmark shaping shaped [--truths N] [--arms NAME...] [--limits A...] [--keep FILE]
-    python -m benchmark shaping frequencies [--truths N] [--arms NAME...] [--keep FILE]
+    python -m benchmark shaping sent [--truths N] [--arms NAME...] [--limits A...] [--keep FILE]
+    python -m benchmark shaping shaped [--truths N] [--arms NAME...] [--limits A...]
+                                     [--keep FILE]
+    python -m benchmark shaping frequencies [--truths N] [--arms NAME...] [--limits A...]
+                                          [--keep FILE]
 
 Each arm learns along the motion of its file for 8 s, without a load and with 2 kg from 2 s on,
 and then makes moves from rest to rest: of all joints, of one, a short one of two joints, and
@@ -48,10 +50,10 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -69,8 +71,8 @@ from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
     load_loop,
 )
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import begin, controller_of
+from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.retargeting import plan_target
 from blf_dsc_controller.reference.stream import TargetStream
@@ -91,6 +93,7 @@ from blf_dsc_controller.run import Floats
 from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Span
 from blf_dsc_controller.simulation.loop import new_record
 from sim_plant.plant import plant_of
+from sim_plant.sampled_plant import Plant
 
 LIMITS = (1.0, 2.5, 5.0, 10.0)  # rad/s^2
 VELOCITY = 1.5  # rad/s
@@ -187,7 +190,7 @@ class Move(NamedTuple):
     limit: float  # rad/s^2
 
 
-def moves_of(config: ControllerConfig) -> list[Move]:
+def moves_of(config: ControllerConfig, limits: Sequence[float]) -> list[Move]:
     """Return the moves of an arm around the middle of its preset's motion."""
     home = np.array(config.reference.offset)
     n = home.size
@@ -200,7 +203,7 @@ def moves_of(config: ControllerConfig) -> list[Move]:
     places = [home, far, one, short, home]
     moves: list[Move] = []
     t = FIRST
-    for limit in LIMITS:
+    for limit in limits:
         for start, goal in itertools.pairwise(places):
             end = trapezoid_points(goal - start, VELOCITY, limit, SPACING)[-1].time
             moves.append(Move(t, end, start, goal, limit))
@@ -432,36 +435,70 @@ def references_of(
     return fields, laters
 
 
-def run(
-    name: str, load: float, truth: int, rule: str, frequency: float
-) -> list[Figures]:
-    """Return what each move of an arm shows under a rule for a frequency [Hz]; none if it stops."""
+class Warm(NamedTuple):
+    """An arm that has learned and rests, to be moved from there by each rule."""
+
+    controller: Controller
+    plant: Plant
+    reference: Floats  # packed, until it rests
+    saved: tuple[Floats, tuple[Floats, Mapping[str, Any]]]
+
+
+@cache
+def warmed(name: str, load: float, truth: int) -> Warm | None:
+    """Run an arm until it rests, FIRST - AFTER [s] from the start; None: it stopped."""
     loop = loop_of(name, load, truth)
     config = loop.controller
-    moves = moves_of(config)
-    seconds = round(moves[-1].begin + moves[-1].duration + DWELL, 2)
-    arm = change(loop.plant, {'duration': seconds})
-    controller, plant = controller_of(config), plant_of(arm)
-    record = new_record(controller, config, arm, Journal())
-    n = len(config.joints)
-    begin(controller, config, *plant.measure().reshape(3, n)[:2])
-    posture = TrajectoryPoint(POSED - LEARNED, tuple(moves[0].start.tolist()))
+    controller, plant = controller_of(config), plant_of(loop.plant)
+    begin(controller, config, *plant.measure().reshape(3, -1)[:2])
+    home = TrajectoryPoint(POSED - LEARNED, config.reference.offset)
     posed = plan_trajectory(
-        Trajectory(config.joints, (posture,), LEARNED),
+        Trajectory(config.joints, (home,), LEARNED),
         controller.reference_vector,
         LEARNED,
         config,
     )
+    controller.reference_vector = posed.vector
+    rows = range(round((FIRST - AFTER) / config.sample_time))
+    record = new_record(controller, config, loop.plant, Journal(), rows)
+    span = Span(rows.start, rows.stop - 1, is_end=False, observed=False)
+    if not CompiledLoop(controller, plant).run(span, record.rows_to_fill()):
+        return None
+    return Warm(controller, plant, posed.vector, (controller.save(), plant.save()))
+
+
+def run(
+    name: str,
+    load: float,
+    truth: int,
+    rule: str,
+    frequency: float,
+    limits: Sequence[float] = LIMITS,
+) -> list[Figures]:
+    """Return what each move of an arm shows under a rule for a frequency [Hz]; none if it stops."""
+    warm = warmed(name, load, truth)
+    if warm is None:
+        return []
+    loop = loop_of(name, load, truth)
+    config, dt = loop.controller, loop.controller.sample_time
+    n = len(config.joints)
+    controller, plant = warm.controller, warm.plant
+    controller.restore(warm.saved[0])
+    plant.restore(warm.saved[1])
+    moves = moves_of(config, limits)
+    end = round((moves[-1].begin + moves[-1].duration + DWELL) / dt)
+    rows = range(round((FIRST - AFTER) / dt), end + 1)
+    record = new_record(controller, config, loop.plant, Journal(), rows)
     t = 1e-9 * record.stamps
     grid = t[np.searchsorted(t, FIRST - 1e-9) :]
     fields, laters = references_of(moves, rule, config, grid, frequency)
     term = hermite(grid, fields.swapaxes(0, 1))._replace(begin=float(grid[0]))
-    controller.reference_vector = pack(n, [*unpack(posed.vector), term])
-    span = Span(0, t.size - 1, is_end=True, observed=False)
+    controller.reference_vector = pack(n, [*unpack(warm.reference), term])
+    span = Span(rows.start, rows.stop - 1, is_end=True, observed=False)
     if not CompiledLoop(controller, plant).run(span, record.rows_to_fill()):
         return []
     links, speeds = record.truths[:, -2 * n : -n], record.truths[:, -n:]
-    acceleration = np.gradient(speeds, t[1], axis=0)
+    acceleration = np.gradient(speeds, dt, axis=0)
     seen = Seen(t, links, acceleration, links - record.true_errors())
     return [figures_of(*each, seen) for each in zip(moves, laters, strict=True)]
 
@@ -469,20 +506,22 @@ def run(
 class Kept:
     """Figures of runs, in a file of JSON lines if one is named."""
 
-    def __init__(self, path: Path | None) -> None:
-        """Read those that the file has."""
-        self.path = path
+    def __init__(self, path: Path | None, limits: Sequence[float]) -> None:
+        """Read those that the file has; each run has moves with all the limits."""
+        self.path, self.limits = path, limits
         self.found: dict[tuple[object, ...], list[Figures]] = {}
         if path is not None and path.exists():
             for line in path.read_text(encoding='utf-8').splitlines():
                 key, values = json.loads(line)
-                self.found[tuple(key)] = [Figures(*each) for each in values]
+                of_run = (*key[:-1], tuple(key[-1]))
+                self.found[of_run] = [Figures(*each) for each in values]
 
     def of(
         self, name: str, load: float, truth: int, rule: str, frequency: float = 0.0
     ) -> list[Figures]:
         """Return the figures of a run, from the file or computed now."""
-        key = name, load, truth, rule, 0.0 if rule in SENT else frequency
+        for_frequency = 0.0 if rule in SENT else frequency
+        key = name, load, truth, rule, for_frequency, tuple(self.limits)
         if key not in self.found:
             self.found[key] = run(*key)
             if self.path is not None:
@@ -509,7 +548,7 @@ def sent_rows(name: str, truths: int, kept: Kept) -> Iterator[list[str]]:
     for rule in SENT:
         moves = list(itertools.chain.from_iterable(kept.of_arm(name, truths, rule)))
         cells = []
-        for limit in LIMITS:
+        for limit in kept.limits:
             chosen = [each for each in moves if each.limit == limit]
             ringing = [each.after for each in chosen]
             cells.append(f'{np.median(ringing):.2f} ({max(ringing):.2f})')
@@ -537,7 +576,6 @@ def pairs_of(
     truths: int,
     rule: str,
     frequency: float,
-    limits: list[float],
     kept: Kept,
 ) -> list[tuple[Figures, Figures]]:
     """Return the moves under a rule, each with MoveIt's, of runs that do not stop."""
@@ -547,7 +585,6 @@ def pairs_of(
         pair
         for mine, other in zip(runs, others, strict=True)
         for pair in zip(mine, other, strict=False)
-        if pair[0].limit in limits
     ]
 
 
@@ -557,12 +594,10 @@ def pair_row(pairs: list[tuple[Figures, Figures]]) -> list[str]:
     return [*errors, *(later_by(pairs, each) for each in ('settles', 'nearly'))]
 
 
-def shaped_rows(
-    name: str, truths: int, limits: list[float], kept: Kept
-) -> Iterator[list[str]]:
+def shaped_rows(name: str, truths: int, kept: Kept) -> Iterator[list[str]]:
     """Compute the rows of an arm: its motion as it is, and with each shaper."""
     label, frequency = CASES[name].label, resonance(name)
-    own = [b for _, b in pairs_of(name, truths, MOVEIT, 0.0, limits, kept)]
+    own = [b for _, b in pairs_of(name, truths, MOVEIT, 0.0, kept)]
     errors = [
         f'{np.median([getattr(each, field) for each in own]):.2f}'
         for field in ('peak', 'rms', 'ringing', 'after')
@@ -573,19 +608,17 @@ def shaped_rows(
     ]
     yield [f'{label}, {frequency:.0f} Hz', 'as it is', *errors, *times]
     for rule in SHAPED:
-        pairs = pairs_of(name, truths, rule, frequency, limits, kept)
+        pairs = pairs_of(name, truths, rule, frequency, kept)
         yield [label, rule, *pair_row(pairs)]
 
 
-FREQUENCIES = (3.0, 6.0, 12.0)  # Hz
+FREQUENCIES = (3.0, 6.0)  # Hz
 
 
-def frequency_rows(
-    name: str, truths: int, limits: list[float], kept: Kept
-) -> Iterator[list[str]]:
+def frequency_rows(name: str, truths: int, kept: Kept) -> Iterator[list[str]]:
     """Compute the rows of an arm: moving averages over long times, and slower motions."""
     for frequency, rule in itertools.product(FREQUENCIES, ('slowed', 'mean')):
-        pairs = pairs_of(name, truths, rule, frequency, limits, kept)
+        pairs = pairs_of(name, truths, rule, frequency, kept)
         yield [CASES[name].label, f'{rule}, {frequency:g} Hz', *pair_row(pairs)]
 
 
@@ -597,7 +630,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('table', choices=('sent', 'shaped', 'frequencies'))
     parser.add_argument('--truths', type=positive, default=5, help='true arms (5)')
     parser.add_argument('--arms', nargs='+', choices=CASES, default=list(CASES))
-    about = 'moves with these limits of the acceleration [rad/s^2]'
+    about = 'limits of the acceleration of the moves, one after the other [rad/s^2]'
     parser.add_argument(
         '--limits',
         nargs='+',
@@ -611,12 +644,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(given: argparse.Namespace) -> None:
     """Print the table that was asked for."""
-    kept = Kept(given.keep)
+    kept = Kept(given.keep, given.limits)
     if given.table == 'sent':
         of_arms = (sent_rows(name, given.truths, kept) for name in given.arms)
-        heads = ('arm', 'sent', 'at rest', *(f'{limit:g} rad/s^2' for limit in LIMITS))
+        heads = (
+            'arm',
+            'sent',
+            'at rest',
+            *(f'{limit:g} rad/s^2' for limit in given.limits),
+        )
         print_table(heads, itertools.chain.from_iterable(of_arms))
         return
     rows = shaped_rows if given.table == 'shaped' else frequency_rows
-    of_arms = (rows(name, given.truths, given.limits, kept) for name in given.arms)
+    of_arms = (rows(name, given.truths, kept) for name in given.arms)
     print_table(('arm', 'reference', *_PAIRS), itertools.chain.from_iterable(of_arms))
