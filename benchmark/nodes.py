@@ -26,11 +26,8 @@ from rclpy.experimental import EventsExecutor
 
 from benchmark.harness import Ratio, ratio
 from blf_dsc_controller.cli.domains import own_domain
-from blf_dsc_controller.cli.session import (
-    NodeProcess,
-    environment,
-    localhost_environment,
-)
+from blf_dsc_controller.cli.isolation import environment, localhost_environment
+from blf_dsc_controller.cli.node_process import NodeProcess
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.controller_groups import Telemetry
 from blf_dsc_controller.configuration.nodes import (

@@ -69,12 +69,8 @@ from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.studies.distributions import parse
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
-from blf_dsc_controller.studies.monte_carlo import (
-    Study,
-    Variation,
-    draw,
-    plant_with,
-)
+from blf_dsc_controller.studies.monte_carlo import Study, draw, plant_with
+from blf_dsc_controller.studies.variations import Variation
 from blf_dsc_controller.supervision.expected_errors import linear_feedback
 
 SECONDS = 11.0

@@ -41,7 +41,7 @@ os.environ['ROS_LOG_DIR'] = os.environ['DASK_TEMPORARY_DIRECTORY'] = _LOG_FOLDER
 if find_spec('rclpy'):  # some tests run without ROS
     from own_domain import avoid_domain_of_shell, own_domain
 
-    from blf_dsc_controller.cli.session import localhost_environment
+    from blf_dsc_controller.cli.isolation import localhost_environment
 
     avoid_domain_of_shell()
     os.environ.update({'ROS_DOMAIN_ID': str(own_domain()), **localhost_environment()})

@@ -16,10 +16,9 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.identification.clearance import Clearance, distance
 from blf_dsc_controller.identification.exciting_reference import (
-    Clearance,
     ExcitationProblem,
-    distance,
     search,
 )
 from blf_dsc_controller.simulation.loop import simulate

@@ -50,11 +50,8 @@ from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
-from blf_dsc_controller.identification.identify import (
-    STAGES,
-    identify_arm,
-    identify_bag,
-)
+from blf_dsc_controller.identification.from_files import identify_bag
+from blf_dsc_controller.identification.identify import STAGES, identify_arm
 from blf_dsc_controller.identification.physical import Cone, solve
 from blf_dsc_controller.identification.prior import Prior, prior_of
 from blf_dsc_controller.identification.problem import problem_of

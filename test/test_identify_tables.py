@@ -29,8 +29,9 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.identification.from_table import read_table
-from blf_dsc_controller.identification.identify import identify_arm, identify_bag
+from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.mjcf import mjcf
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.recording import Recording

@@ -23,8 +23,8 @@ from blf_dsc_controller.law import friction
 from blf_dsc_controller.law.learning import measure_reversals
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
-from blf_dsc_controller.studies.report import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
+from blf_dsc_controller.studies.summary import compare_pairs
 
 # rad/s, first of the presets panda and ur5e, third of the last
 TONE = 1.2566370614359172

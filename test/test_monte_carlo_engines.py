@@ -29,8 +29,10 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs as engines
-from blf_dsc_controller.studies.report import format_report, reproduce, summarize
+from blf_dsc_controller.studies.report import format_report
+from blf_dsc_controller.studies.reproduction import reproduce
 from blf_dsc_controller.studies.runs import Store, compute, run_chunk, warm_up
+from blf_dsc_controller.studies.summary import summarize
 
 
 @pytest.fixture(scope='module')

@@ -25,8 +25,8 @@ from blf_dsc_controller.studies.monte_carlo import (
     plant_with,
     torque_rows,
 )
-from blf_dsc_controller.studies.report import compare_pairs
 from blf_dsc_controller.studies.runs import run_chunk
+from blf_dsc_controller.studies.summary import compare_pairs
 
 RUNS = 24
 

@@ -24,8 +24,9 @@ import rclpy
 from command import finished
 from own_domain import own_domain
 
-from blf_dsc_controller.cli import domains, session
-from blf_dsc_controller.cli.session import ProgressMonitor, localhost_environment
+from blf_dsc_controller.cli import domains, isolation, session
+from blf_dsc_controller.cli.isolation import localhost_environment
+from blf_dsc_controller.cli.progress_monitor import ProgressMonitor
 from blf_dsc_controller.configuration.nodes import dump, load_loop
 from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.control.realtime import request_realtime
@@ -144,7 +145,7 @@ def test_nodes_of_a_run_look_for_nobody_elsewhere_whatever_the_shell_names(monke
     assert own.keys() >= OTHERS.keys()
     assert own['FASTRTPS_DEFAULT_PROFILES_FILE'].endswith('config/fastdds.xml')
     with monkeypatch.context() as kilted:  # its Fast DDS 3 rejects the profile
-        kilted.setattr(session.metadata, 'version', lambda _: '9.1.1')
+        kilted.setattr(isolation.metadata, 'version', lambda _: '9.1.1')
         limited = localhost_environment()
     monkeypatch.setattr(
         rclpy, 'get_rmw_implementation_identifier', lambda: 'rmw_cyclonedds_cpp'

@@ -19,6 +19,7 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import INVALID, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.checks import check_sample
 from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.velocity import Velocity
@@ -39,7 +40,7 @@ def law():
 
 
 def sample_check(config, law):
-    return SampleCheck(config, law, Calming(config, law))
+    return SampleCheck(config, law, Calming(config, law), KeptEstimates(law))
 
 
 def verdict(law, error_ratio=1.0):
@@ -118,7 +119,7 @@ def test_what_is_learned_at_the_torque_limit_is_kept_while_it_is_tolerated(law):
     law.flags = verdict(law)
     assert law.flags == SUSPECT
     assert check.check(DT) is None
-    assert (check.estimate == 0.5).all()
+    assert (law.checks.estimates.kept[: law.settings.m] == 0.5).all()
 
 
 @pytest.mark.parametrize(
@@ -183,21 +184,20 @@ def test_estimates_of_before_a_restart_are_consistent_with_it(law):
     law.state.estimate[:] = 0.5
     law.state.disturbance[:] = 0.25
     law.state.rotors.gain_scale[:] = 0.75
-    check.keep()
+    estimates = KeptEstimates(law)
     check.restart()
-    check.return_to_consistent()
-    assert (check.estimate == 0.5).all()
-    assert (check.disturbance == 0.25).all()
+    estimates.return_to_consistent()
+    assert (estimates.estimate == 0.5).all()
+    assert (estimates.disturbance == 0.25).all()
     assert (law.checks.estimates.consistent_scale == 0.75).all()
 
 
 def test_law_continues_with_the_kept_estimates_after_a_stop(law):
-    check = sample_check(ControllerConfig(), law)
     law.state.estimate[:] = 0.5
     law.state.disturbance[:] = 0.25
-    check.keep()
+    estimates = KeptEstimates(law)
     law.state.estimate[:] = law.state.disturbance[:] = 9.0  # by what made it stop
-    check.restore()
+    estimates.restore()
     assert (law.state.estimate == 0.5).all()
     assert (law.state.disturbance == 0.25).all()
     assert law.samples == 0
@@ -485,10 +485,10 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
     if on_a_ramp:
         rig.guard.deactivate()
     torque = rig.guard.release()
-    samples = rig.guard.samples
+    estimate = rig.guard.estimates.estimate
     q = rig.guard.safe_torque.last.q
-    load = rig.guard.held.recent.load(rig.guard.controller.settings, samples.estimate)
-    holding = dynamics(samples.estimate[:3], 9.8, q, (0.0, 0.0))[2] + load
+    load = rig.guard.held.recent.load(rig.guard.controller.settings, estimate)
+    holding = dynamics(estimate[:3], 9.8, q, (0.0, 0.0))[2] + load
     np.testing.assert_allclose(
         torque, holding if safety == 'hold_gravity' else [0.0, 0.0]
     )

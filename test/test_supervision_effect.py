@@ -158,7 +158,7 @@ def test_commands_that_do_not_arrive_leave_nothing_in_the_safe_torque(preset):
     is_told = guard.supervisor.reason is Reason.NO_EFFECT  # by the effort of an FR3
     assert is_told or 'but the arm has not accelerated' in guard.supervisor.text
     assert 'activate the effort controller' in guard.supervisor.text
-    assert np.abs(guard.samples.disturbance).max() < 2.0
+    assert np.abs(guard.estimates.disturbance).max() < 2.0
     assert np.abs(torques[-1]).max() < 3.0
     again = stop + round(1.0 / loop.controller.sample_time)
     assert np.abs(np.diff(torques[again:], axis=0)).max() < 1.0
@@ -224,7 +224,7 @@ def test_measured_efforts_explain_an_error_past_the_bound(preset):
     guard, *_ = stopped_by(loop.controller, plant, reach=lose)
     assert guard.supervisor.reason is Reason.NO_EFFECT
     assert "_joint2' lacks -" in guard.supervisor.text
-    assert np.abs(guard.samples.disturbance).max() < 2.0
+    assert np.abs(guard.estimates.disturbance).max() < 2.0
 
 
 @pytest.mark.parametrize('effort', ['whole', 'unknown'])
@@ -301,7 +301,7 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     last = LastState(2)
     slow = guard.safe_torque.last.slow
     last.take(0, np.concatenate(seen[-1][1:]), slow)
-    goal = safe_torque(safety, settings, last, guard.samples.estimate, known)
+    goal = safe_torque(safety, settings, last, guard.estimates.estimate, known)
     np.testing.assert_allclose(rig.commands[-1], goal, rtol=0.0, atol=1e-9)
     assert rig.supervisor.text.count('speeds up') == 1
 

@@ -317,8 +317,8 @@ def test_estimates_before_a_fault_are_kept_but_not_the_window():
         rig.step()
     assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
     start = rig.guard.controller.settings.initial_estimate
-    learned = rig.guard.samples.estimate.copy()
-    disturbance = rig.guard.samples.disturbance.copy()
+    learned = rig.guard.estimates.estimate.copy()
+    disturbance = rig.guard.estimates.disturbance.copy()
     assert disturbance.any()
     at = np.flatnonzero((np.array(seen) == learned).all(axis=1))
     assert at.size
@@ -621,14 +621,14 @@ def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
     learned = {'learning.initial_estimate': P.tolist(), 'safety.torque': 'hold_gravity'}
     rig = Rig(learned, plant={'disturbance.amplitude': [0.0, 0.0]})
     rig.step(40)
-    before = rig.guard.samples.estimate.copy()
+    before = rig.guard.estimates.estimate.copy()
     jammed(rig)
     rig.step(500)
     assert rig.supervisor.reason is Reason.NO_EFFECT
     assert (
         'release the brakes, and activate the effort controller' in rig.supervisor.text
     )
-    np.testing.assert_allclose(rig.guard.samples.estimate, before, rtol=1e-3)
+    np.testing.assert_allclose(rig.guard.estimates.estimate, before, rtol=1e-3)
     state = rig.state()
     rig.sense = lambda state: [state.raw()]  # the brakes open
     rig.step(1000)
@@ -675,10 +675,10 @@ def test_estimates_are_discarded_by_a_reset_at_once():
     rig = Rig({'safety.torque': 'hold_gravity'})
     rig.step(300)
     initial = rig.guard.controller.settings.initial_estimate
-    assert rig.guard.samples.disturbance.any()
+    assert rig.guard.estimates.disturbance.any()
     rig.guard.starting.reset()
-    np.testing.assert_array_equal(rig.guard.samples.estimate, initial)
-    assert not rig.guard.samples.disturbance.any()
+    np.testing.assert_array_equal(rig.guard.estimates.estimate, initial)
+    assert not rig.guard.estimates.disturbance.any()
 
 
 def test_velocity_limit_changed_at_run_time_holds_from_the_next_state_on():
@@ -822,7 +822,7 @@ def test_stop_that_winds_the_estimates_up_holds_with_those_from_before(reason, g
             after_gap=np.zeros(2) if gap else None,
             load=lambda: 'of the torque that holds it',
         ),
-        _samples=SimpleNamespace(disturbance='from before'),
+        _estimates=SimpleNamespace(disturbance='from before'),
     )
     winds_up = reason in AFTER_WINDING_UP and not gap
     expected = 'from before' if winds_up else 'of the torque that holds it'

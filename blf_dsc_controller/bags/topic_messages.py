@@ -371,15 +371,29 @@ class TopicMessages:
         self,
         names: Sequence[str],
         required: Collection[str] = ('position', 'velocity'),
-        errors: dict[int, MessageError] | None = None,
     ) -> JointStates:
         """Return the states of these names, without messages that name none of them.
 
         The values of a std_msgs/Float64MultiArray are efforts; their names are their
-        numbers. Messages that cannot be decoded are added to `errors` by number.
+        numbers.
 
         Raises:
-            UnreadableMessageError: a message cannot be decoded and `errors` is None, or none can.
+            UnreadableMessageError: a message cannot be decoded.
+        """
+        states, errors = self.readable_states(names, required)
+        if errors:
+            raise UnreadableMessageError(self.name, *min(errors.items()))
+        return states
+
+    def readable_states(
+        self, names: Sequence[str], required: Collection[str]
+    ) -> tuple[JointStates, dict[int, MessageError]]:
+        """Return the states of these names, and why others cannot be decoded, by their numbers.
+
+        Messages that name none of them are in neither.
+
+        Raises:
+            UnreadableMessageError: there are messages, and none can be decoded.
         """
         problems: dict[int, MessageError] = {}
         for k, layout in enumerate(self._layouts):
@@ -399,18 +413,17 @@ class TopicMessages:
             if number.size
             else range(self.size)
         )
-        found = {
+        errors = {
             k: self._unreadable.get(k) or problems[layouts[k]] for k in map(int, bad)
         }
-        if found and (errors is None or not number.size):
-            raise UnreadableMessageError(self.name, *min(found.items()))
-        if errors is not None:
-            errors.update(found)
+        if errors and not number.size:
+            raise UnreadableMessageError(self.name, *min(errors.items()))
         places = [
             [self._columns.get((field, name), -1) for name in names]
             for field in JOINT_STATE_FIELDS
         ]
-        return JointStates(self, names, np.array(places, np.intp), number)
+        states = JointStates(self, names, np.array(places, np.intp), number)
+        return states, errors
 
     def name_lists(self) -> list[tuple[str, ...]]:
         """Return the different lists of names; raise UnreadableMessageError if none."""

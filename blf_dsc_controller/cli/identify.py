@@ -26,12 +26,12 @@ from blf_dsc_controller.identification.foresight import (
     foresee,
     foresight_lines,
 )
-from blf_dsc_controller.identification.identified import Identified
-from blf_dsc_controller.identification.identify import (
-    STAGES,
+from blf_dsc_controller.identification.from_files import (
     foresee_recordings,
     identify_bag,
 )
+from blf_dsc_controller.identification.identified import Identified
+from blf_dsc_controller.identification.identify import STAGES
 from blf_dsc_controller.identification.mjcf import mjcf
 from blf_dsc_controller.identification.parameters import robot_parameters
 from blf_dsc_controller.identification.problems import is_usable, problems_of

@@ -66,33 +66,15 @@ def run(options: Namespace) -> int:
         )
     with announced_compilation(print_notice):
         config = loop_configuration(options)
-    if options.view:
-        if options.offline:
-            raise BlfDscError('--view shows a run over ROS: leave out --offline')
-        from blf_dsc_controller.view.page import require_viser  # slow, as below
-
-        require_viser()
-    if not options.offline:
-        check_network()
+        _show_expectations(options.config, config)
+    _check_means(options)
     out = make_folder(options.out, BAG)
     clock = 'plant' if config.plant.mode == 'lockstep' else 'wall'
     recorder = {'output': str(out / BAG), 'clock': clock}
     config = config._replace(recorder=change(config.recorder, recorder))
     dump(out / 'config.yaml', config.by_node)
-    completed = True
     print_notice(_begun(config.plant, offline=options.offline))
-    if options.offline:
-        with announced_compilation(print_notice):
-            simulate_into_bag(
-                out / BAG,
-                config.controller,
-                config.plant,
-                compression=config.recorder.compression,
-            )
-    else:
-        from blf_dsc_controller.cli.session import run_session
-
-        completed = run_session(config, out, view=options.view)
+    completed = _run_loop(config, out, options)
     try:
         stopped = _report(out)
     except BlfDscError as error:
@@ -104,6 +86,34 @@ def run(options: Namespace) -> int:
     if not completed:
         return INTERRUPTED
     return STOPPED if stopped else 0
+
+
+def _check_means(options: Namespace) -> None:
+    """Raise BlfDscError if a page or ROS is asked for, and cannot be had."""
+    if options.view:
+        if options.offline:
+            raise BlfDscError('--view shows a run over ROS: leave out --offline')
+        from blf_dsc_controller.view.page import require_viser  # slow, as below
+
+        require_viser()
+    if not options.offline:
+        check_network()
+
+
+def _run_loop(config: LoopConfig, out: Path, options: Namespace) -> bool:
+    """Run a loop into the bag of a folder; return whether it ran to its end."""
+    if not options.offline:
+        from blf_dsc_controller.cli.session import run_session
+
+        return run_session(config, out, view=options.view)
+    with announced_compilation(print_notice):
+        simulate_into_bag(
+            out / BAG,
+            config.controller,
+            config.plant,
+            compression=config.recorder.compression,
+        )
+    return True
 
 
 def _begun(plant: PlantConfig, *, offline: bool) -> str:
@@ -118,30 +128,34 @@ def _begun(plant: PlantConfig, *, offline: bool) -> str:
 def loop_configuration(options: Namespace) -> LoopConfig:
     """Return the configuration of the three nodes, from file and options.
 
-    Prints configuration warnings, and raises StartError or MotionError if the
-    controller would reject the true start.
+    Raises:
+        BlfDscError: it is invalid, or sets no limit to a simulation.
     """
     names = ('duration', 'mode', 'seed', 'physics')
     chosen = {name: getattr(options, name) for name in names}
     given = {name: value for name, value in chosen.items() if value is not None}
     recorded: dict[str, Any] = {'wait_for_subscribers': 1}
     config = load_loop(options.config, {PLANT: given | recorded, CONTROLLER: recorded})
-    for warning in _unused(options.config):
-        print_notice(f'warning: {warning}')
     if options.duration == 0.0 and options.offline:
         raise BlfDscError(
             '--duration 0 is no limit, which --offline cannot have: give a duration in s'
         )
     if config.plant.duration == 0.0 and options.duration is None:
         config = config._replace(plant=change(config.plant, {'duration': _DURATION}))
-    controller, plant = config.controller, config.plant
-    order = [plant.joints.index(joint) for joint in controller.joints]
-    q, dq = (
-        np.array(values)[order]
-        for values in (plant.initial.position, plant.initial.velocity)
-    )
-    plan_start(controller, np.array(controller.barrier.widest), q, dq)
-    if turned := reference_near(controller, q)[1]:
+    return config
+
+
+def _show_expectations(given: str, config: LoopConfig) -> None:
+    """Print warnings of a configuration, read from the file `given`, and the errors to expect.
+
+    Raises:
+        StartError: the controller would not take over at the true start.
+        MotionError: no approach from there keeps the limits.
+    """
+    for warning in _unused(given):
+        print_notice(f'warning: {warning}')
+    controller = config.controller
+    if turned := _turned_reference(config):
         print(f'the reference {turned}')
     for warning in config_warnings(controller):
         print(f'warning: {warning}', file=sys.stderr)
@@ -151,7 +165,21 @@ def loop_configuration(options: Namespace) -> LoopConfig:
             print_notice(f'note: {note}')
     if end := end_of_waypoints(controller):
         print(end)
-    return config
+
+
+def _turned_reference(config: LoopConfig) -> str:
+    """Plan the true start; return by which turns the reference is shifted for it, or nothing.
+
+    Raises StartError or MotionError as the controller would.
+    """
+    controller, plant = config.controller, config.plant
+    order = [plant.joints.index(joint) for joint in controller.joints]
+    q, dq = (
+        np.array(values)[order]
+        for values in (plant.initial.position, plant.initial.velocity)
+    )
+    plan_start(controller, np.array(controller.barrier.widest), q, dq)
+    return reference_near(controller, q)[1]
 
 
 def _unused(given: str) -> Iterator[str]:

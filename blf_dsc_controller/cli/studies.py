@@ -18,6 +18,8 @@ from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.studies import laws, report, runs
 from blf_dsc_controller.studies.monte_carlo import load_study
+from blf_dsc_controller.studies.reproduction import reproduce
+from blf_dsc_controller.studies.summary import summarize
 
 _PAUSE_IN_A_LOG = 10.0  # s between two lines
 
@@ -44,7 +46,7 @@ def monte_carlo(options: Namespace) -> None:
         folder, run = options.reproduce
         store = runs.Store(Path(folder))
         chosen = make_folder(options.out or Path(f'{store.folder.name}-run-{run}'))
-        report.reproduce(store, run, chosen)
+        reproduce(store, run, chosen)
         print(f'the same figures as in {folder}, bit for bit')
         print(
             f'wrote       {chosen}: config.yaml and bag, which blf_dsc plot and report draw'
@@ -73,7 +75,7 @@ def _run_study(options: Namespace) -> None:
             else runs.processes(workers) as executor
         ):
             _compute(store, chunks, executor)
-    summary = report.summarize(study, store.results())
+    summary = summarize(study, store.results())
     write_json(summary, store.folder / 'summary.json')
     print(report.format_report(summary, store.folder))
     print(f'wrote       {store.folder}: summary.json')

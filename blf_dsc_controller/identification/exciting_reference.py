@@ -14,18 +14,17 @@ and that is left to the prior.)
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.arms.friction import slidings
 from blf_dsc_controller.arms.model import regressors_at
-from blf_dsc_controller.arms.urdf import Chain, frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.estimate import prior_covariance
 from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.identification.clearance import Clearance
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.progress import steps
 from blf_dsc_controller.reference.approach import MotionError
@@ -38,111 +37,8 @@ _COARSE = 4  # samples per filtered row
 _MARGIN = 1e-3  # fraction of each limit, and m of room, for peaks between samples
 _PENALTY = 1e4  # on the mean square excess: limits are exceeded by a few percent
 _SHRINKS = 30  # most reductions of the amplitudes, by 1 % each, to keep the limits
-_LEAST = 1e-6  # m, length of a line; shorter ones are points of the next line
-_CARRIED = 2  # joints, counted from the base, that may be near the floor
 _DURATION, _RECORDED = 30.0, 0.01  # s, of a recording of it, and between its samples
 _SPREAD = 0.2  # standard deviation of a search's initial amplitudes
-
-
-class Clearance:
-    """Clearance between the links of a chain, and between them and the floor.
-
-    Meshes are not read.  A link is modelled as all points within `radius` of the
-    straight line from its joint to the next, or to the tip; via its centre of mass, if
-    that is farther from the line than the radius.  All pairs of links are checked
-    except those separated by less than two radii of arm, from joint to joint: they
-    touch in every posture, and only the joint limits can keep them apart.  The floor is
-    the plane z = `floor` [m] in the base; the first two joints may be near it.
-    """
-
-    def __init__(self, chain: Chain, radius: float, floor: float) -> None:
-        self._chain = chain
-        self._radius = radius
-        self._floor = floor
-        centres = [joint.inertia[:4] / joint.inertia[0] for joint in chain.joints]
-        self._centres = [np.append(centre[1:], 1.0) for centre in centres]
-        self._aside = [False] * len(centres)
-        origins = self.corners(np.zeros(len(centres)))
-        self._aside = self._centres_aside(origins)
-        pairs = self._pairs(origins)
-        self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
-
-    def _centres_aside(self, origins: np.ndarray) -> list[bool]:
-        """Return which links have a centre of mass off their line, between these origins."""
-        placements = frames(self._chain, np.zeros(len(self._centres)))[1:]
-        aside = []
-        for i, (begin, end) in enumerate(pairwise(origins[1:])):
-            centre = (placements[i] @ self._centres[i])[:3]
-            off = distance(centre, centre, begin, end)
-            aside.append(bool(off > self._radius))
-        return aside
-
-    def _pairs(self, origins: np.ndarray) -> list[tuple[int, int]]:
-        """Return the pairs of lines to check, of links whose joints have these origins."""
-        links = [0]  # of each line
-        for i, aside in enumerate(self._aside, 1):
-            links += [i] * (1 + aside)
-        length = np.linalg.norm(np.diff(origins, axis=0), axis=1)
-        end = np.cumsum(length)
-        begin = end - length
-        pairs = []
-        for a, this in enumerate(links):
-            for b, other in enumerate(links):
-                is_line = min(length[this], length[other]) > _LEAST
-                if is_line and begin[other] - end[this] > 2.0 * self._radius:
-                    pairs.append((a, b))
-        return pairs
-
-    def corners(self, q: np.ndarray) -> np.ndarray:
-        """Return base, joints, centres of mass aside, and tip (..., k, 3) [m], at q (..., n)."""
-        placements = frames(self._chain, q)
-        corners = [placements[0][..., :3, 3]]
-        for placement, centre, aside in zip(
-            placements[1:], self._centres, self._aside, strict=False
-        ):
-            corners.append(placement[..., :3, 3])
-            if aside:
-                corners.append((placement @ centre)[..., :3])
-        return np.stack([*corners, placements[-1][..., :3, 3]], axis=-2)
-
-    def room(self, q: np.ndarray) -> np.ndarray:
-        """Return the room (..., k) of the pairs of links, then of the corners above the floor.
-
-        At q (..., n), as (distance / required) - 1: two radii are required, or one
-        above the floor.
-        """
-        corners = self.corners(q)
-        begin = corners[..., :-1, :]
-        end = corners[..., 1:, :]
-        a, b = self._first, self._second
-        apart = distance(
-            begin[..., a, :], end[..., a, :], begin[..., b, :], end[..., b, :]
-        )
-        above = (
-            corners[..., 1 + _CARRIED + sum(self._aside[:_CARRIED]) :, 2] - self._floor
-        )
-        room = (apart / (2.0 * self._radius), above / self._radius)
-        return np.concatenate(room, axis=-1) - 1.0
-
-
-def distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return the distance (...) [m] of the line segments from a to b and from c to d (..., 3).
-
-    Ericson, Real-Time Collision Detection, 2005, 5.1.9; a segment may be a point.
-    """
-    u = b - a
-    v = d - c
-    w = a - c
-    uu = (u * u).sum(-1)
-    uv = (u * v).sum(-1)
-    vv = (v * v).sum(-1)
-    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
-    tiny = np.finfo(float).tiny
-    s = np.clip((uv * vw - vv * uw) / np.maximum(uu * vv - uv * uv, tiny), 0.0, 1.0)
-    t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
-    s = np.clip((uv * t - uw) / np.maximum(uu, tiny), 0.0, 1.0)
-    gap: np.ndarray = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
-    return gap
 
 
 class Excitation(NamedTuple):

@@ -57,10 +57,7 @@ def read_bag(
         BlfDscError: the bag cannot be read, has no torques or too few states, or has the joints
             of no arm.
     """
-    others = dict(names.joints)
-    motors = others.pop('theta', '')
-    units = {kind: _unit(path, others, kind) for kind in ('q', 'tau')}
-    names = NameMap(names.topics, others)
+    names, units, motors = _split(path, names)
     content = read_content(path, namespace, names)
     messages = content.topics[JOINT_STATES]
     named = messages.name_lists()
@@ -71,10 +68,7 @@ def read_bag(
     if not _has_stamps(messages, groups[0]):
         messages.is_stamped = False
         source += ' (without stamps: by the times of reception)'
-    other = _motor_states(content, theirs)
-    if motors:
-        topics = {**names.topics, JOINT_STATES.leaf: '/' + motors.lstrip('/')}
-        other = read_content(path, namespace, NameMap(topics, names.joints))
+    other = _motor_states(content, theirs, namespace, motors)
     if other is not None:
         source += f', positions of motors of {other.topics[JOINT_STATES].name}'
 
@@ -164,18 +158,29 @@ class _Unit(NamedTuple):
     factor: float
 
 
-def _unit(path: Path, names: dict[str, str], kind: str) -> _Unit:
-    """Take the unit of q or tau out of names by `--map`, such as `q=[deg]`.
+def _split(path: Path, names: NameMap) -> tuple[NameMap, dict[str, _Unit], str]:
+    """Return names of the bag, the units of q and tau, and the topic of the motors, if given.
+
+    `names.joints` is what `--map` gives, such as `q=[deg]` and `theta=motors` among the joints.
 
     Raises:
-        BlfDscError: it is not known.
+        BlfDscError: a unit is not known.
     """
-    given = _BRACKETED.fullmatch(names.get(kind, ''))
-    if given is None:
-        return _Unit('', 1.0)
-    del names[kind]
+    joints = dict(names.joints)
+    motors = joints.pop('theta', '')
+    units = {}
+    for kind in ('q', 'tau'):
+        units[kind] = _Unit('', 1.0)
+        if given := _BRACKETED.fullmatch(joints.get(kind, '')):
+            units[kind] = _unit(path, given[1], kind)
+            del joints[kind]
+    return NameMap(names.topics, joints), units, motors
+
+
+def _unit(path: Path, name: str, kind: str) -> _Unit:
+    """Return the unit of q or tau; BlfDscError if it is not known."""
     try:
-        return _Unit(given[1], factor_of(given[1], kind))
+        return _Unit(name, factor_of(name, kind))
     except BlfDscError as error:
         raise BlfDscError(f'{path}: {error}') from error
 
@@ -240,8 +245,17 @@ def _motors_at(stamp: Stamps, content: Content, joints: Sequence[str]) -> Floats
     return np.asarray(_at(stamp, known)[0])
 
 
-def _motor_states(content: Content, joints: Sequence[str]) -> Content | None:
-    """Return a bag with the states of motors as its joint states; None if it has none of these."""
+def _motor_states(
+    content: Content, joints: Sequence[str], namespace: str, topic: str
+) -> Content | None:
+    """Return a bag with the states of motors as its joint states; None if it has none of these.
+
+    They are on `topic`, by default on `motor_states` beside the joint states.
+    """
+    if topic:
+        topics = {**content.names.topics, JOINT_STATES.leaf: '/' + topic.lstrip('/')}
+        names = NameMap(topics, content.names.joints)
+        return read_content(content.path, namespace, names)
     messages = content.topics.get(MOTOR_STATES)
     if messages is None:
         return None

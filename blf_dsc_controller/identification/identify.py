@@ -10,20 +10,16 @@ of that of one joint, other zeros and directions of the joints are tried.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.conventions import (
     Convention,
     converted,
     likely_conventions,
 )
-from blf_dsc_controller.identification.foresight import Foresight, foresee
 from blf_dsc_controller.identification.identified import (
     Identified,
     OtherConvention,
@@ -31,12 +27,10 @@ from blf_dsc_controller.identification.identified import (
     Score,
 )
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
-from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.plausibility import shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
 from blf_dsc_controller.identification.problems import is_usable, unexplained_joints
-from blf_dsc_controller.identification.reading import read_recording
-from blf_dsc_controller.identification.recording import Recording, joined
+from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.regression import Fit, fitted
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import Selected, select
@@ -44,7 +38,6 @@ from blf_dsc_controller.identification.stiffness import Compliance, compliance_o
 from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
 from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
-from blf_dsc_controller.run import Floats
 
 STAGES = READING, CHECKING, SELECTING, FITTING, INTERVALS, OTHERS = (
     'reading',
@@ -62,103 +55,8 @@ _SHOWN = 2.0  # deviations of its mass, least mass of such a load
 _AS_GOOD = 1.1  # times that error, at most, without what is not needed
 
 
-def _tell_nobody(_stage: str) -> None:
-    pass
-
-
-def identify_bag(
-    path: Path | Sequence[Path],
-    robot: Robot,
-    namespace: str = '',
-    names: NameMap = NO_NAMES,
-    effort: Effort = 'torque',
-    gains: Sequence[float] = (),
-    loaded: Path | None = None,
-    *,
-    pick_up: bool = False,
-    begin: Callable[[str], None] = _tell_nobody,
-) -> Identified:
-    """Identify the arm of one or several bags or tables from its URDF.
-
-    Path, namespace and names are as for `read_run`.  `effort` says what the efforts
-    are: the whole torque, the torque without that of gravity, or the commanded torque
-    instead of them; `gains` [N m/A] turn currents into torques, and if there are none,
-    signs are found.  A load is identified if there is a bag in which the arm is
-    `loaded`, or if it does `pick_up` one.  `begin` is called with each of STAGES when
-    it begins.
-
-    Raises:
-        BlfDscError: a bag or the URDF cannot be read, or there are no torques of the arm, too
-            little of it, or no motion; or they are currents, and there are no gains.
-    """
-    begin(READING)
-    paths = [path] if isinstance(path, Path) else list(path)
-    recordings = _read(
-        [*paths, *([loaded] if loaded else [])],
-        robot,
-        namespace,
-        names,
-        commanded=effort == 'command',
-    )
-    joints = recordings[0].joints
-    recording, begins = joined(*recordings)
-    picked_up = float('nan') if pick_up else None
-    if loaded:
-        picked_up = begins[-1]
-    if len(gains):
-        recording = _with_gains(recording, gains)
-    elif any(each.currents for each in recordings):
-        raise BlfDscError(
-            f'{recording.source}: these are currents or percentages, from which no mass in kg '
-            f'can be told: give --gains [N m/A or N m/%] of {", ".join(joints)}; 1 for each if '
-            'they are torques'
-        )
-    return identify_arm(
-        recording, robot, effort, picked_up, find_signs=not len(gains), begin=begin
-    )
-
-
-def foresee_recordings(
-    paths: Sequence[Path], robot: Robot, namespace: str = '', names: NameMap = NO_NAMES
-) -> Foresight:
-    """Return what recordings together can show, or tables of a planned motion without torques.
-
-    Raises:
-        BlfDscError: as `identify_bag` does.
-    """
-    recordings = _read(paths, robot, namespace, names, planned=True)
-    return foresee(joined(*recordings)[0], robot)
-
-
-def _read(
-    paths: Sequence[Path], robot: Robot, namespace: str, names: NameMap, **how: bool
-) -> list[Recording]:
-    """Return the recordings of one arm; `how` is as for `read_recording`."""
-    joints: tuple[str, ...] = ()
-    if robot.tip:
-        joints = tuple(joint.name for joint in robot.chain(()).joints)
-    recordings: list[Recording] = []
-    for path in paths:
-        recording = read_recording(path, robot.text, joints, namespace, names, **how)
-        joints = recording.joints
-        recordings.append(recording)
-    return recordings
-
-
-def _with_gains(recording: Recording, gains: Sequence[float]) -> Recording:
-    """Return the recording with torques that are its efforts times the gains."""
-    factors = checked_gains(gains, recording.joints)
-    efforts = recording.torque
-    torque = mapped(recording.gap.size, lambda rows: efforts[rows] * factors)
-    return recording._replace(torque=torque)
-
-
-def checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:
-    """Return the gains (n,); raises BlfDscError if there is not one for each joint."""
-    if len(gains) != len(joints):
-        found = f'{len(joints)} joints: {", ".join(joints)}'
-        raise BlfDscError(f'got {len(gains)} gains for {found}')
-    return np.array(gains)
+def tell_nobody(_stage: str) -> None:
+    """Take no note of the stage that begins."""
 
 
 def identify_arm(
@@ -168,7 +66,7 @@ def identify_arm(
     picked_up: float | None = None,
     *,
     find_signs: bool = True,
-    begin: Callable[[str], None] = _tell_nobody,
+    begin: Callable[[str], None] = tell_nobody,
 ) -> Identified:
     """Identify the arm of a recording, and the load picked up at that time [s]; NaN: find it.
 
@@ -185,7 +83,7 @@ def identify_arm(
     if is_good and not unexplained.size:
         return found
     if picked_up is None and not is_good:
-        changing = _trained(recording, robot, effort, np.nan, find_signs, _tell_nobody)
+        changing = _trained(recording, robot, effort, np.nan, find_signs, tell_nobody)
         if (load := _better_load(found, changing)) is not None:
             return found._replace(other_load=load)
     if effort == 'without-gravity':
@@ -193,7 +91,7 @@ def identify_arm(
 
     def trained_as(convention: Convention) -> _Trained:
         other = converted(recording, convention)
-        return _trained(other, robot, effort, picked_up, find_signs, _tell_nobody)
+        return _trained(other, robot, effort, picked_up, find_signs, tell_nobody)
 
     likely = likely_conventions(recording, robot, unexplained.tolist())
     convention = _better_convention(found, likely, trained_as)
@@ -216,7 +114,7 @@ def _better_load(found: Identified, trained: _Trained) -> OtherLoad | None:
     carried = trained.problem.carried
     if carried is None or not error < _BETTER * found.score.total[2]:
         return None
-    changing = _completed(trained, _tell_nobody)
+    changing = _completed(trained, tell_nobody)
     mass, deviation = (float(each[0]) for each in changing.load)
     if mass < _SHOWN * deviation or not is_usable(changing):
         return None
@@ -232,7 +130,7 @@ def _better_convention(
     for convention in likely:
         other = trained_as(convention)
         is_better = _left(other.score) < _BETTER * _left(found.score)
-        if is_better and is_usable(_completed(other, _tell_nobody)):
+        if is_better and is_usable(_completed(other, tell_nobody)):
             return _simplest(OtherConvention(convention, other.score), trained_as)
     return None
 

@@ -52,9 +52,10 @@ def regression(
     *,
     parts: int = FOLDS,
 ) -> Regression:
-    """Return the problem of the prior's z, with deviations and gravity of its own solution.
+    """Return the problem of the prior's z (k,), with deviations and gravity of its own solution.
 
-    The solution is looked for from that of a problem `near` it.
+    It is that of the windows `fit`; G (m + 1, k) are the unknowns of `Rows`, and the delay [s], by
+    the values of the prior.  The solution is looked for from that of a problem `near` it.
     """
     mean = G @ prior.mean
     B = G @ prior.D
@@ -70,10 +71,7 @@ def regression(
         loaded = rows.with_load(theta[: rows.p])
         weighted = Weighted(loaded, fit, float(theta[-1]))
         of_joints = triangle(np.moveaxis(each, 1, 0) for each in weighted.blocks())
-        scaled = of_joints / deviation[:, None, None]
-        R = triangle([scaled.reshape(-1, theta.size + 1)])
-        A = R[:, :-1] @ B
-        b = R[:, -1] - R[:, :-1] @ mean
+        A, b = _of_prior(of_joints / deviation[:, None, None], mean, B)
         theta = mean + B @ np.linalg.solve(A.T @ A + np.eye(A.shape[1]), A.T @ b)
         left = of_joints @ np.append(theta, -1.0)
         found = np.sqrt(np.sum(left**2, axis=1) / counted)
@@ -93,6 +91,15 @@ def regression(
     )
     folds = np.array(list(successive(fit, G, prior, solved, parts)))
     return solved._replace(folds=folds)
+
+
+def _of_prior(triangles: Floats, mean: Floats, B: Floats) -> tuple[Floats, Floats]:
+    """Return A (., k) and b (.,) of the prior's z, where theta = mean + B z.
+
+    `triangles` (n, ., m + 2) has for each joint [columns of theta | torque], by its deviation.
+    """
+    R = triangle([triangles.reshape(-1, mean.size + 1)])
+    return R[:, :-1] @ B, R[:, -1] - R[:, :-1] @ mean
 
 
 def successive(

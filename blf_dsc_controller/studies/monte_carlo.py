@@ -18,11 +18,9 @@ start.
 
 from __future__ import annotations
 
-import itertools
-import operator
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, cast
@@ -41,28 +39,21 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.schema import Value as Setting
 from blf_dsc_controller.configuration.schema import (
-    Parameter,
     build,
     change,
     flatten,
     parameter,
-    parameters,
-    unknown,
 )
-from blf_dsc_controller.configuration.schema import Value as Setting
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import model_of
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.studies.distributions import (
-    EXPECTED,
-    Distribution,
-    Drawn,
-    parse,
-)
+from blf_dsc_controller.studies.distributions import Drawn
+from blf_dsc_controller.studies.variations import VARY, Variation, variations_of
 
 WITHOUT = 'without.'
 """Prefix of the columns of a run without learning."""
@@ -77,7 +68,6 @@ UNSEEN = 1000
 _ROWS = 200  # postures of that motion
 _ROWS_FOR = 15.0  # s
 _NODE = 'monte_carlo'
-_VARY = 'vary.'
 
 
 @dataclass(frozen=True)
@@ -128,7 +118,7 @@ class Study:
         """Return every value by node and name, with distributions as written."""
         own = flatten(self.settings)
         for variation in self.variations:
-            name = f'{_VARY}{variation.name}'
+            name = f'{VARY}{variation.name}'
             text = str(variation.distribution)
             before = cast('tuple[str, ...]', own.get(name, ()))
             own[name] = text if variation.entry < 0 else (*before, text)
@@ -196,7 +186,6 @@ def load_study(
     """
     path = locate(path)
     problems: list[str] = []  # of the loop
-    own: list[str] = []  # of the section
     loop: LoopConfig | None = None
     settings: MonteCarloConfig | None = None
     try:
@@ -205,10 +194,11 @@ def load_study(
         problems += error.problems
     entries = _section(path)
     given = {name: entry.value for name, entry in entries.items()}
-    varied = {name: given.pop(name) for name in entries if name.startswith(_VARY)}
+    varied = {name: given.pop(name) for name in entries if name.startswith(VARY)}
     if loop is None:  # the number of events is unknown
         varied = _without_events(varied)
-    variations = tuple(_variations(varied, loop.plant if loop else PlantConfig(), own))
+    plant = loop.plant if loop else PlantConfig()
+    variations, own = variations_of(varied, plant)  # problems of the section
     try:
         settings = build(MonteCarloConfig, {**given, **(overrides or {})})
     except ConfigurationError as error:
@@ -227,7 +217,7 @@ def load_study(
 
 def _without_events(varied: Mapping[str, object]) -> dict[str, object]:
     """Return the variations but those of events."""
-    events = f'{_VARY}events.'
+    events = f'{VARY}events.'
     return {
         name: value for name, value in varied.items() if not name.startswith(events)
     }
@@ -329,112 +319,3 @@ def _start(study: Study, relative: Mapping[str, Any]) -> dict[str, Any]:
     if 'velocity_error' in relative:
         start['velocity'] = tuple((dqr + relative['velocity_error']).tolist())
     return start
-
-
-@dataclass(frozen=True)
-class Variation:
-    """One number drawn for each run."""
-
-    name: str  # of the parameter
-    entry: int  # index in the list; -1: not a list
-    column: str  # name in the results
-    distribution: Distribution
-
-
-_GROUPS = (
-    'arm.',
-    'truth.',
-    'joint.',
-    'base.',
-    'disturbance.',
-    'sensor.',
-    'actuator.',
-    'load.',
-    'events.',
-)
-_REALTIME = ('actuator.command_timeout', 'actuator.without_command')
-
-
-@cache
-def _variable_parameters() -> Mapping[str, Parameter]:
-    """Return every parameter that may vary, by name; relative ones last."""
-    relative = Parameter((), '', is_array=True, length=('joints',))
-    found = [
-        *(param for param in parameters(PlantConfig) if param.name.startswith(_GROUPS)),
-        replace(relative, name='initial.error', above=-1.0, below=1.0),
-        replace(relative, name='initial.velocity_error', unit='rad/s'),
-        replace(
-            relative,
-            name='events.gap',
-            unit='s',
-            at_least=0.0,
-            length=('events.begin',),
-        ),
-    ]
-    return {p.name: p for p in found if p.type in EXPECTED and p.name not in _REALTIME}
-
-
-def _variations(
-    given: Mapping[str, object], plant: PlantConfig, problems: list[str]
-) -> Iterator[Variation]:
-    """Yield the variations in the order of the plant's parameters; add to the problems.
-
-    Each name, `vary.` before it, has a distribution; a list parameter also takes a list
-    of them.
-    """
-    known = {f'{_VARY}{name}': param for name, param in _variable_parameters().items()}
-    problems += [unknown(name, known) for name in given if name not in known]
-    for name, param in known.items():
-        if name in given:
-            try:
-                yield from [*_variations_of(param, given[name], plant)]
-            except ValueError as error:
-                problems.append(f'{name}: {error}')
-
-
-def _variations_of(
-    param: Parameter, given: object, plant: PlantConfig
-) -> Iterator[Variation]:
-    column = f'plant.{param.name}'
-    if not param.is_array:
-        yield Variation(param.name, -1, column, _distribution(param, given))
-        return
-    names = _entries(param, plant)
-    if not names:
-        raise ValueError(
-            'got a distribution, but there are no events: give events.begin'
-        )
-    each = list(given) if isinstance(given, (list, tuple)) else [given] * len(names)
-    if len(each) == len({name.rpartition('.')[2] for name in names}):
-        each *= len(names) // len(each)  # the same row for each event
-    if len(each) != len(names):
-        raise ValueError(
-            f'got {len(each)} distributions, but there are {len(names)} entries '
-            f'({", ".join(names)}): give one for each, or a single one for all'
-        )
-    for i, (name, text) in enumerate(zip(names, each, strict=True)):
-        yield Variation(param.name, i, f'{column}.{name}', _distribution(param, text))
-
-
-def _entries(param: Parameter, plant: PlantConfig) -> tuple[str, ...]:
-    """Return the names of the entries of a list parameter, by joint or number."""
-    each = []
-    for name in param.length or (param.name,):
-        count = int(name) if name.isdigit() else len(operator.attrgetter(name)(plant))
-        each.append(
-            plant.joints if name == 'joints' else tuple(map(str, range(1, count + 1)))
-        )
-    return tuple('.'.join(names) for names in itertools.product(*each))
-
-
-def _distribution(param: Parameter, text: object) -> Distribution:
-    """Parse a distribution and check that the parameter allows all of its values."""
-    scalar = replace(param, is_array=False)
-    distribution = parse(text, scalar.type)
-    for value in distribution.extremes:
-        for problem in scalar.problems(value):
-            reason = problem.removeprefix(f'{param.name}: ')
-            raise ValueError(
-                f'{distribution} can give values that are not allowed: {reason}'
-            )
-    return distribution

@@ -42,8 +42,8 @@ def width_warnings(
     of_joint = widest in barrier.bound
     name = 'barrier.bound' if of_joint else 'barrier.initial_bound'
     remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
-    if barrier.bounds_tool:
-        name = POSITION if barrier.tool_bound > 0.0 else ANGLE
+    if of_tool := _tool_parameter(config):
+        name = of_tool
         remedy = 'the bound of a joint follows from this one: give less'
     elif of_joint and errors is not None and not errors.is_endless:
         is_widest = np.array(barrier.bound) == widest

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque import added_torque
+from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.recent_motion import RecentMotion
-from blf_dsc_controller.supervision.sample_check import SampleCheck
 
 Vector = NDArray[np.float64]
 
@@ -29,14 +29,17 @@ class HeldTorque:
     """
 
     def __init__(
-        self, config: ControllerConfig, controller: Controller, samples: SampleCheck
+        self,
+        config: ControllerConfig,
+        controller: Controller,
+        estimates: KeptEstimates,
     ) -> None:
-        """Look at the law of the controller, whose estimates `samples` keep."""
+        """Look at the law of the controller, and at its kept `estimates`."""
         self.recent = RecentMotion(len(config.joints), config.sample_time)
         self.after_gap: Vector | None = None
         self._effort = config.robot.effort
         self._controller = controller
-        self._samples = samples
+        self._estimates = estimates
 
     def command(self) -> Vector | None:
         """Return the command (n,) [N m] that acts after a gap, within the torque limit.
@@ -63,8 +66,8 @@ class HeldTorque:
         held = self.command()
         if held is not None and self.after_gap is not None:
             return self.load_of(held, self.after_gap[: held.size])
-        load = self.recent.load(self._controller.settings, self._samples.estimate)
-        return self._samples.disturbance if load is None else load
+        load = self.recent.load(self._controller.settings, self._estimates.estimate)
+        return self._estimates.disturbance if load is None else load
 
     def load_before_learning(self) -> Vector:
         """Return the load (n,) [N m] besides the initial estimate, by the last samples.
@@ -73,10 +76,10 @@ class HeldTorque:
         """
         settings = self._controller.settings
         load = self.recent.load(settings, settings.initial_estimate)
-        return self._samples.disturbance.copy() if load is None else load
+        return self._estimates.disturbance.copy() if load is None else load
 
     def load_of(self, command: Vector, q: Vector) -> Vector:
         """Return what a command (n,) [N m] carries besides the model, at rest at q (n,) [rad]."""
         at_rest = np.zeros((2, q.size))
-        estimate = self._samples.estimate
+        estimate = self._estimates.estimate
         return command - needed_torque(self._controller.settings, estimate, q, *at_rest)

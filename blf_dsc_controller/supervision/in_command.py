@@ -24,6 +24,7 @@ from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.readings import Readings
 from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_stop import WINDING_UP, SafeStop
@@ -45,6 +46,7 @@ class InCommand:
         controller: the law.
         supervisor: phase, and the reason of a stop.
         states, samples: the checks before and after the law.
+        estimates: those that count for the torque without the law, and for its next start.
         watchdog: the check for missing states.
         journal: events, and counts of what has been processed so far.
         calming: the last oscillation, and by how much it has softened the feedback.
@@ -71,7 +73,10 @@ class InCommand:
         self.supervisor = Supervisor()
         self.states = StateCheck(config.joints, config.sample_time)
         self.calming = Calming(config, self.controller)
-        self.samples = SampleCheck(config, self.controller, self.calming)
+        self.estimates = KeptEstimates(self.controller)
+        self.samples = SampleCheck(
+            config, self.controller, self.calming, self.estimates
+        )
         self.watchdog = Watchdog(steady, wall)
         self.journal = Journal()
         self.has_sample = self.silenced = False
@@ -83,9 +88,9 @@ class InCommand:
         sensor = self.controller.checks.sensor
         self.safe_torque.noise = sensor.noise[:n]
         self.safe_torque.resolution = sensor.resolution
-        self.held = HeldTorque(config, self.controller, self.samples)
+        self.held = HeldTorque(config, self.controller, self.estimates)
         self.safe_stop = SafeStop(
-            config, self.controller, self.samples, self.safe_torque, self.held
+            config, self.controller, self.estimates, self.safe_torque, self.held
         )
         digest = (
             {'law_digest': law_file.digest(config.law)}
@@ -162,7 +167,7 @@ class InCommand:
         if not self.supervisor.stop(reason, text):
             return
         if was_running and reason in WINDING_UP:
-            self.samples.return_to_consistent()
+            self.estimates.return_to_consistent()
         self.journal.note(EventType.STOP, reason=reason, text=text)
         self.clean = self.reference.resumable = False
         self.safe_stop.begin(

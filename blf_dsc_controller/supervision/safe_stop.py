@@ -10,9 +10,9 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.model_torque import model_torque
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
-from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.supervision.swing_names import SwingNames
@@ -41,14 +41,14 @@ class SafeStop:
         self,
         config: ControllerConfig,
         controller: Controller,
-        samples: SampleCheck,
+        estimates: KeptEstimates,
         torque: SafeTorque,
         held: HeldTorque,
     ) -> None:
-        """Use the ramp of `torque`, what `held` finds, and the estimates of `samples`."""
+        """Use the ramp of `torque`, what `held` finds, and the kept `estimates` of the law."""
         self._joints = config.joints
         self._controller = controller
-        self._samples = samples
+        self._estimates = estimates
         self._torque = torque
         self._held = held
         self._speed = StopSpeed()
@@ -104,20 +104,20 @@ class SafeStop:
         if safety.torque != 'hold_gravity' or not self._torque.carries:
             return None
         settings, q = self._controller.settings, self._torque.last.q
-        held = model_torque(settings, self._samples.estimate, q) + self._torque.load
+        held = model_torque(settings, self._estimates.estimate, q) + self._torque.load
         return held - model_torque(settings, settings.initial_estimate, q)
 
     def advance(self, safety: Safety, dt: float) -> Vector | None:
         """Return the torque (n,) [N m] `dt` [s] later; None before a usable state."""
         settings = self._controller.settings
-        return self._torque.advance(safety, settings, self._samples.estimate, dt)
+        return self._torque.advance(safety, settings, self._estimates.estimate, dt)
 
     def leave(self, safety: Safety, *, was_running: bool) -> Vector | None:
         """Return the last torque (n,) [N m]; None before the first usable state."""
         if was_running:
             self._torque.load[:] = self._held.load()
         settings = self._controller.settings
-        return self._torque.leave(safety, settings, self._samples.estimate)
+        return self._torque.leave(safety, settings, self._estimates.estimate)
 
     def observe_speed(self, safety: Safety, speed: float, gap: float) -> bool:
         """Return to the load known before if the arm speeds up; return whether it does.
@@ -158,5 +158,5 @@ class SafeStop:
         """Return the torque (n,) [N m] that holds the arm besides its model when the law stops."""
         is_wound_up = reason in WINDING_UP or reason is Reason.NO_EFFECT
         if is_wound_up and self._held.after_gap is None:
-            return self._samples.disturbance
+            return self._estimates.disturbance
         return self._held.load()

@@ -14,6 +14,7 @@ from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.not_sensors import is_off
 from blf_dsc_controller.supervision.stop_cause import StopCause
@@ -32,7 +33,7 @@ _RELIEF = 4
 
 
 class SampleCheck:
-    """Checks each sample, and keeps the estimates of the last valid one.
+    """Checks each sample, and returns to earlier estimates where a fault has spoilt them.
 
     Attributes:
         ratio: largest |xi1| / k_c of each joint since the start (n,).
@@ -41,9 +42,13 @@ class SampleCheck:
     """
 
     def __init__(
-        self, config: ControllerConfig, controller: Controller, calming: Calming
+        self,
+        config: ControllerConfig,
+        controller: Controller,
+        calming: Calming,
+        estimates: KeptEstimates,
     ) -> None:
-        """Enable the checks of the controller."""
+        """Enable the checks of the controller; `estimates` are the kept ones of its law."""
         controller.checks.sample_time[0] = config.sample_time
         self._has_torques = config.robot.effort in ('whole', 'commanded')
         self._joints = config.joints
@@ -51,10 +56,9 @@ class SampleCheck:
         self._controller = controller
         self._cause = StopCause(config.joints, controller, calming)
         self.ratio = controller.checks.ratio
-        self._kept = controller.checks.estimates.kept
+        self._estimates = estimates
         self._saturation = 0  # ns, times _RELIEF
         self.set_limits(config.safety)
-        self.keep()
         self.restart()
 
     def set_limits(self, safety: Safety) -> None:
@@ -69,10 +73,7 @@ class SampleCheck:
         self.compare_efforts()
         self.ratio[:] = 0.0
         self.outside = self.saturated = 0
-        checks = self._controller.checks
-        checks.estimates.consistent[:] = self._kept
-        checks.estimates.consistent_scale[:] = self._controller.state.rotors.gain_scale
-        checks.estimates.moved[:] = self._kept
+        self._estimates.begin()
         self.relax()
 
     def compare_efforts(self) -> None:
@@ -102,34 +103,6 @@ class SampleCheck:
         sample = self._controller.sample
         return self._tool.errors(sample.qr, sample.xi1, sample.bound)
 
-    @property
-    def estimate(self) -> Vector:
-        """The kept estimate (m,)."""
-        return self._kept[: self._controller.settings.m]
-
-    @property
-    def disturbance(self) -> Vector:
-        """The kept disturbance estimate (n,) [N m]: d^3, and r of `load_observer`."""
-        return self._kept[self._controller.settings.m :]
-
-    def keep(self) -> None:
-        """Keep the current estimates."""
-        state = self._controller.state
-        np.concatenate((state.estimate, state.disturbance), out=self._kept)
-        observed = state.observer.torque
-        self.disturbance[: observed.size] += observed
-
-    def return_to_consistent(self) -> None:
-        """Keep the estimates from before the error grew."""
-        self._kept[:] = self._controller.checks.estimates.consistent
-
-    def restore(self) -> None:
-        """Reset the controller, but set its estimates to the kept ones."""
-        self._controller.reset()
-        state = self._controller.state
-        state.estimate[:] = self.estimate
-        state.disturbance[:] = self.disturbance
-
     def check(self, dt: float) -> Fault | None:
         """Return why the torque of a sample, after `dt` [s], must not be used."""
         flags = self._controller.flags
@@ -144,7 +117,7 @@ class SampleCheck:
             self._check_numbers() or self._check_error() or self._count_saturated(dt)
         )
         if fault is None:
-            self.keep()
+            self._estimates.keep()
         return fault
 
     def _check_numbers(self) -> Fault | None:
@@ -167,7 +140,7 @@ class SampleCheck:
         """Keep the estimates of when a joint last moved; return the fault."""
         checks = self._controller.checks
         limit = self._controller.settings.torque.limit
-        self._kept[:] = checks.estimates.moved
+        self._estimates.return_to_moved()
         if shaking := self._cause.shaking:
             return Fault(Reason.OSCILLATION, shaking)
         if saturation := self._cause.saturation(self.saturated_time):
@@ -217,7 +190,7 @@ class SampleCheck:
         is_short = (share > _SHORT) & (share_now > _SHORT_NOW) & (shortfall * now > 0.0)
         if not is_short.any():
             return None
-        self.return_to_consistent()
+        self._estimates.return_to_consistent()
         return self._falling_short(
             int(np.argmax(np.where(is_short, share, 0.0))), shortfall
         )
@@ -279,7 +252,9 @@ class SampleCheck:
         sample = controller.sample
         rest = np.zeros(len(self._joints))
         q = sample.qr + sample.xi1
-        model = needed_torque(controller.settings, self.estimate, q, rest, rest)[joint]
+        model = needed_torque(
+            controller.settings, self._estimates.estimate, q, rest, rest
+        )[joint]
         sent = sample.torque[joint]
         least = _AGAINST * controller.settings.torque.limit[joint]
         is_against = -np.sign(sample.xi1[joint]) * (sent - model) > least

@@ -47,7 +47,7 @@ class Starting:
         if command.clean:
             command.controller.state.samples[0] = 0.0
         else:
-            command.samples.restore()
+            command.estimates.restore()
         self._start_over()
         command.watchdog.restart()
 
@@ -63,7 +63,7 @@ class Starting:
         command.controller.reset()
         self._loads.forget()
         load = self._carried(added - self._added_by_drives())
-        command.samples.keep()
+        command.estimates.keep()
         self._start_over()
         self._takeover.carried = load
         if load is not None:

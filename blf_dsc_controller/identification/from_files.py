@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm of bags and tables: they are read, joined and identified, or looked at beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from blf_dsc_controller.bags.content import NO_NAMES, NameMap
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.foresight import Foresight, foresee
+from blf_dsc_controller.identification.identified import Identified
+from blf_dsc_controller.identification.identify import (
+    READING,
+    identify_arm,
+    tell_nobody,
+)
+from blf_dsc_controller.identification.on_disk import mapped
+from blf_dsc_controller.identification.problem import Effort
+from blf_dsc_controller.identification.reading import read_recording
+from blf_dsc_controller.identification.recording import Recording, joined
+from blf_dsc_controller.run import Floats
+
+
+def identify_bag(
+    path: Path | Sequence[Path],
+    robot: Robot,
+    namespace: str = '',
+    names: NameMap = NO_NAMES,
+    effort: Effort = 'torque',
+    gains: Sequence[float] = (),
+    loaded: Path | None = None,
+    *,
+    pick_up: bool = False,
+    begin: Callable[[str], None] = tell_nobody,
+) -> Identified:
+    """Identify the arm of one or several bags or tables from its URDF.
+
+    Path, namespace and names are as for `read_run`.  `effort` says what the efforts
+    are: the whole torque, the torque without that of gravity, or the commanded torque
+    instead of them; `gains` [N m/A] turn currents into torques, and if there are none,
+    signs are found.  A load is identified if there is a bag in which the arm is
+    `loaded`, or if it does `pick_up` one.  `begin` is called with each of STAGES when
+    it begins.
+
+    Raises:
+        BlfDscError: a bag or the URDF cannot be read, or there are no torques of the arm, too
+            little of it, or no motion; or they are currents, and there are no gains.
+    """
+    begin(READING)
+    paths = [path] if isinstance(path, Path) else list(path)
+    recordings = _read(
+        [*paths, *([loaded] if loaded else [])],
+        robot,
+        namespace,
+        names,
+        commanded=effort == 'command',
+    )
+    recording, begins = joined(*recordings)
+    picked_up = float('nan') if pick_up else None
+    if loaded:
+        picked_up = begins[-1]
+    if len(gains):
+        recording = _with_gains(recording, gains)
+    elif any(each.currents for each in recordings):
+        raise _not_torques(recording)
+    return identify_arm(
+        recording, robot, effort, picked_up, find_signs=not len(gains), begin=begin
+    )
+
+
+def foresee_recordings(
+    paths: Sequence[Path], robot: Robot, namespace: str = '', names: NameMap = NO_NAMES
+) -> Foresight:
+    """Return what recordings together can show, or tables of a planned motion without torques.
+
+    Raises:
+        BlfDscError: as `identify_bag` does.
+    """
+    recordings = _read(paths, robot, namespace, names, planned=True)
+    return foresee(joined(*recordings)[0], robot)
+
+
+def _read(
+    paths: Sequence[Path], robot: Robot, namespace: str, names: NameMap, **how: bool
+) -> list[Recording]:
+    """Return the recordings of one arm; `how` is as for `read_recording`."""
+    joints: tuple[str, ...] = ()
+    if robot.tip:
+        joints = tuple(joint.name for joint in robot.chain(()).joints)
+    recordings: list[Recording] = []
+    for path in paths:
+        recording = read_recording(path, robot.text, joints, namespace, names, **how)
+        joints = recording.joints
+        recordings.append(recording)
+    return recordings
+
+
+def _not_torques(recording: Recording) -> BlfDscError:
+    return BlfDscError(
+        f'{recording.source}: these are currents or percentages, from which no mass in kg can be '
+        f'told: give --gains [N m/A or N m/%] of {", ".join(recording.joints)}; 1 for each if '
+        'they are torques'
+    )
+
+
+def _with_gains(recording: Recording, gains: Sequence[float]) -> Recording:
+    """Return the recording with torques that are its efforts times the gains."""
+    factors = _checked_gains(gains, recording.joints)
+    efforts = recording.torque
+    torque = mapped(recording.gap.size, lambda rows: efforts[rows] * factors)
+    return recording._replace(torque=torque)
+
+
+def _checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:
+    """Return the gains (n,); raises BlfDscError if there is not one for each joint."""
+    if len(gains) != len(joints):
+        found = f'{len(joints)} joints: {", ".join(joints)}'
+        raise BlfDscError(f'got {len(gains)} gains for {found}')
+    return np.array(gains)
