@@ -58,8 +58,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmark import soft_arms
+from benchmark.elastic import FREE
 from benchmark.harness import print_table
-from benchmark.load_observer import FREE, WEIGHT
+from benchmark.load_observer import WEIGHT
 from benchmark.options import positive
 from benchmark.random_arms import ROBOTS, describe
 from benchmark.scaling import trapezoid_points
