@@ -47,9 +47,20 @@ def points_of(
     distance: Floats, scale: tuple[float, float], spacing: float
 ) -> list[TrajectoryPoint]:
     """Return the points of a motion from 0 over distances (2,) [rad]."""
-    config = build(ControllerConfig, _LIMITS)
-    velocity = scale[0] * config.limits.velocity[0]
-    acceleration = scale[1] * config.limits.acceleration[0]
+    limits = build(ControllerConfig, _LIMITS).limits
+    velocity = scale[0] * limits.velocity[0]
+    return trapezoid_points(
+        distance, velocity, scale[1] * limits.acceleration[0], spacing
+    )
+
+
+def trapezoid_points(
+    distance: Floats, velocity: float, acceleration: float, spacing: float
+) -> list[TrajectoryPoint]:
+    """Return the points of a motion from 0 over distances (n,) [rad] within limits.
+
+    They are at most `spacing` [s] apart, with velocities and accelerations.
+    """
     knots = trapezoid(distance, velocity, acceleration)
     count = max(2, int(np.ceil(knots[-1] / spacing)) + 1)
     times = np.linspace(0.0, knots[-1], count)

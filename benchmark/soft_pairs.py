@@ -29,7 +29,7 @@ from benchmark.studies import load_study
 from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study
 from blf_dsc_controller.studies.runs import KEPT, VIOLATED, Columns, run_chunk
 
-ROBOTS = 'panda', 'ur5e'
+ROBOTS = 'panda', 'ur5e', 'fr3'
 LAWS = '', WITHOUT, NOISE
 ALLOWED = 1.1  # rms with learning over without
 

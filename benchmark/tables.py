@@ -52,6 +52,7 @@ GROUPS = {
     },
     'references': {
         'streams': 'how far behind and how smooth the reference of a stream is',
+        'shaping': 'whether motions make elastic arms ring, and shaping them',
         'scaling': "how many of MoveIt's trajectories are stretched",
     },
     'time': {

@@ -209,6 +209,28 @@ def test_change_forgets_the_window_and_the_latch_and_the_estimate_is_the_anchor(
 
 
 @pytest.mark.parametrize(
+    ('spans', 'raised'),
+    [
+        ((40, 3, 3, 3), (False, False, True, True)),  # something pushes
+        ((40, 3), (False, False)),  # a load came on in two steps
+        ((40, 3, 40, 3, 40), (False,) * 5),  # loads, one after the other
+        ((40, 3, 3, 40, 3), (False, False, True, False, False)),
+    ],
+)
+def test_third_change_in_a_row_is_no_other_arm(parts, spans, raised):
+    """Each comes after so many rows, and is 5 (N m)^2 off."""
+    noise = parts.change.innovation.noise
+    found = []
+    for span in spans:
+        parts.push(THETA, span)
+        noise[0], parts.change.innovation.recent[0] = 0.1, 5.0
+        change.count_change(parts.change, parts.latch, parts.sliding, PRIOR, THETA, DT)
+        found.append(noise[0] == 5.0)
+    assert tuple(found) == raised
+    assert parts.change.changes[0] == len(spans)
+
+
+@pytest.mark.parametrize(
     ('rows', 'least', 'split', 'residual', 'asked'),
     [
         (LENGTH, 0.0, 0.0, 0.081, True),  # past four times the floor

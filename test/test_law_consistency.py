@@ -70,6 +70,24 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
     assert learning.parameter_error[-1] < 0.01
 
 
+def test_push_that_lasts_does_not_restart_learning_again_and_again():
+    """Sideways, as no load pulls.  It was 38 changes in 3 s."""
+    push = {
+        'events.begin': [3.0],
+        'events.duration': [3.0],
+        'events.payload': [0.0],
+        'events.force': [0.0, 14.0, 0.0],  # N
+    }
+    learning, without = (
+        run_preset(8.0, push, preset='panda', law=law) for law in ({}, OFF)
+    )
+    assert learning.changes[-1] <= 10.0
+    after = learning.t > 6.5
+    assert np.linalg.norm(learning.xi1[after]) < 0.9 * np.linalg.norm(
+        without.xi1[after]
+    )
+
+
 def test_change_detection_has_no_effect_without_a_change():
     """Bit for bit: consistency only decides which windows are latched."""
     for preset in ('noisy', 'excitation', 'two_tone'):

@@ -17,6 +17,7 @@ from blf_dsc_controller.law.innovation import (
     has_begun,
     noise_of,
     normalized_square,
+    raise_noise,
     row_variance,
     update,
 )
@@ -29,7 +30,7 @@ MEMORY = 10  # rows in 0.1 s
 
 def begun(unmodelled=1.0):
     """Statistics before any row: s^2 is a tenth of what is unmodelled."""
-    state = State(*np.zeros((4, 1)))
+    state = State(*np.zeros((5, 1)))
     assert not has_begun(state)
     begin(state, unmodelled)
     assert has_begun(state)
@@ -183,3 +184,24 @@ def test_noise_of_a_window_shorter_than_what_is_assumed_is_not_trusted_more():
     """Of half a second, whose rows are fewer than the assumed ones."""
     state = begun()
     assert alarm(state, PERIOD, 50.0) == pytest.approx(8.0 * 0.1)
+
+
+@pytest.mark.parametrize(
+    ('recent', 'raised'),
+    [
+        (5.0, 5.0),
+        (0.01, 0.1),  # never lowered
+    ],
+)
+def test_raised_noise_is_that_of_the_last_rows_and_falls_within_seconds(recent, raised):
+    """The mean square is that of the rows, as if it had not been raised."""
+    state, other = begun(), begun()
+    state.recent[0] = recent
+    raise_noise(state)
+    assert state.noise[0] == raised
+    for each in (state, other):
+        forget_recent(each)
+        for _ in range(round(2.0 / PERIOD)):
+            assert not update(each, 0.05, 1.0, 1.0, PERIOD, MOST)
+    assert state.noise[0] == pytest.approx(max(raised / np.e, other.noise[0]), rel=0.01)
+    assert state.mean[0] == other.mean[0]

@@ -12,6 +12,10 @@ last 0.1 s is compared with the residual that it had.
 If the arm has changed, window, filters and latch are cleared, and learning restarts.
 What a window has taught before it was full is taken back: it did not predict what it
 was not fitted to (`learning.detect_change`).
+
+Something may push the arm for seconds, with a torque that no parameters explain.  Rows
+would contradict those before again and again, and nothing would ever be learned.  So
+after three changes in a row the contradiction is taken for noise for a while.
 """
 
 from typing import Annotated, NamedTuple
@@ -25,12 +29,16 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 # ratio of mean squares; larger than the gate's, since a solution extrapolates
 _ALARM = 8.0
+# s from one change to the next. A load that comes on may be found twice so soon; the third time,
+# there is no arm that the rows are of
+_SOON, _TWICE = 0.3, 2.0
 
 
 class State(NamedTuple):
     """What it keeps from one row to the next."""
 
     changes: Cell  # number of times that the arm was found to have changed
+    hasty: Cell  # the last changes that came soon after the one before
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     recent_residual: Cell  # of the last rows against the solution, (N m)^2
     # with a prior: theta of the rows so far, and the factor of its equations
@@ -158,11 +166,19 @@ def count_change(
     estimate: Array,
     dt: float,
 ) -> None:
-    """Count a change, and forget window and latch; the `estimate` (m,) becomes the anchor."""
+    """Count a change, and forget window and latch; the `estimate` (m,) becomes the anchor.
+
+    The third of three that come soon after one another is of a torque that lasts.
+    """
+    of = sliding.settings
+    since = sliding.state.rows[0] * of.row_interval * dt
     state.changes[0] += 1.0
+    state.hasty[0] = state.hasty[0] + 1.0 if since < _SOON else 0.0
+    if state.hasty[0] >= _TWICE:
+        innovation.raise_noise(state.innovation)
     state.contradiction[0] = state.recent_residual[0]
     state.recent_residual[0] = 0.0
     excitation.unlatch(latch, estimate)
     window.forget(sliding.state)
     innovation.forget_recent(state.innovation)
-    fit_rows(state, sliding, prior, sliding.settings.row_interval * dt)
+    fit_rows(state, sliding, prior, of.row_interval * dt)

@@ -38,6 +38,7 @@ from blf_dsc_controller.numerics.elementary import exp
 
 CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
+LASTING = 2.0  # s, in which a floor of s^2 falls to 1 / e
 MEMORY = 0.1  # s of motion, over which the last rows are averaged
 # times s^2: friction is no noise, and reaches what the noise of a sensor never would
 _ALARM = 8.0
@@ -62,6 +63,7 @@ class State(NamedTuple):
     mean: Cell  # mean square
     rows: Cell  # moving ones that it is of
     recent: Cell  # mean over 0.1 s of motion
+    floor: Cell  # s^2 at least, for some time after it was raised
 
 
 @inner
@@ -83,6 +85,16 @@ def has_begun(state: State) -> bool:
 def forget_recent(state: State) -> None:
     """Forget the last rows: those that follow are of another arm."""
     state.recent[0] = 0.0
+
+
+@inner
+def raise_noise(state: State) -> None:
+    """Take the last rows for noise: no theta explains their torque.
+
+    s^2 stays so large for some `LASTING`, and is measured meanwhile as if it were not.
+    """
+    state.floor[0] = max(state.noise[0], state.recent[0])
+    state.noise[0] = state.floor[0]
 
 
 @inner
@@ -129,11 +141,14 @@ def update(
     excess = square - share * state.recent[0]
     state.recent[0] += min(1.0, period / MEMORY) * excess
     has_changed = state.recent[0] > alarm(state, period, most)
+    own = noise_of(state.mean[0], state.rows[0], unmodelled, most)
     state.rows[0] = min(state.rows[0] + share, most)
     if state.rows[0] > 0.0:
-        usual = min(square, _MOST * share * state.noise[0])
+        usual = min(square, _MOST * share * own)
         state.mean[0] += (usual - share * state.mean[0]) / state.rows[0]
-    state.noise[0] = noise_of(state.mean[0], state.rows[0], unmodelled, most)
+    state.floor[0] *= 1.0 - period / LASTING
+    own = noise_of(state.mean[0], state.rows[0], unmodelled, most)
+    state.noise[0] = max(own, state.floor[0])
     return bool(has_changed)
 
 
