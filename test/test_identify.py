@@ -678,6 +678,16 @@ def test_nearest_physical_body_is_found():
     np.testing.assert_allclose(solve(A, b, far, np.zeros(3)), expected, atol=1e-3)
 
 
+@pytest.mark.parametrize('scale', [1e3, 1e5, 1e7])
+def test_body_is_found_to_the_digits_that_the_objective_has(scale):
+    """At 1e7, no step of Newton's method lowered it by what a double can show."""
+    target = np.diag([1.0, 2.0, -1.0, 3.0])
+    A, b = scale * UNIT.reshape(10, 16).T, scale * target.ravel()
+    z = solve(A, b, [Cone(0, np.zeros((4, 4)), UNIT)], inertia_of(np.eye(4)))
+    expected = np.diag([1.0, 2.0, 0.0, 3.0])
+    np.testing.assert_allclose(pseudo_inertia(z), expected, atol=2e-3)
+
+
 def test_what_data_would_put_on_a_bound_stays_inside():
     """The maximum of s exp(-s^2 / 2 d^2), for a deviation d, is at s = d."""
     deviation = 0.3

@@ -26,6 +26,7 @@ _STEPS = 100
 _CENTRED = 1e-3  # of mu, Newton decrement at which mu is reduced
 _SUFFICIENT = 0.1  # of the linear decrease, in the line search
 _SHORTEST = 1e-9  # step of the line search
+_ROUNDED = float(np.finfo(float).eps)  # of the objective
 
 
 class Cone(NamedTuple):
@@ -86,7 +87,7 @@ def solve(A: Floats, b: Floats, cones: list[Cone], z: Floats) -> Floats:
 def _centred(
     information: Floats, target: Floats, cones: list[_Cones], z: Floats, mu: float
 ) -> Floats:
-    """Return the minimum for one mu."""
+    """Return the minimum for one mu, as far as the objective's digits show it."""
     for _ in range(_STEPS):
         gradient = information @ z - target
         hessian = information.copy()
@@ -105,6 +106,8 @@ def _centred(
         size = 1.0
         least = _objective(information, target, cones, z, mu)
         while size > _SHORTEST:
+            if _SUFFICIENT * size * decrement < _ROUNDED * abs(least):
+                return z  # a decrease would be lost in rounding
             there = _objective(information, target, cones, z + size * step, mu)
             if there <= least - _SUFFICIENT * size * decrement:
                 break
