@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether motions that are sent make elastic arms ring, and what shaping them is worth.
 
-    python -m benchmark shaping sent [--truths N] [--arms NAME...] [--limits A...] [--keep FILE]
-    python -m benchmark shaping shaped [--truths N] [--arms NAME...] [--limits A...]
-                                     [--keep FILE]
-    python -m benchmark shaping frequencies [--truths N] [--arms NAME...] [--limits A...]
-                                          [--keep FILE]
+    python -m benchmark shaping sent|shaped [--truths N] [--arms NAME...] [--limits A...]
+                                            [--keep FILE]
 
 Each arm learns along the motion of its file for 8 s, without a load and with 2 kg from 2 s on,
 and then makes moves from rest to rest: of all joints, of one, a short one of two joints, and
@@ -21,14 +18,10 @@ the links:
     settles      how long after the end of what was sent [s] all links stay within 1 mrad of the
                  goal, and within 3 mrad; at most the 1.5 s until the next move
 
-`sent`: the ringing that motions cause as they are followed today
+The moves have trapezoidal velocities, as MoveIt's TOTG sends them: points every 0.1 s with
+velocities and accelerations, which the action interpolates by quintics.
 
-    trapezoid      velocities that are trapezoids, exactly, as no planner sends them as a rule
-    MoveIt         the same, by MoveIt's TOTG: points every 0.1 s with velocities and accelerations
-    cubic          the same without accelerations
-    stream N Hz    the positions of the trapezoid as targets of a stream
-    minimum jerk   in the same time, as `follow` makes it of the last point
-    move_to        minimum jerk with the same largest acceleration, which takes 1.2 times as long
+`sent`: the ringing after them
 
 `shaped`: MoveIt's motion, changed by a shaper for the lowest resonance f of the assumed arm
 
@@ -41,8 +34,6 @@ the links:
 Cells have the median of the ratios to the motion as it is, and in how many pairs it is lower and
 higher by more than 2 %; of the times until links settle the median of the differences [ms], and
 in how many pairs it is sooner and later by more than 5 ms.
-
-`frequencies`: moving averages for other frequencies, and the motion slowed as much.
 """
 
 from __future__ import annotations
@@ -50,8 +41,8 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,13 +66,10 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.messages.journal import Journal
-from blf_dsc_controller.reference.retargeting import plan_target
-from blf_dsc_controller.reference.stream import TargetStream
 from blf_dsc_controller.reference.terms import (
     hermite,
     minimum_jerk,
     pack,
-    remaining,
     sampled,
     unpack,
 )
@@ -103,47 +91,26 @@ DWELL = 1.5  # s after the end of a move that was sent
 AFTER = 0.5  # s, in which ringing is looked for
 BAND = 8.0, 45.0  # Hz
 FAR, SHORT = 0.35, 0.05  # rad
-SPACING, DENSE = 0.1, 0.004  # s between points
-LEAD = 0.004  # s of planning a target
+SPACING = 0.1  # s between points
 TOLERANCES = (1.0, 3.0)  # mrad
 LOADS = (0.0, WEIGHT)  # kg
 
 
-class Case(NamedTuple):
-    """An arm as `soft_arms` draws it, or the commissioned file of it."""
-
-    label: str
-    arm: str
-    preset: str | None = None
-
-
-CASES = {
-    'ur5e': Case('UR5e', 'ur5e'),
-    'panda': Case('Panda', 'panda_preset'),
-    'fr3': Case('FR3', 'fr3'),
-    'ur5e_commissioned': Case('UR5e, commissioned', 'ur5e', 'ur5e_commissioned'),
-    'panda_commissioned': Case(
-        'Panda, commissioned', 'panda_preset', 'panda_commissioned'
-    ),
-    'fr3_commissioned': Case('FR3, commissioned', 'fr3', 'fr3_direct_commissioned'),
-    'ur5e_motor': Case('UR5e, encoders at motors, 1e4', 'ur5e_motor'),
-    'panda_no_loop': Case('Panda, 1e4, no torque loop', 'panda_no_loop'),
+ARMS = {
+    'ur5e': soft_arms.ARMS['ur5e'],
+    'panda': soft_arms.ARMS['panda']._replace(label='Panda', plant={}),  # its file's
+    'fr3': soft_arms.ARMS['fr3'],
+    'ur5e_motor': soft_arms.ARMS['ur5e_motor'],
+    'panda_no_loop': soft_arms.ARMS['panda_no_loop'],
 }
-_PANDA = soft_arms.ARMS['panda']._replace(label='Panda', plant={})
-
-
-def arm_of(case: Case) -> soft_arms.Arm:
-    """Return the arm of a case."""
-    return _PANDA if case.arm == 'panda_preset' else soft_arms.ARMS[case.arm]
 
 
 @cache
 def loop_of(name: str, load: float, truth: int) -> LoopConfig:
     """Return the loop of a true arm with a load [kg]; truth 0 is the arm that is assumed."""
-    case = CASES[name]
-    arm = arm_of(case)
+    arm = ARMS[name]
     n = len(soft_arms.loop_with(arm, {}).plant.joints)
-    gains = {} if case.arm == 'panda_preset' else soft_arms.gains_of(case.arm)
+    gains = {} if name == 'panda' else soft_arms.gains_of(name)
     drawn = soft_arms.drawn(arm, truth) if truth else {}
     plant = {
         **arm.plant,
@@ -155,13 +122,12 @@ def loop_of(name: str, load: float, truth: int) -> LoopConfig:
         'events.payload': [load],
     }
     controller = {
-        **({} if case.preset else gains),
+        **gains,
         'barrier.bound': [FREE] * n,
         'limits.velocity': [2.0] * n,
         'limits.acceleration': [40.0] * n,  # nothing is stretched
     }
-    preset = case.preset or ROBOTS[arm.robot].preset
-    return load_loop(preset, {PLANT: plant, CONTROLLER: controller})
+    return load_loop(ROBOTS[arm.robot].preset, {PLANT: plant, CONTROLLER: controller})
 
 
 @cache
@@ -212,82 +178,25 @@ def moves_of(config: ControllerConfig, limits: Sequence[float]) -> list[Move]:
     return moves
 
 
-def points_of(move: Move, spacing: float, fields: int) -> list[TrajectoryPoint]:
-    """Return the points of a move with trapezoidal velocity, with the first fields."""
-    given = trapezoid_points(move.goal - move.start, VELOCITY, move.limit, spacing)
-    return [
-        each._replace(
-            positions=tuple((move.start + each.positions).tolist()),
-            velocities=each.velocities if fields > 1 else (),
-            accelerations=each.accelerations if fields > 2 else (),
-        )
-        for each in given[1:]
-    ]
-
-
-def planned(
-    vector: Floats, move: Move, config: ControllerConfig, points: list[TrajectoryPoint]
-) -> Floats:
-    """Return the reference with a trajectory."""
-    trajectory = Trajectory(config.joints, tuple(points), move.begin)
-    return plan_trajectory(trajectory, vector, move.begin, config).vector
-
-
-def sent_points(
-    move: Move, config: ControllerConfig, times: Floats, spacing: float, fields: int
-) -> Floats:
-    """Return qr, dqr, ddqr (k, 3, n) of a trajectory with points of a spacing [s]."""
+def sent(move: Move, config: ControllerConfig, times: Floats) -> Floats:
+    """Return qr, dqr, ddqr (k, 3, n) of a move with MoveIt's points."""
+    distance = move.goal - move.start
+    points = tuple(
+        each._replace(positions=tuple((move.start + each.positions).tolist()))
+        for each in trapezoid_points(distance, VELOCITY, move.limit, SPACING)[1:]
+    )
     at_rest = pack(move.goal.size, [minimum_jerk(np.zeros(1), move.start[np.newaxis])])
-    points = points_of(move, spacing, fields)
-    return sampled(planned(at_rest, move, config, points), times)
+    trajectory = Trajectory(config.joints, points, move.begin)
+    return sampled(
+        plan_trajectory(trajectory, at_rest, move.begin, config).vector, times
+    )
 
 
-def sent_quintic(move: Move, later: float, times: Floats) -> Floats:
-    """Return qr, dqr, ddqr (k, 3, n) of minimum jerk that takes some time [s] longer."""
-    ends = np.array((move.begin, move.begin + move.duration + later))
+def quintic(move: Move, times: Floats) -> Floats:
+    """Return qr, dqr, ddqr (k, 3, n) of minimum jerk in the time of a move."""
+    ends = np.array((move.begin, move.begin + move.duration))
     term = minimum_jerk(ends, np.array((move.start, move.goal)))
     return sampled(pack(move.goal.size, [term]), times)
-
-
-def sent_stream(
-    move: Move, config: ControllerConfig, times: Floats, rate: float
-) -> Floats:
-    """Return qr, dqr, ddqr (k, 3, n) of the positions of a move, sent at a rate [Hz]."""
-    exact = sent_points(move, config, times, DENSE, 3)
-    stream = TargetStream()
-    vector = pack(move.goal.size, [minimum_jerk(np.zeros(1), move.start[np.newaxis])])
-    out = np.zeros_like(exact)
-    fastest = np.array(config.limits.velocity)
-    step, done = round(1e3 / rate), 0
-    for k in range(0, times.size, step):
-        target = stream.target(
-            float(times[k]),
-            exact[k, 0],
-            timeout=config.reference.stream_timeout,
-            fastest=fastest,
-        )
-        start = float(times[k]) + LEAD
-        last = int(np.searchsorted(times, start))
-        out[done:last] = sampled(vector, times[done:last])
-        done = last
-        motion = plan_target(target, vector, start, config)
-        vector = remaining(motion.vector, start - 1e-3)
-    out[done:] = sampled(vector, times[done:])
-    return out
-
-
-SENT: Mapping[str, Callable[[Move, ControllerConfig, Floats], Floats]] = {
-    'trapezoid': partial(sent_points, spacing=DENSE, fields=3),
-    'MoveIt': partial(sent_points, spacing=SPACING, fields=3),
-    'cubic': partial(sent_points, spacing=SPACING, fields=2),
-    'stream 50 Hz': partial(sent_stream, rate=50.0),
-    'stream 200 Hz': partial(sent_stream, rate=200.0),
-    'minimum jerk': lambda move, _, times: sent_quintic(move, 0.0, times),
-    'move_to': lambda move, _, times: sent_quintic(
-        move, (np.sqrt(5.774 / 4.0) - 1.0) * move.duration, times
-    ),
-}
-MOVEIT = 'MoveIt'
 
 
 # Shapers: each takes and returns qr, dqr, ddqr (k, 3, n), a sample in each ms.
@@ -328,7 +237,7 @@ def slowed(move: Move, config: ControllerConfig, times: Floats, later: float) ->
     """Return MoveIt's motion, slowed down to take some time [s] longer."""
     factor = move.duration / (move.duration + later)
     warped = move.begin + factor * (times - move.begin)
-    fields = SENT[MOVEIT](move, config, warped)
+    fields = sent(move, config, warped)
     return np.asarray(fields * (factor ** np.arange(3.0))[:, np.newaxis])
 
 
@@ -336,13 +245,14 @@ def reference(
     rule: str, move: Move, config: ControllerConfig, times: Floats, frequency: float
 ) -> tuple[Floats, float]:
     """Return a rule's qr, dqr, ddqr (k, 3, n), and by how much [s] it ends later."""
-    if rule in SENT:
-        later = (np.sqrt(5.774 / 4.0) - 1.0) * move.duration
-        return SENT[rule](move, config, times), later if rule == 'move_to' else 0.0
+    if rule == 'minimum jerk':
+        return quintic(move, times), 0.0
     period = 1.0 / frequency
     if rule == 'slowed':
         return slowed(move, config, times, period), period
-    fields = SENT[MOVEIT](move, config, times)
+    fields = sent(move, config, times)
+    if rule == MOVEIT:
+        return fields, 0.0
     if rule == 'mean':
         return averaged(fields, period), period
     if rule == 'ZV':
@@ -350,6 +260,7 @@ def reference(
     return impulses(fields, period, (0.25, 0.5, 0.25)), period
 
 
+MOVEIT = 'MoveIt'
 SHAPED = ('slowed', 'ZV', 'ZVD', 'mean', 'minimum jerk')
 
 
@@ -473,10 +384,9 @@ def run(
     load: float,
     truth: int,
     rule: str,
-    frequency: float,
     limits: Sequence[float] = LIMITS,
 ) -> list[Figures]:
-    """Return what each move of an arm shows under a rule for a frequency [Hz]; none if it stops."""
+    """Return what each move of an arm shows under a rule; none if it stops."""
     warm = warmed(name, load, truth)
     if warm is None:
         return []
@@ -492,7 +402,7 @@ def run(
     record = new_record(controller, config, loop.plant, Journal(), rows)
     t = 1e-9 * record.stamps
     grid = t[np.searchsorted(t, FIRST - 1e-9) :]
-    fields, laters = references_of(moves, rule, config, grid, frequency)
+    fields, laters = references_of(moves, rule, config, grid, resonance(name))
     term = hermite(grid, fields.swapaxes(0, 1))._replace(begin=float(grid[0]))
     controller.reference_vector = pack(n, [*unpack(warm.reference), term])
     span = Span(rows.start, rows.stop - 1, is_end=True, observed=False)
@@ -517,12 +427,9 @@ class Kept:
                 of_run = (*key[:-1], tuple(key[-1]))
                 self.found[of_run] = [Figures(*each) for each in values]
 
-    def of(
-        self, name: str, load: float, truth: int, rule: str, frequency: float = 0.0
-    ) -> list[Figures]:
+    def of(self, name: str, load: float, truth: int, rule: str) -> list[Figures]:
         """Return the figures of a run, from the file or computed now."""
-        for_frequency = 0.0 if rule in SENT else frequency
-        key = name, load, truth, rule, for_frequency, tuple(self.limits)
+        key = name, load, truth, rule, tuple(self.limits)
         if key not in self.found:
             self.found[key] = run(*key)
             if self.path is not None:
@@ -530,12 +437,10 @@ class Kept:
                     file.write(json.dumps([key, self.found[key]]) + '\n')
         return self.found[key]
 
-    def of_arm(
-        self, name: str, truths: int, rule: str, frequency: float = 0.0
-    ) -> list[list[Figures]]:
+    def of_arm(self, name: str, truths: int, rule: str) -> list[list[Figures]]:
         """Return the figures of the runs of a number of true arms with each load."""
         return [
-            self.of(name, load, truth, rule, frequency)
+            self.of(name, load, truth, rule)
             for truth in range(1, truths + 1)
             for load in LOADS
         ]
@@ -544,18 +449,14 @@ class Kept:
 # Tables.
 
 
-def sent_rows(name: str, truths: int, kept: Kept) -> Iterator[list[str]]:
-    """Compute the rows of an arm: the ringing after each kind of motion."""
-    for rule in SENT:
-        moves = list(itertools.chain.from_iterable(kept.of_arm(name, truths, rule)))
-        cells = []
-        for limit in kept.limits:
-            chosen = [each for each in moves if each.limit == limit]
-            ringing = [each.after for each in chosen]
-            cells.append(f'{np.median(ringing):.2f} ({max(ringing):.2f})')
-        resting = [each.resting for each in moves]
-        rest = f'{np.median(resting):.2f} ({max(resting):.2f})'
-        yield [CASES[name].label, rule, rest, *cells]
+def sent_row(name: str, truths: int, kept: Kept) -> list[str]:
+    """Return the row of an arm: the ringing after its moves, and at rest."""
+    moves = list(itertools.chain.from_iterable(kept.of_arm(name, truths, MOVEIT)))
+    ringing = [[each.resting for each in moves]] + [
+        [each.after for each in moves if each.limit == limit] for limit in kept.limits
+    ]
+    cells = (f'{np.median(each):.2f} ({max(each):.2f})' for each in ringing)
+    return [ARMS[name].label, f'{resonance(name):.0f} Hz', *cells]
 
 
 def ratios(pairs: list[tuple[Figures, Figures]], field: str) -> str:
@@ -576,11 +477,10 @@ def pairs_of(
     name: str,
     truths: int,
     rule: str,
-    frequency: float,
     kept: Kept,
 ) -> list[tuple[Figures, Figures]]:
     """Return the moves under a rule, each with MoveIt's, of runs that do not stop."""
-    runs = kept.of_arm(name, truths, rule, frequency)
+    runs = kept.of_arm(name, truths, rule)
     others = kept.of_arm(name, truths, MOVEIT)
     return [
         pair
@@ -597,8 +497,8 @@ def pair_row(pairs: list[tuple[Figures, Figures]]) -> list[str]:
 
 def shaped_rows(name: str, truths: int, kept: Kept) -> Iterator[list[str]]:
     """Compute the rows of an arm: its motion as it is, and with each shaper."""
-    label, frequency = CASES[name].label, resonance(name)
-    own = [b for _, b in pairs_of(name, truths, MOVEIT, 0.0, kept)]
+    label, frequency = ARMS[name].label, resonance(name)
+    own = [b for _, b in pairs_of(name, truths, MOVEIT, kept)]
     errors = [
         f'{np.median([getattr(each, field) for each in own]):.2f}'
         for field in ('peak', 'rms', 'ringing', 'after')
@@ -609,18 +509,8 @@ def shaped_rows(name: str, truths: int, kept: Kept) -> Iterator[list[str]]:
     ]
     yield [f'{label}, {frequency:.0f} Hz', 'as it is', *errors, *times]
     for rule in SHAPED:
-        pairs = pairs_of(name, truths, rule, frequency, kept)
+        pairs = pairs_of(name, truths, rule, kept)
         yield [label, rule, *pair_row(pairs)]
-
-
-FREQUENCIES = (3.0, 6.0)  # Hz
-
-
-def frequency_rows(name: str, truths: int, kept: Kept) -> Iterator[list[str]]:
-    """Compute the rows of an arm: moving averages over long times, and slower motions."""
-    for frequency, rule in itertools.product(FREQUENCIES, ('slowed', 'mean')):
-        pairs = pairs_of(name, truths, rule, frequency, kept)
-        yield [CASES[name].label, f'{rule}, {frequency:g} Hz', *pair_row(pairs)]
 
 
 _PAIRS = ('peak', 'rms', 'ringing', 'after', 'settles to 1 mrad', '3 mrad')
@@ -628,9 +518,9 @@ _PAIRS = ('peak', 'rms', 'ringing', 'after', 'settles to 1 mrad', '3 mrad')
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument('table', choices=('sent', 'shaped', 'frequencies'))
+    parser.add_argument('table', choices=('sent', 'shaped'))
     parser.add_argument('--truths', type=positive, default=5, help='true arms (5)')
-    parser.add_argument('--arms', nargs='+', choices=CASES, default=list(CASES))
+    parser.add_argument('--arms', nargs='+', choices=ARMS, default=list(ARMS))
     about = 'limits of the acceleration of the moves, one after the other [rad/s^2]'
     parser.add_argument(
         '--limits',
@@ -647,15 +537,9 @@ def main(given: argparse.Namespace) -> None:
     """Print the table that was asked for."""
     kept = Kept(given.keep, given.limits)
     if given.table == 'sent':
-        of_arms = (sent_rows(name, given.truths, kept) for name in given.arms)
-        heads = (
-            'arm',
-            'sent',
-            'at rest',
-            *(f'{limit:g} rad/s^2' for limit in given.limits),
-        )
-        print_table(heads, itertools.chain.from_iterable(of_arms))
+        limits = (f'{limit:g} rad/s^2' for limit in given.limits)
+        rows = [sent_row(name, given.truths, kept) for name in given.arms]
+        print_table(('arm', 'lowest resonance', 'at rest', *limits), rows)
         return
-    rows = shaped_rows if given.table == 'shaped' else frequency_rows
-    of_arms = (rows(name, given.truths, kept) for name in given.arms)
+    of_arms = (shaped_rows(name, given.truths, kept) for name in given.arms)
     print_table(('arm', 'reference', *_PAIRS), itertools.chain.from_iterable(of_arms))

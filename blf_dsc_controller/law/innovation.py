@@ -25,8 +25,9 @@ weights: with the share w^2 of a row, the mean square of its joints' weights,
 The arm has changed where the mean over 0.1 s of motion exceeds eight times s^2, and
 more where s^2, which is of few rows, may be too small (`alarm`).
 
-s^2 is assumed at first, and measured as the mean.  Rows that fit ever worse, as under a
-disturbance that lasts, raise it as they come, and contradict nothing.
+s^2 is assumed at first, and measured as the mean.  Rows that fit ever worse raise it as
+they come, and contradict nothing.  It has a floor for some seconds after rows have
+contradicted those before again and again, as under a push (`raise_noise`).
 """
 
 from typing import NamedTuple
