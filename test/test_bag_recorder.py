@@ -21,7 +21,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import PATIENT, closed_loop
+from command import PATIENCE, PATIENT, closed_loop
 from mcap.reader import make_reader
 from nav_msgs.msg import Goals
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -48,7 +48,6 @@ from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
 # s
 KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 1)
-PATIENCE = 60.0  # s, until a test gives up on what should take a moment
 RECORDER = (
     sys.executable,
     '-m',
