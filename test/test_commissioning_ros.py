@@ -15,7 +15,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from elastic_two_link import ARM, NEAR, shorten_motions
 from rclpy.parameter import Parameter
-from ros_rig import FakeClock
+from ros_rig import PATIENCE, FakeClock
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.commission_ros import made
@@ -92,6 +92,12 @@ class Rig:
 
     def speed(self):
         return np.abs(self.arm.plant.measure().reshape(3, -1)[1]).max()
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """Wait for a slow arm as long as for anything in these tests."""
+    monkeypatch.setattr(over_ros, '_PATIENCE', PATIENCE)
 
 
 @pytest.fixture

@@ -414,9 +414,12 @@ def test_load_is_not_declared_to_drives_that_add_nothing(arm):
 
 
 def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
-    """80 N m for 0.1 s, against 600 N m/rad and a bound of 49 mrad."""
+    """80 N m for 0.1 s, against 600 N m/rad and a bound of 49 mrad.
+
+    In a motion of ten seconds, which has begun by then.
+    """
     push = {
-        'events.begin': [0.5],
+        'events.begin': [3.0],
         'events.duration': [0.1],
         'events.payload': [0.0],
         'events.torque': [0.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -424,7 +427,7 @@ def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
     with drive(sim_plant=push) as arm:
         start = arm.state.q
         with pytest.raises(LoopEndedError, match=r'the controller stopped: .*recover'):
-            arm.move_to(start + STEP, speed=0.1)
+            arm.move_to(start + STEP, speed=0.02)
         assert 'the controller stopped' in arm.ended
         with pytest.raises(LoopEndedError, match='the controller stopped'):
             arm.stream(start)
