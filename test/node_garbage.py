@@ -13,10 +13,12 @@ _users = 0
 def begin():
     """Call this before the first node: what is there by now is not looked at again.
 
-    Not beside other nodes: theirs would stay for good.
+    Not beside other nodes: theirs would stay for good. So would those that the last test still
+    held at its `end`, as by a fixture that refers to them: they are collected here.
     """
     global _users  # noqa: PLW0603 - of the garbage collector, of which there is one
     if _users == 0:
+        gc.collect()
         gc.freeze()
     _users += 1
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS domains of this test process, claimed as a run claims its own: nobody else is in them.
 
-Each context takes the next one, because nodes of the last test leave the graph slowly.
+Each context takes the next one, because nodes of the last test leave the graph slowly. Nor does
+it take one in which this process has left something: a rig that other tests share, or a node.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ def avoid_domain_of_shell():
 
 
 def own_domain() -> int:
-    """Return a domain that this process has not used recently, and in which nobody else is."""
+    """Return a domain that this process has not used recently, and in which nobody is."""
     if len(_MINE) < _WANTED:
         _MINE.append(_CLAIMS.enter_context(domains.own_domain()))
         return _MINE[-1]
     for _ in _MINE:
         _MINE.append(_MINE.pop(1))  # the first is the environment's
-        if not domains.strangers(_MINE[-1]):
+        if not domains.bound_ports(_MINE[-1]):
             return _MINE[-1]
-    raise RuntimeError(f'others are in all of the domains {_MINE}')
+    raise RuntimeError(f'somebody is in each of the domains {_MINE}')

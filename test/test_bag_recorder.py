@@ -21,7 +21,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from command import PATIENT, closed_loop
+from command import PATIENCE, PATIENT, closed_loop
 from mcap.reader import make_reader
 from nav_msgs.msg import Goals
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -48,7 +48,6 @@ from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
 # s
 KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 1)
-PATIENCE = 60.0  # s, until a test gives up on what should take a moment
 RECORDER = (
     sys.executable,
     '-m',
@@ -75,11 +74,22 @@ def bag(tmp_path):
     return tmp_path / 'bag'
 
 
-def connected(ros, type_, topic, quality=100):
+def connected(ros, recorder, type_, topic, quality=100):
     """Return a publisher of the test that the recorder has subscribed to."""
     publisher = ros.tester.create_publisher(type_, topic, quality)
-    ros.until(publisher.get_subscription_count)
+    until_subscribed(ros, recorder, publisher)
     return publisher
+
+
+def until_subscribed(ros, recorder, *publishers):
+    """Spin until the recorder has these topics, and its subscriptions and publishers matched."""
+    ros.until(
+        lambda: all(
+            each.topic_name in recorder.bag.message_counts
+            and each.get_subscription_count()
+            for each in publishers
+        )
+    )
 
 
 def until_recorded(ros, recorder, **counts):
@@ -94,7 +104,7 @@ def until_recorded(ros, recorder, **counts):
 
 def test_messages_are_recorded_byte_for_byte(ros, bag):
     recorder = ros.add(BagRecorderNode, output=str(bag))
-    publisher = connected(ros, JointState, 'joint_states')
+    publisher = connected(ros, recorder, JointState, 'joint_states')
     sent = [encoded(k) for k in range(1050)]
     before = time.time_ns()
     for k, raw in enumerate(sent):
@@ -120,7 +130,7 @@ def test_plant_as_the_clock_logs_at_the_stamp_of_the_last_joint_state(ros, bag):
     topics = ['early', 'joint_states']
     given = {'output': str(bag), 'clock': 'plant', 'topics': topics}
     recorder = ros.add(BagRecorderNode, given)
-    early, states = (connected(ros, JointState, topic) for topic in topics)
+    early, states = (connected(ros, recorder, JointState, each) for each in topics)
     for publisher, numbers in ((early, (1, 2)), (states, (70, 90, 80))):
         for number in numbers:
             publisher.publish(encoded(number))
@@ -137,10 +147,10 @@ def test_best_effort_publisher_that_joins_a_reliable_one_is_recorded_too(ros, ba
     """And what the reliable one sends is recorded once, though it arrives twice."""
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     recorder = ros.add(BagRecorderNode, output=str(bag), topics=['mixed'])
-    reliable = connected(ros, JointState, 'mixed')
+    reliable = connected(ros, recorder, JointState, 'mixed')
     reliable.publish(encoded(1))
     until_recorded(ros, recorder, mixed=1)
-    late = connected(ros, JointState, 'mixed', best_effort)
+    late = connected(ros, recorder, JointState, 'mixed', best_effort)
     ros.until(lambda: reliable.get_subscription_count() == 2)
     reliable.publish(encoded(2))
     late.publish(encoded(3))
@@ -166,7 +176,7 @@ def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
     kinds = (('sensor', best_effort), ('mixed', KEPT), ('mixed', best_effort))
     publishers = [create(JointState, topic, quality) for topic, quality in kinds]
     publishers.append(create(Goals, 'goals', 100))
-    ros.until(lambda: all(each.get_subscription_count() for each in publishers))
+    until_subscribed(ros, recorder, *publishers)
     for publisher in publishers:
         publisher.publish(publisher.msg_type())
     until_recorded(ros, recorder, bound=1, sensor=1, mixed=2, goals=1)
@@ -219,7 +229,7 @@ def test_received_messages_are_on_disk_before_a_type_is_imported(ros, bag, monke
     recorder = ros.add(
         BagRecorderNode, output=str(bag), topics=['joint_states', 'goals']
     )
-    publisher = connected(ros, JointState, 'joint_states')
+    publisher = connected(ros, recorder, JointState, 'joint_states')
     monkeypatch.setattr(recorder_node, 'message_class', import_slowly)
     ros.tester.create_publisher(Goals, 'goals', 10)
     for _ in range(50):
@@ -238,7 +248,7 @@ def test_losses_are_counted_and_reported(ros, bag, capfd):
     recorder = ros.add(
         BagRecorderNode, output=str(bag), topics=['joint_states'], queue_depth=5
     )
-    ros.until(publisher.get_subscription_count)
+    until_subscribed(ros, recorder, publisher)
     for burst, count in ((range(8, 9), 1), (range(9, 59), 6)):
         for k in burst:
             publisher.publish(encoded(k))

@@ -15,11 +15,13 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from elastic_two_link import ARM, NEAR, shorten_motions
 from rclpy.parameter import Parameter
+from ros_rig import PATIENCE, FakeClock
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.commission_ros import made
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import over_ros
+from blf_dsc_controller.commissioning.motion import is_motion
 from blf_dsc_controller.commissioning.over_ros import OverRos
 from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.configuration.schema import flatten
@@ -37,7 +39,7 @@ pytestmark = pytest.mark.usefixtures('blank_pictures')
 class Rig:
     """An arm in lock-step, and the node that measures it."""
 
-    def __init__(self, ros, folder, text=ARM):
+    def __init__(self, ros, folder, text=ARM, **options):
         self.ros = ros
         self.file = folder / 'arm.yaml'
         self.file.write_text(text)
@@ -45,9 +47,9 @@ class Rig:
         loop = blf.load_loop(self.file)
         self.commissioning = blf.Commissioning(loop.controller)
         values = {k: v for k, v in flatten(loop.plant).items() if v != ()}
-        self.arm = ros.add(PlantNode, {**values, 'mode': 'lockstep'})
+        self.arm = ros.add(PlantNode, {**values, 'mode': 'lockstep'}, **options)
         self.node = ros.keep(made(loop.controller, context=ros.context, cli_args=[]))
-        self.samples = 0
+        self.due = lambda: False
         self.then = self.always = lambda: None
         self.robot = OverRos(
             self.node,
@@ -60,13 +62,29 @@ class Rig:
     def spin(self):
         self.ros.executor.spin_once(timeout_sec=0.01)
         self.always()
-        if self.samples and self.arm.plant.sample >= self.samples:
-            self.samples = 0
+        if self.due():
+            self.due = lambda: False
             self.then()
 
-    def at(self, samples, then):
-        """Do something once the arm has made this many samples."""
-        self.samples, self.then = samples, then
+    def during(self, part, then, when=lambda: True):
+        """Do something once the law has made 0.3 s of a `part`, a move or a motion, and `when`.
+
+        In the arm's time. How many samples the arm makes before is up to the computer.
+        """
+        self.then = then
+        self.due = lambda: self.part() == part and self.passed() > 0.3 and when()
+
+    def part(self):
+        """Return what the law does, if it commands."""
+        guard = self.node.guard
+        if guard is None or not guard.supervisor.running:
+            return ''
+        return 'motion' if is_motion(guard.config) else 'move'
+
+    def passed(self):
+        """Return since when the law has followed the reference of this part [s]."""
+        guard = self.node.guard
+        return (guard.journal.stamp - guard.reference.start_stamp) * 1e-9
 
     def measured(self, *postures):
         self.robot.wait()
@@ -74,6 +92,12 @@ class Rig:
 
     def speed(self):
         return np.abs(self.arm.plant.measure().reshape(3, -1)[1]).max()
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """Wait for a slow arm as long as for anything in these tests."""
+    monkeypatch.setattr(over_ros, '_PATIENCE', PATIENCE)
 
 
 @pytest.fixture
@@ -102,7 +126,7 @@ def test_a_run_goes_on_from_the_torque_that_holds_the_arm(ros, tmp_path):
     """A load that the law knows nothing of does not sag between two runs."""
     loaded = ARM.replace('constant: [0.0, 0.0]', 'constant: [1.0, 0.5]')  # N m
     rig = Rig(ros, tmp_path, loaded)
-    rig.at(6000, rig.robot.request_end)  # in the motion
+    rig.during('motion', rig.robot.request_end)
     with pytest.raises(EndedError):
         rig.measured(NEAR)
     before, after = (blf.read_run(rig.bags / each) for each in ('move_1', 'posture_1'))
@@ -131,9 +155,9 @@ def test_log_has_oscillations_of_moves_but_not_of_motions_which_shake_the_arm(
         rig.node.guard.calming.count += 2
         rig.node.log.warn_of_findings(rig.node.guard)
         if len(during) == 1:
-            rig.at(4500, oscillate)  # in the motion, too
+            rig.during('motion', oscillate)
 
-    rig.at(300, oscillate)
+    rig.during('move', oscillate)
     rig.measured(NEAR)
     assert during == ['waypoints', 'sinusoids']
     assert said == ['2 so far']
@@ -147,13 +171,15 @@ def calm(rig):
     return rig.speed() < 0.01 and rig.node.guard.is_settled  # rad/s
 
 
-@pytest.mark.parametrize('at', [300, 4500])
-def test_ctrl_c_brings_the_arm_to_rest_in_a_move_and_in_a_motion(rig, at):
-    rig.at(at, rig.robot.request_end)
+@pytest.mark.parametrize(
+    ('part', 'name'), [('move', 'move 1'), ('motion', 'posture 1')]
+)
+def test_ctrl_c_brings_the_arm_to_rest_in_a_move_and_in_a_motion(rig, part, name):
+    rig.during(part, rig.robot.request_end)
     with pytest.raises(EndedError, match='ended on request') as caught:
         rig.measured(NEAR)
     assert caught.value.end is End.REQUESTED
-    assert str(caught.value).startswith('move 1' if at == 300 else 'posture 1')
+    assert str(caught.value).startswith(name)
     assert calm(rig)
     assert main(['commission', str(rig.bags / 'move_1'), '--config', str(rig.file)])
 
@@ -161,18 +187,22 @@ def test_ctrl_c_brings_the_arm_to_rest_in_a_move_and_in_a_motion(rig, at):
 @pytest.mark.parametrize(
     ('takes', 'told'),
     [
-        (True, r'no joint states on /joint_states for 4'),
+        (True, r'no joint states on /joint_states for \d'),
         (False, r'nobody takes torques on /blf_dsc_controller/commands'),
     ],
 )
 def test_a_driver_that_is_gone_is_told(rig, takes, told, monkeypatch):
     """With somebody else who takes torques, or without."""
-    monkeypatch.setattr(
-        over_ros, '_PATIENCE', 4.0
-    )  # s; the arm's first state takes 3 s
     if takes:
         rig.ros.driver()
-    rig.at(500, lambda: rig.ros.kill(rig.arm))
+
+    def lose():
+        rig.ros.kill(rig.arm)
+        # of states, which are gone as well; and of the look at who takes the torques
+        monkeypatch.setattr(over_ros, '_PATIENCE', 1.0 if takes else 10.0)  # s
+        monkeypatch.setattr(over_ros, '_LOOK', 0.0)  # s
+
+    rig.during('move', lose)
     with pytest.raises(EndedError, match=told) as caught:
         rig.measured(NEAR)
     assert caught.value.end is End.LOST
@@ -185,7 +215,7 @@ def test_somebody_who_also_commands_ends_it(rig):
         rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
         rig.node.on_second()  # it looks every second
 
-    rig.at(500, command)
+    rig.during('move', command)
     with pytest.raises(EndedError, match='another node publishes torques on') as caught:
         rig.measured(NEAR)
     assert caught.value.end is End.STOPPED
@@ -217,7 +247,7 @@ def test_what_would_spoil_a_motion_ends_it(rig, name, told):
         else:
             rig.node.reset()
 
-    rig.at(500, do)
+    rig.during('move', do)
     with pytest.raises(EndedError, match=told):
         rig.measured(NEAR)
     rig.ros.until(lambda: calm(rig))
@@ -241,19 +271,16 @@ def test_somebody_who_came_between_two_runs_is_noticed(rig):
 
 def test_watchdog_relies_on_each_run(rig):
     watchdog = rig.ros.add(WatchdogNode)
-    watched = []
 
-    def look():
-        watched.append(watchdog.watchdog.watches)
-        if len(watched) == 1:
-            rig.at(5000, look)  # in the motion
-        else:
-            rig.robot.request_end()
+    def watches():
+        return watchdog.watchdog is not None and watchdog.watchdog.watches
 
-    rig.at(2000, look)  # in the move
+    def go_on():
+        rig.during('motion', rig.robot.request_end, watches)
+
+    rig.during('move', go_on, watches)
     with pytest.raises(EndedError, match='posture 1: ended on request'):
         rig.measured(NEAR)
-    assert watched == [True, True]
 
 
 def test_parameters_cannot_be_changed_meanwhile(rig):
@@ -265,7 +292,7 @@ def test_parameters_cannot_be_changed_meanwhile(rig):
 
 def test_it_says_who_is_missing(ros, tmp_path, monkeypatch):
     monkeypatch.setattr(over_ros, '_PATIENCE', 0.5)  # s
-    rig = Rig(ros, tmp_path)
+    rig = Rig(ros, tmp_path, clock=FakeClock())  # by which the arm never sends a state
     ros.kill(rig.arm)
     with pytest.raises(BlfDscError, match='nobody takes torques on /blf_dsc_contr'):
         rig.robot.wait()

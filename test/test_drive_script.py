@@ -286,17 +286,17 @@ def test_values_of_overrides_may_be_paths_and_arrays():
 
 def test_a_motion_is_waited_for_stopped_and_given_up(arm):
     start = arm.state.q
-    arm.move_to(start + STEP, speed=0.1, wait=False)
-    assert arm.is_moving
+    arm.move_to(start + STEP, speed=0.02, wait=False)
+    assert arm.is_moving  # for ten seconds
     arm.stop()
     assert rests(arm)
     with pytest.raises(MotionFailedError, match=r'pre-empted by stop\(\)|was stopped'):
         arm.wait()
-    arm.move_to(start + STEP, speed=0.1, wait=False)
+    arm.move_to(start + STEP, speed=0.02, wait=False)
     with pytest.raises(NotInTimeError, match=r'after 0.1 s: the arm has braked'):
         arm.wait(timeout=0.1)
     assert rests(arm)
-    arm.move_to(start + STEP, speed=0.1, wait=False)
+    arm.move_to(start + STEP, speed=0.02, wait=False)
     arm.move_to(start, speed=1.0)
     np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
 
@@ -304,7 +304,12 @@ def test_a_motion_is_waited_for_stopped_and_given_up(arm):
 def test_ctrl_c_in_a_motion_brakes_the_arm_also_where_no_block_ends(arm):
     """As in a notebook, whose kernel goes on."""
     start = arm.state.q
-    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    def interrupt():
+        wait_for(lambda: arm.is_moving)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
         arm.move_to(start + STEP, speed=0.02)
     wait_for(lambda: rests(arm))
@@ -409,9 +414,12 @@ def test_load_is_not_declared_to_drives_that_add_nothing(arm):
 
 
 def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
-    """80 N m for 0.1 s, against 600 N m/rad and a bound of 49 mrad."""
+    """80 N m for 0.1 s, against 600 N m/rad and a bound of 49 mrad.
+
+    In a motion of ten seconds, which has begun by then.
+    """
     push = {
-        'events.begin': [0.5],
+        'events.begin': [3.0],
         'events.duration': [0.1],
         'events.payload': [0.0],
         'events.torque': [0.0, 80.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -419,7 +427,7 @@ def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
     with drive(sim_plant=push) as arm:
         start = arm.state.q
         with pytest.raises(LoopEndedError, match=r'the controller stopped: .*recover'):
-            arm.move_to(start + STEP, speed=0.1)
+            arm.move_to(start + STEP, speed=0.02)
         assert 'the controller stopped' in arm.ended
         with pytest.raises(LoopEndedError, match='the controller stopped'):
             arm.stream(start)

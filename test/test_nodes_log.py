@@ -222,7 +222,7 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     assert np.abs(arm.plant.measure()[2:4]).max() < 0.05
     ros.run(arm, 500)
     law.close()
-    ros.until(lambda: not ros.spin(0.1))
+    ros.until(lambda: len(commands) == law.guard.journal.commands)
     gravity = dynamics((1.0, 0.32, 0.4), 9.8, arm.plant.measure()[:2], ZERO)[2]
     load = law.guard.safe_torque.load  # what it met on the way
     np.testing.assert_allclose(torques(commands)[-1], gravity + load, atol=0.05)

@@ -81,7 +81,7 @@ def run_lockstep(ros, plant, controller=None):
     samples = round(plant['duration'] * 1000) + 1
     ros.until(lambda: arm.finished and len(commands) >= samples)
     ros.until(lambda: len(joint_states) >= samples)
-    assert len(truth) == (samples - 1) // 10 + 1
+    ros.until(lambda: len(truth) == (samples - 1) // 10 + 1)
     return torques(commands), states(joint_states, arm.config.joints)[0]
 
 
@@ -330,6 +330,7 @@ def test_parameter_change_takes_effect_at_the_published_sample(ros):
     )
     assert response.result.successful, response.result.reason
     ros.until(lambda: arm.finished and len(commands) == 1001)
+    ros.until(lambda: len(changes) == 2)
 
     configured, change = [json.loads(message.data) for message in changes]
     assert configured['configured']

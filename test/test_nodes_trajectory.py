@@ -14,7 +14,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
-from ros_rig import JOINTS, PATIENCE
+from ros_rig import JOINTS, PATIENCE, activate, configure
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.messages import topics
@@ -197,9 +197,11 @@ def test_rejected_trajectory_changes_nothing(ros, monkeypatch, spoil, watchdog):
 
 def test_header_stamp_sets_the_start_of_a_trajectory(ros):
     """Before the start of the loop it is rejected."""
-    arm, law = ros.loop(None, BRISK)
+    arm, law = ros.loop({'autostart': False}, BRISK)
     sent = trajectory(JOINTS, 0.0, duration=0.1)
     assert 'not in command: starting' in send(ros, law, sent)
+    assert configure(ros, arm)
+    assert activate(ros, arm)
     ros.run(arm, 20)
     begin = law.guard.reference.start_stamp + 3 * SECOND
     sent = trajectory(JOINTS, 0.0, duration=0.1, stamp=begin)

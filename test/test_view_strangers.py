@@ -120,8 +120,9 @@ ODD = [
 class Sender:
     """Sends what a controller, an arm and strangers send to a view."""
 
-    def __init__(self, ros):
+    def __init__(self, ros, view):
         self.ros = ros
+        self._view = view
         self._publishers = {}
         self._now = 1.0
 
@@ -133,12 +134,23 @@ class Sender:
         return self._publishers[topic]
 
     def send(self, topic, message):
-        """Send a message, and wait until it is taken: the view looks 30 times a second."""
-        self.publisher(topic).publish(message)
-        self.ros.spin(0.1)
+        """Send a message, and wait until the view has taken it."""
+        taken = []
+        take = self._view._raw_subscriptions.take
 
-    def move(self, view, then=()):
-        """Move the arm, with messages after its own, until the page shows it."""
+        def take_and_note():
+            messages = take()
+            taken.extend(each for each in messages if each.handle is topic)
+            return messages
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(self._view._raw_subscriptions, 'take', take_and_note)
+            self.publisher(topic).publish(message)
+            self.ros.until(lambda: taken)
+
+    def move(self, view=None, then=()):
+        """Move the arm, with messages after its own, until the page of a view shows it."""
+        view = view or self._view
         self._now += 0.1
         angle = np.sin(self._now)
         moved = states(JOINTS, [angle, 0.2], self._now)
@@ -156,11 +168,11 @@ def watched():
     """A view of an arm with an open page, and who sends to it."""
     ros = RosRig()
     view = ros.add(ViewNode, port=18380)
-    sender = Sender(ros)
+    sender = Sender(ros, view)
     sender.send(topics.JOURNAL, text(configure()._asdict()))
     with visitor(view.page.server.get_port()):
         ros.until(view.page.server.get_clients)
-        sender.move(view)
+        sender.move()
         yield view, sender
     view.close()
     ros.close()
@@ -169,25 +181,25 @@ def watched():
 @pytest.mark.parametrize(('topic', 'message'), ODD)
 def test_view_survives_an_odd_message(watched, topic, message):
     """It shows the arm as before, for whoever has its page open."""
-    view, sender = watched
+    _, sender = watched
     sender.send(topic, message)
-    sender.move(view)
+    sender.move()
 
 
 def test_arm_moves_with_a_gripper_on_the_same_topic(watched):
     """Whose states follow each of the arm's."""
     view, sender = watched
-    sender.move(view, then=[states(['gripper'], [0.1])])
+    sender.move(then=[states(['gripper'], [0.1])])
     assert np.isfinite(view.past[-1].position).all()
 
 
 def test_arm_is_drawn_without_a_plant_that_cannot_be(ros):
     """The plant may come before the journal that says what it is of."""
     view = ros.add(ViewNode, port=18400)
-    sender = Sender(ros)
+    sender = Sender(ros, view)
     sender.send(topics.CHANGES, change(configured=True, parameters={'arm.l1': 1e308}))
     sender.send(topics.JOURNAL, text(configure()._asdict()))
-    sender.move(view)
+    sender.move()
     view.close()
 
 

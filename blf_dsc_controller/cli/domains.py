@@ -99,15 +99,18 @@ def claimed(domain: int) -> socket.socket | None:
 
 def strangers(domain: int) -> list[int]:
     """Return the UDP ports of a domain that other processes here have bound."""
+    own = _own_sockets()
+    return [port for port, inode in bound_ports(domain) if inode not in own]
+
+
+def bound_ports(domain: int) -> list[tuple[int, str]]:
+    """Return the UDP ports of a domain that are bound here, with the numbers of their sockets."""
     begin = _FIRST_PORT + _PORTS * domain
     ports = range(begin, begin + _PORTS)
-    own = _own_sockets()
-    return [
-        port for port, inode in _bound_ports() if port in ports and inode not in own
-    ]
+    return [each for each in _all_bound_ports() if each[0] in ports]
 
 
-def _bound_ports() -> Iterator[tuple[int, str]]:
+def _all_bound_ports() -> Iterator[tuple[int, str]]:
     """Yield each bound UDP port with the number of its socket."""
     for table in _TABLES:
         path = Path('/proc/net') / table
