@@ -238,8 +238,11 @@ class WatchdogNode(PlainNode):
             elif message.handle is topics.COMMANDS and not self._encoder.has_layout(
                 raw
             ):
-                self._commands.decode(raw)
-                watchdog.take_torque(self._commands.values, now)
+                size = self._commands.decode(raw)
+                torque = self._commands.values
+                if size != torque.size:  # drives apply none of it
+                    raise MessageError(f'{size} torques for {torque.size} joints')
+                watchdog.take_torque(torque, now)
         except MessageError as error:
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
 
