@@ -198,7 +198,7 @@ def locate(given: str | Path) -> Path:
     )
 
 
-def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
+def read(path: str | Path, based: tuple[Path, ...] = ()) -> Sequence[Section]:
     """Read the sections of a parameter file.
 
     ConfigurationError names the file and the line.
@@ -216,12 +216,12 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
         if base is None:
             return sections
         below = _based_on(str(base), Path(path).parent)
-        above = (*based, str(path))
+        above = (*based, Path(path).resolve())
     except OSError as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:
         raise ConfigurationError(error.problems, str(path)) from error
-    if str(below) in above:
+    if below.resolve() in above:
         problem = (
             f'monte_carlo: base: {base!r} leads back to a file that is based on it'
         )
