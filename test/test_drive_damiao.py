@@ -36,7 +36,7 @@ from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.ticks import Ticks
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Status
 from blf_dsc_controller.motors.frame import Frame
@@ -247,6 +247,27 @@ def test_motors_that_cannot_be_driven_are_named(
     monkeypatch.setattr(LockstepDriver, 'patience', 2.0)
     with pytest.raises(DriverError, match=text):
         made(arrange, **given)
+
+
+@pytest.mark.parametrize(
+    ('given', 'text'),
+    [
+        ({'motor_ids': [1, 2, 2]}, 'motor_ids: got [1, 2, 2], but 2 is that of two'),
+        (
+            {'feedback_ids': [17, 9, 17]},
+            'feedback_ids: got [17, 9, 17], but 17 is that',
+        ),
+        ({'motor_ids': [1, 17]}, 'motor_ids: got 17, with which another one answers'),
+        (
+            {'motor_ids': [1, 2], 'feedback_ids': [3, 1]},
+            'motor_ids: got 1, with which another one answers',
+        ),
+    ],
+)
+def test_identifier_that_stands_for_two_motors_is_refused(given, text):
+    """Else one would seem not to answer, or another program to command them."""
+    with pytest.raises(ConfigurationError, match=re.escape(text)):
+        build(DriveConfig, given)
 
 
 TURNED = {
