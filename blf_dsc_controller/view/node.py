@@ -13,9 +13,10 @@ from collections import deque
 from typing import Any
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import VIEW, ViewConfig
+from blf_dsc_controller.configuration.nodes import VIEW
 from blf_dsc_controller.configuration.received import without_files
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.side_nodes import ViewConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
