@@ -255,6 +255,11 @@ class ControllerConfig(ArmConfig):
                 f'feedback.gain alone, with a feedback.damping_rate of {feedback.damping_rate:g} '
                 '1/s: set one of them to 0'
             )
+        yield from self._joint_gain_problems()
+
+    def _joint_gain_problems(self) -> Iterator[str]:
+        """Check that stiffness and damping of joints are both given, and act."""
+        feedback = self.feedback
         given = bool(feedback.joint_stiffness), bool(feedback.joint_damping)
         acts = feedback.inertia == 'none' and self.model == 'urdf'
         if any(given) and self.law in OWN and not acts:
