@@ -197,6 +197,13 @@ def test_urdf_of_two_links_is_the_same_arm():
 
 
 @pytest.mark.parametrize(
+def test_masses_of_two_links_are_at_their_ends_to_the_last_digit():
+    lengths, masses = (1.0 / 3.0, 2.0 / 3.0), (0.6, 0.45)
+    chain = read_chain(urdf(('a', 'b'), lengths, masses), '', 'tip', ('a', 'b'))
+    centres = chain.inertias[:, 1] / masses
+    np.testing.assert_allclose(centres, lengths, rtol=1e-15)
+
+
     'arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)]
 )
 def test_two_links_are_the_arm_of_section_iv(arm):
