@@ -105,16 +105,7 @@ def elastic(
     """
     joint, actuator = config.joint, config.actuator
     n, K = len(config.joints), stiffness_of(config)
-    missing = [
-        name
-        for name, stiffness, rotor in zip(config.joints, K, rotors, strict=True)
-        if stiffness > 0.0 and rotor <= 0.0
-    ]
-    if missing:
-        raise BlfDscError(
-            f'joint.stiffness: {", ".join(missing)} has no inertia on the side of the '
-            'motor: give truth.rotor_inertia'
-        )
+    _check_motors(config, rotors)
     M, mobility = _at_start(config, arm)
     motors = np.where(K > 0.0, 1.0 / np.where(K > 0.0, rotors, 1.0), 0.0)
     free = np.diag(mobility)[-n:]  # of each link, with all others free
@@ -138,6 +129,19 @@ def elastic(
     )
     mounts = mounts_of(config)
     return Elasticity(steps, blocks, n, mounts, springs, _base_of(config, M))
+
+
+def _check_motors(config: PlantConfig, rotors: np.ndarray) -> None:
+    """Raise BlfDscError if a spring has no motor, with an inertia (n,) [kg m^2]."""
+    springs = zip(config.joints, stiffness_of(config), rotors, strict=True)
+    missing = [
+        name for name, stiffness, rotor in springs if stiffness > 0.0 and rotor <= 0.0
+    ]
+    if missing:
+        raise BlfDscError(
+            f'joint.stiffness: {", ".join(missing)} has no inertia on the side of the '
+            'motor: give truth.rotor_inertia'
+        )
 
 
 def _at_start(config: PlantConfig, arm: RigidArm) -> tuple[np.ndarray, np.ndarray]:
