@@ -152,7 +152,7 @@ class ControllerConfig(ArmConfig):
         if self.model == 'urdf':
             base = parameters_of(self.robot, self.robot.chain(self.joints))
             return None, base.model.p
-        model = arm_model(self.model, self.arm.l1, self.arm.gravity)
+        model = arm_model(self.arm.l1, self.arm.gravity)
         return model.n, model.p
 
     def _weighing_problems(self) -> Iterator[str]:
