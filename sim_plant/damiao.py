@@ -42,7 +42,8 @@ class DamiaoArm:
     Attributes:
         arm: the arm.
         status: what each motor says of itself.
-        modes: mode of each motor, and its time-out [50 us], which only says so.
+        modes: mode of each motor.
+        timeouts: time-out of each motor [50 us], which it tells and does not keep.
         mute: joints whose motors do not answer.
     """
 
@@ -101,6 +102,8 @@ class DamiaoArm:
         if message is None:
             return False
         data = bytes(message.data)
+        if len(data) != damiao.LENGTH:
+            return True
         if message.arbitration_id == damiao.TO_ALL:
             self._answer_request(data)
         elif 1 <= message.arbitration_id <= self._n:
@@ -159,7 +162,7 @@ class DamiaoArm:
             return
         if request == damiao.REFRESH:
             self._send_state(joint)
-        elif request == damiao.READ:
+        elif request == damiao.READ and data[3] in set(Register):
             register = Register(data[3])
             value = {
                 Register.TIMEOUT: self.timeouts[joint],
