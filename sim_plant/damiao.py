@@ -27,9 +27,8 @@ from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Limits, Register, StateCodes, Status
 from blf_dsc_controller.motors.frame import Frame
 from blf_dsc_controller.motors.mounting import Mounting
-from sim_plant.motors import MotorPlant
+from sim_plant.motors import IN_REAL_TIME, MotorPlant
 
-_RATE = 2000.0  # Hz, of motors in real time, in Python
 _PATIENCE = 0.05  # s, after which it is seen that the bus is closed
 _AT_ONCE = 0.002  # s, in which no frame is answered
 _LATEST = 0.2  # s behind the clock, at most
@@ -52,7 +51,7 @@ class DamiaoArm:
         bus: can.BusABC,
         config: PlantConfig,
         limits: Sequence[Limits],
-        rate: float = _RATE,
+        rate: float = IN_REAL_TIME,
         mounting: Mounting | None = None,
     ) -> None:
         """Put the motors of a configured arm on a bus, disabled, as 1, 2, ..."""

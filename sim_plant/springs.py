@@ -27,7 +27,8 @@ _STEP = 2.5e-5  # s, longest step of springs and motors
 _PHASE = 0.3
 _DECAY = 0.5  # of a velocity by friction in a step
 _POSTURES = 2.0  # times the square of the highest frequency at the start
-_MOST_STEPS = 1000  # in a sample
+MOST_STEPS = 1000
+"""Steps of an integrator in a sample, at most."""
 
 
 class Elasticity(NamedTuple):
@@ -113,7 +114,7 @@ def elastic(
     fastest = _highest_frequency(config, mobility, motors)
     rate = float((slope * np.where(K > 0.0, motors, free)).max())
     step = min(_STEP, _PHASE / max(fastest, 1.0), _DECAY / max(rate, 1.0))
-    steps = min(math.ceil(config.sample_time / step), _MOST_STEPS)
+    steps = min(math.ceil(config.sample_time / step), MOST_STEPS)
     steps = math.ceil(steps / blocks)
     half = 0.5 * config.sample_time / (steps * blocks)
     springs = Springs(
