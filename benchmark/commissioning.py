@@ -89,9 +89,10 @@ from blf_dsc_controller.commissioning.commissioning import Commissioned, commiss
 from blf_dsc_controller.commissioning.own_loop import Commissioning, Measured
 from blf_dsc_controller.commissioning.planned import measuring_gains, postures_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
-from blf_dsc_controller.configuration.nodes import LoopConfig, RecorderConfig
+from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
+from blf_dsc_controller.configuration.side_nodes import RecorderConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import Study, draw, plant_with

@@ -27,9 +27,8 @@ from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Limits, Register, StateCodes, Status
 from blf_dsc_controller.motors.frame import Frame
 from blf_dsc_controller.motors.mounting import Mounting
-from sim_plant.motors import MotorPlant
+from sim_plant.motors import IN_REAL_TIME, MotorPlant
 
-_RATE = 2000.0  # Hz, of motors in real time, in Python
 _PATIENCE = 0.05  # s, after which it is seen that the bus is closed
 _AT_ONCE = 0.002  # s, in which no frame is answered
 _LATEST = 0.2  # s behind the clock, at most
@@ -42,7 +41,8 @@ class DamiaoArm:
     Attributes:
         arm: the arm.
         status: what each motor says of itself.
-        modes: mode of each motor, and its time-out [50 us], which only says so.
+        modes: mode of each motor.
+        timeouts: time-out of each motor [50 us], which it tells and does not keep.
         mute: joints whose motors do not answer.
     """
 
@@ -51,7 +51,7 @@ class DamiaoArm:
         bus: can.BusABC,
         config: PlantConfig,
         limits: Sequence[Limits],
-        rate: float = _RATE,
+        rate: float = IN_REAL_TIME,
         mounting: Mounting | None = None,
     ) -> None:
         """Put the motors of a configured arm on a bus, disabled, as 1, 2, ..."""
@@ -101,6 +101,8 @@ class DamiaoArm:
         if message is None:
             return False
         data = bytes(message.data)
+        if len(data) != damiao.LENGTH:
+            return True
         if message.arbitration_id == damiao.TO_ALL:
             self._answer_request(data)
         elif 1 <= message.arbitration_id <= self._n:
@@ -159,7 +161,7 @@ class DamiaoArm:
             return
         if request == damiao.REFRESH:
             self._send_state(joint)
-        elif request == damiao.READ:
+        elif request == damiao.READ and data[3] in set(Register):
             register = Register(data[3])
             value = {
                 Register.TIMEOUT: self.timeouts[joint],

@@ -29,6 +29,9 @@ Vector = NDArray[np.float64]
 RATE = 10_000.0
 """Rate of the motors' own loop [Hz]."""
 
+IN_REAL_TIME = 2000.0
+"""Rate of simulated motors in real time [Hz]: Python is no faster."""
+
 
 class MotorPlant:
     """A simulated arm with such motors: call `measure()`, then `step(frame)`, in turn.

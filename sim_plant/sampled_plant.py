@@ -49,7 +49,7 @@ class Plant:
         settings: PlantSettings,
         position: ArrayLike,
         velocity: ArrayLike,
-        seed: int = 0,
+        seed: int,
     ) -> None:
         self.arm = settings.arm
         self.settings = pack(settings)

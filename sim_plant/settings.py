@@ -34,6 +34,7 @@ from sim_plant.layout import (
     PlantSettings,
 )
 from sim_plant.springs import (
+    MOST_STEPS,
     Elasticity,
     apparent_rotors,
     elastic,
@@ -45,7 +46,6 @@ from sim_plant.springs import (
 )
 
 _RESOLVED = 1.5  # decay within a step; the integrator is stable up to 3.3
-_MOST_STEPS = 1000
 _CURRENT = 0.1  # A/N m, of motors with their gears, roughly that of cobots
 
 
@@ -188,7 +188,7 @@ def _steps_of(config: PlantConfig, arm: Arm, slope: np.ndarray) -> int:
     for i, torque in enumerate(np.eye(n)):
         arm.accelerate(0.0, position, rest, torque, ddq[1])
         rate = max(rate, float(slope[i] * (ddq[1, i] - ddq[0, i])))
-    return min(max(1, math.ceil(config.sample_time * rate / _RESOLVED)), _MOST_STEPS)
+    return min(max(1, math.ceil(config.sample_time * rate / _RESOLVED)), MOST_STEPS)
 
 
 def _schedule_of(config: PlantConfig) -> Events:

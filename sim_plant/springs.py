@@ -27,7 +27,8 @@ _STEP = 2.5e-5  # s, longest step of springs and motors
 _PHASE = 0.3
 _DECAY = 0.5  # of a velocity by friction in a step
 _POSTURES = 2.0  # times the square of the highest frequency at the start
-_MOST_STEPS = 1000  # in a sample
+MOST_STEPS = 1000
+"""Steps of an integrator in a sample, at most."""
 
 
 class Elasticity(NamedTuple):
@@ -105,16 +106,7 @@ def elastic(
     """
     joint, actuator = config.joint, config.actuator
     n, K = len(config.joints), stiffness_of(config)
-    missing = [
-        name
-        for name, stiffness, rotor in zip(config.joints, K, rotors, strict=True)
-        if stiffness > 0.0 and rotor <= 0.0
-    ]
-    if missing:
-        raise BlfDscError(
-            f'joint.stiffness: {", ".join(missing)} has no inertia on the side of the '
-            'motor: give truth.rotor_inertia'
-        )
+    _check_motors(config, rotors)
     M, mobility = _at_start(config, arm)
     motors = np.where(K > 0.0, 1.0 / np.where(K > 0.0, rotors, 1.0), 0.0)
     free = np.diag(mobility)[-n:]  # of each link, with all others free
@@ -122,7 +114,7 @@ def elastic(
     fastest = _highest_frequency(config, mobility, motors)
     rate = float((slope * np.where(K > 0.0, motors, free)).max())
     step = min(_STEP, _PHASE / max(fastest, 1.0), _DECAY / max(rate, 1.0))
-    steps = min(math.ceil(config.sample_time / step), _MOST_STEPS)
+    steps = min(math.ceil(config.sample_time / step), MOST_STEPS)
     steps = math.ceil(steps / blocks)
     half = 0.5 * config.sample_time / (steps * blocks)
     springs = Springs(
@@ -138,6 +130,19 @@ def elastic(
     )
     mounts = mounts_of(config)
     return Elasticity(steps, blocks, n, mounts, springs, _base_of(config, M))
+
+
+def _check_motors(config: PlantConfig, rotors: np.ndarray) -> None:
+    """Raise BlfDscError if a spring has no motor, with an inertia (n,) [kg m^2]."""
+    springs = zip(config.joints, stiffness_of(config), rotors, strict=True)
+    missing = [
+        name for name, stiffness, rotor in springs if stiffness > 0.0 and rotor <= 0.0
+    ]
+    if missing:
+        raise BlfDscError(
+            f'joint.stiffness: {", ".join(missing)} has no inertia on the side of the '
+            'motor: give truth.rotor_inertia'
+        )
 
 
 def _at_start(config: PlantConfig, arm: RigidArm) -> tuple[np.ndarray, np.ndarray]:

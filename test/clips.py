@@ -25,7 +25,7 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.analysis.panels import BLUE, COLOURS, MUTED, ORANGE
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.main import main as blf_dsc
-from blf_dsc_controller.view.page import ShownArm, arm_of
+from blf_dsc_controller.view.shown_arm import ShownArm, arm_of
 
 DOC = Path('doc')
 SPEED = 2.0  # of the clip, relative to the arm

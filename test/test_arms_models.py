@@ -17,6 +17,7 @@ from closed_loop_case import MODEL
 from plants import ARM
 from random_arm import (
     ARMS,
+    GRAVITY,
     PANDA,
     PANDA_CHAIN,
     PANDA_TEXT,
@@ -183,10 +184,10 @@ def test_urdf_of_two_links_is_the_same_arm():
     lengths, masses = (1.1, 0.7), (0.6, 0.45)
     chain = read_chain(urdf(('a', 'b"<&'), lengths, masses), '', 'tip', ('a', 'b"<&'))
     arm = PointMassArm(*lengths, *masses, g=9.81)
-    ours = arm_model('two_link', l1=arm.l1, gravity=arm.g)
+    ours = arm_model(l1=arm.l1, gravity=arm.g)
     P = np.empty(3)
     arm.fill_parameters(0.0, P)
-    theirs = serial_chain(chain)
+    theirs = serial_chain(chain, GRAVITY)
     phi = np.column_stack((chain.inertias, np.zeros(2))).ravel()
     states = np.random.default_rng(0).normal(size=(4, 20, 2))
     found = regressors_at(ours, *states) @ P
@@ -196,12 +197,19 @@ def test_urdf_of_two_links_is_the_same_arm():
     np.testing.assert_allclose(frames(chain, np.zeros(2))[-1][:3, 3], (1.8, 0.0, 0.0))
 
 
+def test_masses_of_two_links_are_at_their_ends_to_the_last_digit():
+    lengths, masses = (1.0 / 3.0, 2.0 / 3.0), (0.6, 0.45)
+    chain = read_chain(urdf(('a', 'b'), lengths, masses), '', 'tip', ('a', 'b'))
+    centres = chain.inertias[:, 1] / masses
+    np.testing.assert_allclose(centres, lengths, rtol=1e-15)
+
+
 @pytest.mark.parametrize(
     'arm', [ARM, PointMassArm(l1=0.7, l2=1.1, m1=1.3, m2=0.4, g=9.81)]
 )
 def test_two_links_are_the_arm_of_section_iv(arm):
     """And of the tests' plain law, and of the simulated arm: M ddq + C dq + G = tau."""
-    model = arm_model('two_link', l1=arm.l1, gravity=arm.g)
+    model = arm_model(l1=arm.l1, gravity=arm.g)
     P = np.empty(3)
     arm.fill_parameters(0.0, P)
     for random in map(np.random.default_rng, range(20)):
@@ -283,10 +291,10 @@ def test_base_parameters_agree_with_the_literature():
     Rotors except at the base.
     """
     for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
-        names = base_parameters(chain).model.parameter_names
+        names = base_parameters(chain, GRAVITY).model.parameter_names
         found = sum(name.startswith('rotor') for name in names)
         assert (len(names) - found, found) == (inertial, rotors)
-    base = base_parameters(PANDA_CHAIN)
+    base = base_parameters(PANDA_CHAIN, GRAVITY)
     sums = dict(zip(base.model.parameter_names, base.combinations, strict=True))
     assert sums['Ixx7'] == 'Ixx7 - Iyy7'
     assert sums['m*cx7'] == 'm*cx7'
@@ -321,7 +329,7 @@ def test_prior_covers_heavier_links_moved_centres_and_the_payload(chain):
 
 
 def test_prior_without_payload_is_tighter():
-    base = base_parameters(UR5E_CHAIN)
+    base = base_parameters(UR5E_CHAIN, GRAVITY)
     loaded, empty = (
         prior_factor(UR5E_CHAIN, base, load, np.full(6, 0.02)) for load in (5.0, 0.0)
     )

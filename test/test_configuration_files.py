@@ -27,7 +27,6 @@ from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     LoopConfig,
-    RecorderConfig,
     dump,
     format_value,
     ignored_sections,
@@ -39,6 +38,7 @@ from blf_dsc_controller.configuration.nodes import (
 )
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
+from blf_dsc_controller.configuration.side_nodes import RecorderConfig
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.adaptation import GRADIENT

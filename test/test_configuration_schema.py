@@ -12,9 +12,10 @@ import pytest
 from blf_dsc_controller.configuration import schema
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_gains import Paper
-from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig, load_loop
+from blf_dsc_controller.configuration.nodes import NODES, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
+from blf_dsc_controller.configuration.side_nodes import RecorderConfig
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import state

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from markdown_it import MarkdownIt
 from motor_arm import loop_of
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
@@ -34,9 +36,10 @@ from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.drive.ticks import Ticks
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.motors import damiao
-from blf_dsc_controller.motors.damiao import Status
+from blf_dsc_controller.motors.damiao import Register, Status
 from blf_dsc_controller.motors.frame import Frame
 from sim_plant.damiao import DamiaoArm
 
@@ -247,6 +250,27 @@ def test_motors_that_cannot_be_driven_are_named(
         made(arrange, **given)
 
 
+@pytest.mark.parametrize(
+    ('given', 'text'),
+    [
+        ({'motor_ids': [1, 2, 2]}, 'motor_ids: got [1, 2, 2], but 2 is that of two'),
+        (
+            {'feedback_ids': [17, 9, 17]},
+            'feedback_ids: got [17, 9, 17], but 17 is that',
+        ),
+        ({'motor_ids': [1, 17]}, 'motor_ids: got 17, with which another one answers'),
+        (
+            {'motor_ids': [1, 2], 'feedback_ids': [3, 1]},
+            'motor_ids: got 1, with which another one answers',
+        ),
+    ],
+)
+def test_identifier_that_stands_for_two_motors_is_refused(given, text):
+    """Else one would seem not to answer, or another program to command them."""
+    with pytest.raises(ConfigurationError, match=re.escape(text)):
+        build(DriveConfig, given)
+
+
 TURNED = {
     'motor_directions': [1, -1, 1, -1, -1, 1, -1],
     'motor_offsets': [0.3, -0.2, 0.0, 1.0, -0.7, 0.05, 2.0],  # rad
@@ -441,3 +465,38 @@ def test_joints_are_shown_without_a_torque_and_a_turn_too_much_is_told(
     assert told[0].endswith('0.100 of -2.62 to 3.14 rad')
     assert 'outside: +6.283 rad, a turn, would be within' in told[1]
     assert 'outside: -6.283 rad, a turn, would be within' in told[4]
+
+
+def test_joint_that_slides_is_shown_in_metres_and_cannot_be_a_turn_off():
+    text = (blf.share_folder() / 'config/two_link.urdf').read_text()
+    text = text.replace('"revolute"', '"prismatic"').replace(
+        '"continuous"', '"prismatic"'
+    )
+    chain = read_chain(text, '', '', ())
+    joint = chain.joints[0]._replace(lower=-4.0, upper=4.0)
+    chain = replace(chain, joints=(joint,))
+    assert list(show_joints.lines(chain, [0.1])) == [
+        f'{joint.name:24}    0.100 of -4.00 to 4.00 m'
+    ]
+    (outside,) = show_joints.lines(chain, [7.0])
+    assert outside.endswith('of -4.00 to 4.00 m: outside')
+
+
+def test_simulated_motors_answer_no_question_that_they_do_not_know():
+    """Of a tool on the same bus, such as one that scans all registers."""
+    with (
+        can.Bus(interface='virtual', channel='asked') as bus,
+        can.Bus(interface='virtual', channel='asked') as tool,
+    ):
+        motors = DamiaoArm(bus, loop_of(0.004).plant, lockstep_damiao.LIMITS)
+        unknown = damiao.request_data(1, damiao.READ, 99)
+        known = damiao.request_data(1, damiao.READ, Register.MODE)
+        for data in (unknown, b'', known[:3], known):
+            frame = can.Message(
+                arbitration_id=damiao.TO_ALL, data=data, is_extended_id=False
+            )
+            tool.send(frame)
+            assert motors.serve(1.0)
+        answer = tool.recv(1.0)
+        assert damiao.reading_of(bytes(answer.data), 1, Register.MODE) == damiao.MIT
+        assert tool.recv(0.0) is None

@@ -8,6 +8,7 @@ the test's own nodes run, and the process of the topics.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import threading
@@ -19,6 +20,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+import rclpy
 from plant_driver import PlantDriver
 from rclpy.duration import Duration
 from recorded_run import messages_of
@@ -31,12 +33,16 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive import ros_topics
+from blf_dsc_controller.drive.beside import LinkLog
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages import topic_link, topics
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.topic_link import KINDS, STOP
+from blf_dsc_controller.nodes import topics_process
+from blf_dsc_controller.nodes.topics_process import LoopTopics
 
 HOLD = {'safety.torque': 'hold_gravity', 'limits.acceleration': [6.0, 6.0]}
 CONFIG = change(blf.load_loop('recommended').controller, HOLD)
@@ -227,6 +233,48 @@ def test_ros_that_does_not_start_is_an_error_with_a_remedy(monkeypatch, capfd):
 def test_a_namespace_without_topics_is_an_error(capsys):
     assert main(['drive', '--robot', 'plant', '--namespace', 'left']) == 1
     assert '--namespace is for the topics, which need --ros' in capsys.readouterr().err
+
+
+@pytest.fixture
+def loop_topics(ros):
+    """Return the topics of a loop, in this process, and the loop's end of their link."""
+    ours, theirs = linked()
+    node = ros.keep(rclpy.create_node('blf_dsc_controller', context=ros.context))
+    return LoopTopics(node, theirs, [KINDS[topics.COMMANDS]], JOINTS), ours
+
+
+def test_loop_logs_at_any_level_in_any_order(loop_topics, capfd):
+    """As of a trajectory that is followed, one that is not, and a stop after it."""
+    beside, loop = loop_topics
+    log = LinkLog(loop)
+    log.info('followed')
+    log.warning('rejected')
+    log.info('braking')
+    log.error('recorded in part')
+    loop.flush()
+    for kind, content in beside._link.messages():
+        beside.take(kind, content)
+    out, err = capfd.readouterr()
+    logged = re.findall(r'^\[(\w+)\].*: (.+)$', out + err, re.MULTILINE)
+    assert logged == [
+        ('INFO', 'followed'),
+        ('WARN', 'rejected'),
+        ('INFO', 'braking'),
+        ('ERROR', 'recorded in part'),
+    ]
+
+
+def test_late_answer_to_a_stop_is_none_to_the_next(loop_topics, monkeypatch):
+    """Else a loop that hangs since then would seem to brake."""
+    beside, loop = loop_topics
+    monkeypatch.setattr(topics_process, '_PATIENCE', 0.05)
+    silent = 'no answer from the loop: use the emergency stop'
+    assert beside._stop() == silent
+    loop.put(STOP, topic_link.encode('braking for 1 s'))
+    loop.flush()
+    for kind, content in beside._link.messages():
+        beside.take(kind, content)
+    assert beside._stop() == silent
 
 
 def linked(most=1 << 20):

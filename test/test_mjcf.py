@@ -6,7 +6,9 @@ What no serial chain has is refused by name.
 
 from __future__ import annotations
 
+import re
 import sys
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -557,3 +559,11 @@ def test_a_urdf_can_say_the_same_and_is_checked(old, new, problem):
     text = robot.urdf.replace(old, new)
     with pytest.raises(ConfigurationError, match=problem):
         build(PlantConfig, {'robot.urdf': text, 'robot.tip': 'tool'})
+
+
+def test_space_before_the_value_of_an_attribute_is_no_matter():
+    """XML allows it: an armature that is not read would be guessed."""
+    robot = build(PlantConfig, {'robot.urdf': arm(), 'robot.tip': 'tool'}).robot
+    spaced = re.sub(r'(armature|gravity)=', r'\1 = ', robot.urdf)
+    given = {'robot.urdf': spaced, 'robot.tip': 'tool'}
+    assert build(PlantConfig, given).robot == replace(robot, urdf=spaced)

@@ -292,6 +292,8 @@ def test_study_may_be_based_on_a_preset(tmp_path):
         ConfigurationError, match=r'base: .*study.yaml. leads back to a file'
     ):
         study(tmp_path, text.replace(str(base), str(tmp_path / 'study.yaml')))
+    with pytest.raises(ConfigurationError, match=r'leads back to a file'):
+        study(tmp_path, text.replace(str(base), f'../{tmp_path.name}/study.yaml'))
 
 
 def test_study_may_be_based_on_a_file_beside_it(tmp_path, monkeypatch):

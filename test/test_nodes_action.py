@@ -549,10 +549,16 @@ def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd)
 
 
 def test_process_of_the_action_ends_with_its_node(own_loop, capfd):
-    """Without a word, and not by Ctrl-C, which a terminal sends it, too: goals still end."""
+    """Without a word, and not by a signal that its whole group gets: goals still end.
+
+    A terminal sends Ctrl-C to all processes, systemd SIGTERM.
+    """
     _, law, client = own_loop
     process = law.action._process._process
     os.kill(process.pid, signal.SIGINT)
+    os.kill(process.pid, signal.SIGTERM)
+    client.ros.spin(0.3)
+    assert process.poll() is None
     assert client.result(client.follow(point(NEAR, 0.5)))[0] == SUCCEEDED
     client.ros.kill(law)
     assert process.returncode == 0

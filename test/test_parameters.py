@@ -24,9 +24,10 @@ from rclpy.qos import ReliabilityPolicy
 from std_msgs.msg import String
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import NODES, RecorderConfig
+from blf_dsc_controller.configuration.nodes import NODES
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten, parameters
+from blf_dsc_controller.configuration.side_nodes import RecorderConfig
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.topics import Quality

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio
 import pytest
 from plants import PERIOD, QUIET, commands, plant, true_parameters
-from random_arm import CONFIG
+from random_arm import CONFIG, GRAVITY
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import pseudo_inertia
@@ -64,7 +64,7 @@ def test_urdf_and_tip_are_a_complete_configuration_which_given_parameters_overri
 def test_truth_contains_the_base_parameters_with_payload_and_factors():
     config = panda_config({'events.begin': [0.5], 'events.payload': [2.0]})
     chain = config.robot.chain(config.joints)
-    base = base_parameters(chain)
+    base = base_parameters(chain, GRAVITY)
     rotors = config.robot.rotors(chain)
     expected = base.of(chain.inertias, rotors)
     np.testing.assert_allclose(true_parameters(config, 0.4), expected, rtol=1e-12)

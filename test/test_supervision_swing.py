@@ -147,8 +147,8 @@ def test_what_a_swing_means_is_said_once_in_a_stop():
     """In an overloaded loop all seven joints of a Panda swing, one after the other."""
     names = SwingNames(('a', 'b', 'c'))
     names.begin()
-    assert 'robot.rotor_inertia' in names.text(np.array([False, True, False]))
-    assert names.text(np.array([False, True, False])) == ''
-    assert names.text(np.array([True, True, True])) == "joints 'a', 'c' swing, too"
+    assert 'robot.rotor_inertia' in names.name(np.array([False, True, False]))
+    assert names.name(np.array([False, True, False])) == ''
+    assert names.name(np.array([True, True, True])) == "joints 'a', 'c' swing, too"
     names.begin()
-    assert 'robot.rotor_inertia' in names.text(np.array([False, False, True]))
+    assert 'robot.rotor_inertia' in names.name(np.array([False, False, True]))

@@ -42,10 +42,13 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.view import page as pages
+from blf_dsc_controller.view.events import Events
 from blf_dsc_controller.view.model_error import shares
 from blf_dsc_controller.view.node import ViewNode
-from blf_dsc_controller.view.page import Page, ShownArm, Snapshot, known_model
+from blf_dsc_controller.view.page import Page
 from blf_dsc_controller.view.plant_events import plant_events
+from blf_dsc_controller.view.shown_arm import ShownArm, known_model
+from blf_dsc_controller.view.snapshot import Snapshot
 from blf_dsc_controller.view.thinned_run import KEPT, ThinnedRun
 
 HOST = '127.0.0.1'
@@ -300,6 +303,19 @@ def test_view_of_an_offline_run_is_rejected_before_the_run(tmp_path):
     assert not out.exists()
 
 
+def test_learning_is_an_event_where_it_begins_and_where_it_restarts():
+    events = Events()
+    for time, latched in enumerate((np.nan, 0.0, 0.0, 1.0, 1.0, np.nan, 0.0, 1.0, 0.0)):
+        events.note_latch(float(time), latched)
+    events.forget_latch()  # of another law
+    events.note_latch(9.0, 1.0)
+    assert list(events.listed) == [
+        (3.0, 'learning', 'excited window latched'),
+        (7.0, 'learning', 'excited window latched'),
+        (8.0, 'learning', 'restarts: the arm has changed'),
+    ]
+
+
 # Live, of a running loop in lock-step.
 
 WAITING = 'waiting for a controller (/blf_dsc_controller/journal)'
@@ -366,7 +382,7 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     assert np.isfinite(view.past[-1].error).all()
     states = view.create_publisher(JointState, 'joint_states', 1)
     state = JointState(name=['joint1', 'joint2'], position=[0.1, 0.2])
-    state.header.stamp.sec = view.sampled // 10**9 + 2
+    state.header.stamp.sec = view.samples.sampled // 10**9 + 2
     ros.until(lambda: states.publish(state) or view.past[-1].position[0] == 0.1)
     assert np.isnan(view.past[-1].error).all()
     view.close()

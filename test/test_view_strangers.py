@@ -31,7 +31,8 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.nodes.endpoints import RawMessage
 from blf_dsc_controller.view.node import ViewNode
-from blf_dsc_controller.view.page import Page, ShownArm
+from blf_dsc_controller.view.page import Page
+from blf_dsc_controller.view.shown_arm import ShownArm
 
 JOINTS = ['joint1', 'joint2']
 NAN, INF = float('nan'), float('inf')

@@ -32,7 +32,7 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.nodes import watchdog_node
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.endpoints import RawSubscriptions
+from blf_dsc_controller.nodes.endpoints import RawMessage, RawSubscriptions
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.supervision.model_torque import model_torque
@@ -407,6 +407,18 @@ def test_watchdog_in_command_stands_down_for_a_torque_alone(ros, event):
     loop.note(event[0], **event[1])
     np.testing.assert_allclose(loop.torque(), held, atol=0.1)
     assert loop.watchdog.takeovers == 1
+
+
+def test_torques_for_other_joints_are_none_of_the_controller(ros):
+    """The drives apply none of them, so that the arm would be left alone."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    held = loop.torque()
+    raw = Float64MultiArrayEncoder(3).encode(np.zeros(3))
+    message = RawMessage(topics.COMMANDS, raw, 0, 0, 0)
+    loop.node._take(loop.watchdog, message, loop.clock() * 1e-9)
+    assert loop.watchdog.active
+    np.testing.assert_allclose(loop.torque(), held, atol=0.1)
 
 
 def test_watchdog_watches_once_it_has_seen_a_state_and_a_torque(ros):

@@ -76,9 +76,7 @@ class BaseParameters:
 
 
 @functools.lru_cache(maxsize=16)
-def base_parameters(
-    chain: Chain, gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
-) -> BaseParameters:
+def base_parameters(chain: Chain, gravity: tuple[float, ...]) -> BaseParameters:
     """Return the base parameters of a chain; gravity [m/s^2] is in its base."""
     full = serial_chain(chain, gravity)
     kept, X = independent_columns(_regressor_at_random(full), _DEPENDENT)

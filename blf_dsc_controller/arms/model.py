@@ -3,9 +3,9 @@
 
 An arm is a `NamedTuple` of the geometry that its regressors need (numbers and arrays),
 with the properties and methods of `ArmModel`.  Kernels call the methods as Python does:
-only those of the type that a kernel receives are compiled into it.  To add an arm,
-write its class in a file of its own, and add it to `arm_model` and `compile_methods`
-below and to the choices of the parameter `model`.
+only those of the type that a kernel receives are compiled into it.  An arm that no URDF
+describes has a class in a file of its own, which `arm_model` returns, and is compiled by
+`compile_methods` below.
 """
 
 from __future__ import annotations
@@ -61,10 +61,9 @@ class ArmModel(Protocol):
         """Compute `regressor` and `momentum_regressor` for one state."""
 
 
-def arm_model(name: str, l1: float, gravity: float) -> ArmModel:
-    """Return the named model, with known l1 [m] and gravity [m/s^2]."""
-    models: dict[str, ArmModel] = {'two_link': TwoLink(gravity / l1)}
-    return models[name]
+def arm_model(l1: float, gravity: float) -> ArmModel:
+    """Return the model of an arm without a URDF, with known l1 [m] and gravity [m/s^2]."""
+    return TwoLink(gravity / l1)
 
 
 compile_methods(

@@ -352,7 +352,7 @@ class SerialChain(NamedTuple):
 
 def serial_chain(
     chain: Chain,
-    gravity: tuple[float, ...] = (0.0, 0.0, -9.81),
+    gravity: tuple[float, ...],
     columns: list[tuple[int, int]] | None = None,
 ) -> SerialChain:
     """Return the model of a chain; `gravity` [m/s^2] is given in its base.

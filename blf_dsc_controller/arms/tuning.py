@@ -48,9 +48,11 @@ _SAG = 1.5
 _PHASE = 0.625  # rad, phase lost to the delay at omega_b
 _BRAKING = 0.375  # of the fastest omega_b, by the damping of a stop
 _BOUND = 0.002  # rad, at full stiffness
-# Of gains of joints: fraction of the rated torque that is expected beside gravity and
-# unknown friction, and rad, the widest bound by default
-_PUSH, _WIDEST = 0.03, 0.35
+WIDEST = 0.35
+"""The widest bound by default [rad or m], of soft gains of joints."""
+# Of such gains: fraction of the rated torque that is expected beside gravity and
+# unknown friction
+_PUSH = 0.03
 # What is left, with drives as heavy as they may be, of how much the slow oscillation is
 # damped: a factor of two instead of three
 _HEAVIEST = 1.5
@@ -157,7 +159,7 @@ def _of_joints(
     """Return the gains of joints, each on its own."""
     postures = arm.over_postures()
     pushed = postures.gravity + _PUSH * arm.efforts + arm.friction
-    sag = np.minimum(_SAG * pushed / gains.stiffness, _WIDEST)
+    sag = np.minimum(_SAG * pushed / gains.stiffness, WIDEST)
     usual_bound = np.maximum(sag, _BOUND)
     start = np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
     heaviest = (postures.inertia + arm.unknown_rotors) / _HEAVIEST

@@ -127,24 +127,45 @@ def urdf(
     `lengths` and `masses` are those of the links [m] and at their ends [kg].  Point
     masses have a tiny inertia: most parsers reject zero.
     """
+    links = [f'link{k}' for k, _ in enumerate(joints, 1)]
+    parents = ['base_link', *links]
+    origins = [0.0, *lengths]
+    moved = [
+        _moved_link(*each)
+        for each in zip(
+            joints, parents[:-1], links, origins[:-1], lengths, masses, strict=True
+        )
+    ]
+    return f"""\
+<robot name="two_link">
+  <link name="base_link" />
+{''.join(moved)}\
+  <joint name="tip_joint" type="fixed">
+    <parent link="{parents[-1]}" />
+    <child link="tip" />
+    <origin xyz="{origins[-1]:.17g} 0 0" />
+  </joint>
+  <link name="tip" />
+</robot>
+"""
+
+
+def _moved_link(
+    joint: str, parent: str, link: str, origin: float, length: float, mass: float
+) -> str:
+    """Return a joint, at `origin` [m] along its parent, and the link that it moves."""
     from xml.sax.saxutils import quoteattr  # slow: it imports what reads from networks
 
-    text = '<robot name="two_link">\n  <link name="base_link" />\n'
-    parent, x = 'base_link', 0.0
-    for k, (joint, length, mass) in enumerate(
-        zip(joints, lengths, masses, strict=True), 1
-    ):
-        link = f'link{k}'
-        text += f"""\
+    return f"""\
   <joint name={quoteattr(joint)} type="continuous">
     <parent link="{parent}" />
     <child link="{link}" />
-    <origin xyz="{x:.17g} 0 0" />
+    <origin xyz="{origin:.17g} 0 0" />
     <axis xyz="0 -1 0" />
   </joint>
   <link name="{link}">
     <inertial>
-      <origin xyz="{length:g} 0 0" />
+      <origin xyz="{length:.17g} 0 0" />
       <mass value="{mass:.17g}" />
       <inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0" />
     </inertial>
@@ -154,14 +175,4 @@ def urdf(
       <material name="blue"><color rgba="0.2 0.4 0.8 1" /></material>
     </visual>
   </link>
-"""
-        parent, x = link, length
-    return f"""{text}\
-  <joint name="tip_joint" type="fixed">
-    <parent link="{parent}" />
-    <child link="tip" />
-    <origin xyz="{x:.17g} 0 0" />
-  </joint>
-  <link name="tip" />
-</robot>
 """

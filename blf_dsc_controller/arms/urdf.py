@@ -127,16 +127,7 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
     tip = tip or _link(tree.joints[wanted[-1]], 'child')
     path = tree.path(base, tip)
     for element in path:
-        name = element.get('name', '')
-        kind = element.get('type')
-        if kind not in (*_MOVING, 'fixed'):
-            raise BlfDscError(
-                f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}'
-            )
-        if element.find('mimic') is not None:
-            raise BlfDscError(
-                f'joint {name!r} mimics another: choose a base and a tip without it'
-            )
+        _check_kind(element)
     moving = _moving(path)
     _check_moving(moving, wanted, base, tip)
     chain: list[Joint] = []
@@ -148,17 +139,22 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
                 _joint(element, frame, tree.body(_link(element, 'child'), moving))
             )
             frame = np.eye(4)
-    massless = [
-        f'{joint.link} (moved by {joint.name})'
-        for joint in chain
-        if not joint.inertia[0]
-    ]
-    if massless:
-        raise BlfDscError(
-            f'these links have no mass, nor has anything fixed to them: {_listed(massless)}: add '
-            'an <inertial> to each, even a rough one'
-        )
+    _check_masses(chain)
     return Chain(base, tip, tuple(chain), frame)
+
+
+def _check_kind(joint: ET.Element) -> None:
+    """Raise BlfDscError if a joint cannot be part of a chain."""
+    name = joint.get('name', '')
+    kind = joint.get('type')
+    if kind not in (*_MOVING, 'fixed'):
+        raise BlfDscError(
+            f'joint {name!r} is {kind}; expected fixed, {_listed(_MOVING)}'
+        )
+    if joint.find('mimic') is not None:
+        raise BlfDscError(
+            f'joint {name!r} mimics another: choose a base and a tip without it'
+        )
 
 
 def _check_moving(
@@ -174,6 +170,20 @@ def _check_moving(
         raise BlfDscError(
             f'the moving joints from base to tip are {_listed(moving)}, in this order; got '
             f'{_listed(wanted)}: list them like this, or choose another base or tip'
+        )
+
+
+def _check_masses(joints: Sequence[Joint]) -> None:
+    """Raise BlfDscError if a joint moves a body without a mass."""
+    massless = [
+        f'{joint.link} (moved by {joint.name})'
+        for joint in joints
+        if not joint.inertia[0]
+    ]
+    if massless:
+        raise BlfDscError(
+            f'these links have no mass, nor has anything fixed to them: {_listed(massless)}: add '
+            'an <inertial> to each, even a rough one'
         )
 
 

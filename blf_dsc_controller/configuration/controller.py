@@ -152,7 +152,7 @@ class ControllerConfig(ArmConfig):
         if self.model == 'urdf':
             base = parameters_of(self.robot, self.robot.chain(self.joints))
             return None, base.model.p
-        model = arm_model(self.model, self.arm.l1, self.arm.gravity)
+        model = arm_model(self.arm.l1, self.arm.gravity)
         return model.n, model.p
 
     def _weighing_problems(self) -> Iterator[str]:
@@ -255,6 +255,11 @@ class ControllerConfig(ArmConfig):
                 f'feedback.gain alone, with a feedback.damping_rate of {feedback.damping_rate:g} '
                 '1/s: set one of them to 0'
             )
+        yield from self._joint_gain_problems()
+
+    def _joint_gain_problems(self) -> Iterator[str]:
+        """Check that stiffness and damping of joints are both given, and act."""
+        feedback = self.feedback
         given = bool(feedback.joint_stiffness), bool(feedback.joint_damping)
         acts = feedback.inertia == 'none' and self.model == 'urdf'
         if any(given) and self.law in OWN and not acts:

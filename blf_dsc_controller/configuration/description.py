@@ -37,7 +37,7 @@ class Description(NamedTuple):
 def describe(text: str) -> Description:
     """Return what a URDF says beyond the format; BlfDscError if a number is none."""
     found = Description({}, {}, {})
-    if f'{ARMATURE}=' not in text and f'{GRAVITY}=' not in text:
+    if not any(word in text for word in (ARMATURE, GRAVITY, UNSUPPORTED)):
         return found
     root = parse_xml(text)
     for link in root.findall('link'):

@@ -14,7 +14,7 @@ from blf_dsc_controller.configuration.schema import (
     parameter,
     positive,
 )
-from blf_dsc_controller.motors.damiao import MODELS
+from blf_dsc_controller.motors.damiao import ANSWERS, MODELS
 
 _WHY = 'it is read once, before the motion starts'
 _fixed = partial(parameter, read_only=_WHY)
@@ -98,6 +98,11 @@ class DriveConfig:
         read_only=_WHY,
     )
 
+    def identifiers(self, motors: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the identifiers of so many motors, and those with which they answer."""
+        ids = self.motor_ids or tuple(range(1, motors + 1))
+        return ids, self.feedback_ids or tuple(each + ANSWERS for each in ids)
+
     def problems(self) -> Iterator[str]:
         """Check thresholds, which come together and six at the hand, and motors."""
         if bool(self.collision_torque) != bool(self.collision_force):
@@ -110,6 +115,7 @@ class DriveConfig:
                 f'collision_force: got {len(self.collision_force)} entries, but three forces and '
                 'three torques are needed'
             )
+        yield from self._identifier_problems()
         if 0 in self.motor_directions:
             yield (
                 f'motor_directions: got {list(self.motor_directions)}, but a motor turns with its '
@@ -119,4 +125,22 @@ class DriveConfig:
         if unknown:
             yield (
                 f'motor_models: got {", ".join(unknown)}, but known are {", ".join(MODELS)}'
+            )
+
+    def _identifier_problems(self) -> Iterator[str]:
+        """Check that no identifier on the bus stands for two motors, or both ways."""
+        for name in ('motor_ids', 'feedback_ids'):
+            given = getattr(self, name)
+            twice = [each for each in given if given.count(each) > 1]
+            if twice:
+                yield (
+                    f'{name}: got {list(given)}, but {twice[0]} is that of two motors: give each '
+                    'its own'
+                )
+        motors = max(len(self.motor_ids), len(self.feedback_ids))
+        ids, answers = self.identifiers(motors)
+        if both := sorted(set(ids) & set(answers)):
+            yield (
+                f'motor_ids: got {both[0]}, with which another one answers: a motor would take '
+                'answers for its commands'
             )

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from blf_dsc_controller.configuration import known_arm, law_file, received
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -25,10 +23,14 @@ from blf_dsc_controller.configuration.schema import (
     build,
     flatten,
     format_value,
-    parameter,
     parameters,
     suggestion,
     unknown_names,
+)
+from blf_dsc_controller.configuration.side_nodes import (
+    RecorderConfig,
+    ViewConfig,
+    WatchdogConfig,
 )
 from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.writing import write_text
@@ -46,64 +48,7 @@ _SWITCHES_OF_ROS = ('use_sim_time', 'start_type_description_service')
 _QOS = 'qos_overrides.'
 _ARM = 'robot.urdf'  # a file, which may be beside the one that names it
 _PATH = 4096  # characters; longer ones are texts
-_of_bag = partial(parameter, read_only='a bag is opened once, when the recorder starts')
-_of_watchdog = partial(parameter, read_only='it is read once, when the node starts')
-_of_view = partial(parameter, read_only='the page is served once, when the node starts')
 Config = TypeVar('Config')
-
-
-@dataclass(frozen=True)
-class RecorderConfig:
-    """Parameters of the node `bag_recorder`."""
-
-    output: str = _of_bag('bag', 'folder of the bag; it must not exist yet')
-    topics: tuple[str, ...] = _of_bag(
-        (), 'topics to record; empty: all', omittable=True
-    )
-    compression: Literal['none', 'zstd'] = _of_bag(
-        'none', 'compression of the chunks of the bag'
-    )
-    queue_depth: int = _of_bag(
-        100_000,
-        'messages buffered per topic while the disk is busy',
-        'messages',
-        at_least=1,
-    )
-    clock: Literal['wall', 'plant'] = _of_bag(
-        'wall',
-        'log times: as received, or the stamp of the last joint state (lock-step)',
-    )
-
-
-@dataclass(frozen=True)
-class WatchdogConfig:
-    """Parameters of the node `torque_watchdog`."""
-
-    timeout: float = _of_watchdog(
-        0.05,
-        'time without a command, while joint states continue, until the watchdog '
-        'commands',
-        's',
-        at_least=0.005,
-        at_most=10.0,
-    )
-    armed: bool = _of_watchdog(
-        False,
-        'do not wait for a first command: for a restart after the controller died, with its '
-        'parameter file',
-    )
-
-
-@dataclass(frozen=True)
-class ViewConfig:
-    """Parameters of the node `view`."""
-
-    host: str = _of_view(
-        '127.0.0.1', 'address of this computer on which the page is served'
-    )
-    port: int = _of_view(
-        8080, 'port of the page; if taken, the next free one', at_least=1, at_most=65535
-    )
 
 
 NODES: Mapping[str, Any] = {
@@ -198,7 +143,7 @@ def locate(given: str | Path) -> Path:
     )
 
 
-def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
+def read(path: str | Path, based: tuple[Path, ...] = ()) -> Sequence[Section]:
     """Read the sections of a parameter file.
 
     ConfigurationError names the file and the line.
@@ -216,12 +161,12 @@ def read(path: str | Path, based: tuple[str, ...] = ()) -> Sequence[Section]:
         if base is None:
             return sections
         below = _based_on(str(base), Path(path).parent)
-        above = (*based, str(path))
+        above = (*based, Path(path).resolve())
     except OSError as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:
         raise ConfigurationError(error.problems, str(path)) from error
-    if str(below) in above:
+    if below.resolve() in above:
         problem = (
             f'monte_carlo: base: {base!r} leads back to a file that is based on it'
         )
@@ -377,7 +322,7 @@ def _wrong_for_ros(sections: Iterable[Section], nodes: Iterable[str]) -> Iterato
 
     None of these nodes would start with it.
     """
-    full = ['/' + node.removeprefix('/') for node in nodes]
+    full = [_full(node) for node in nodes]
     for section in sections:
         if not any(map(section.matches, full)):
             continue
@@ -395,7 +340,7 @@ def _entries_of(sections: Iterable[Section], node: str, cls: type) -> dict[str, 
     return {
         name: entry
         for section in sections
-        if section.matches('/' + node.removeprefix('/'))
+        if section.matches(_full(node))
         for name, entry in section.entries.items()
         if not section.is_wildcard or is_of_node(name, cls)
         if not is_builtin(name)
@@ -424,7 +369,7 @@ def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
     """
     lines = [comment]
     for node, config in nodes.items():
-        lines.append(f'/{node.removeprefix("/")}:\n  ros__parameters:\n')
+        lines.append(f'{_full(node)}:\n  ros__parameters:\n')
         values = config if isinstance(config, Mapping) else flatten(config)
         lines += [
             f'    {name}: {format_value(value)}\n' for name, value in values.items()
@@ -447,7 +392,7 @@ def unmatched_sections(
         if name not in NODES and (guess := suggestion(name, absent, cutoff=0.8)):
             yield f'line {section.line}: unknown node {name}{guess}'
     for node in nodes:
-        full = '/' + node.removeprefix('/')
+        full = _full(node)
         name = node.rsplit('/', 1)[-1]
         if name in by_name and not any(
             section.matches(full) for section in sections if not section.is_wildcard
@@ -465,7 +410,7 @@ def ignored_sections(sections: Sequence[Section], nodes: Iterable[str]) -> str:
     They may belong to others in the same file, or be misspelt. `nodes` are those that
     are started.
     """
-    full = ['/' + node.removeprefix('/') for node in nodes]
+    full = [_full(node) for node in nodes]
     by_wildcard = [section for section in sections if section.is_wildcard]
     matches = {
         section.pattern: any(map(section.matches, full)) for section in by_wildcard
@@ -483,3 +428,8 @@ def ignored_sections(sections: Sequence[Section], nodes: Iterable[str]) -> str:
 def _is_of_others(section: Section) -> bool:
     name = section.pattern.rsplit('/', 1)[-1]
     return not section.is_wildcard and name not in (*NODES, STUDY)
+
+
+def _full(node: str) -> str:
+    """Return the full name of a node, whose slash may be omitted in the root namespace."""
+    return '/' + node.removeprefix('/')

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
+from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT, WIDEST
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.checked import Checked
 from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
@@ -48,13 +48,13 @@ _ROUNDED = 1.001  # defaults have four digits
 _BROKEN = 10.0  # times the speed of the fastest joint: no measurement
 _UNKNOWN = 100.0  # times the speed of motions, where the speed of the joints is unknown
 _QUARTER = 0.5 * math.pi  # rad: an arm so far from its reference points elsewhere
-_SOFTEST = 0.35  # rad or m, the widest bound that gains for an unknown arm need
 _WIDEST = 0.1  # of the reach
 _HEAVIEST = 30.0  # m/s^2, on no planet
 _CARRIED = 10.0  # times what the strongest joint holds at full reach
 _SLOWEST = 1.0  # rad/s^2, of a free drive at its rated torque
 _COARSEST = 0.01  # of the range
-_LONGEST = 0.1  # s, as `robot.lag`
+LONGEST_LAG = 0.1
+"""Lag [s] that is too long for any loop; drivers have up to 0.03."""
 
 
 class _Doubt(NamedTuple):
@@ -177,7 +177,7 @@ def widest_bound(kind: str, lower: float, upper: float) -> float:
     allowed = 0.5 * (upper - lower)
     if kind != 'prismatic':
         allowed = min(allowed, _QUARTER)
-    return max(allowed, _SOFTEST)
+    return max(allowed, WIDEST)
 
 
 def _of_errors(config: Checked) -> Iterator[_Doubt]:
@@ -295,7 +295,7 @@ def _of_sensors(
             f'got {noise:g} rad rms, more than a hundredth of the range of a '
             f'joint: {_of_degrees(noise)}',
         )
-    if lag > _LONGEST:
+    if lag > LONGEST_LAG:
         yield _Doubt(
             'actuator.time_constant',
             f'got {lag:g} s, too long for any loop: is it in ms? Give {1e-3 * lag:g}',

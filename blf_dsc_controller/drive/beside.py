@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from math import inf
 from time import monotonic
 
 from blf_dsc_controller.control.arm_controller import ArmController
@@ -59,17 +60,18 @@ class LinkLog:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._warned: dict[str, float] = {}
+        self._last = '', -inf  # warning, and when [s]
 
     def info(self, message: str) -> None:
         """Tell what is as it should be."""
         self._send('info', message)
 
     def warning(self, message: str, *, throttle_duration_sec: float = 0.0) -> None:
-        """Warn, of the same only after a pause [s]."""
+        """Warn, of the same again only after a pause [s]."""
         now = monotonic()
-        if now - self._warned.get(message, -1e9) >= throttle_duration_sec:
-            self._warned = {message: now}
+        last, at = self._last
+        if message != last or now - at >= throttle_duration_sec:
+            self._last = message, now
             self._send('warning', message)
 
     def error(self, message: str) -> None:

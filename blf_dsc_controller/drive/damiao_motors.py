@@ -48,10 +48,7 @@ class DamiaoMotors:
         self._mounting = mounting_of(config, n)
         self._address = address
         self._joints = joints
-        self._ids = config.motor_ids or tuple(range(1, n + 1))
-        answers = config.feedback_ids or tuple(
-            each + damiao.ANSWERS for each in self._ids
-        )
+        self._ids, answers = config.identifiers(n)
         if not len(self._ids) == len(answers) == n:
             raise DriverError(
                 f'drive.motor_ids, drive.feedback_ids: got {len(self._ids)} and {len(answers)}, '

@@ -25,13 +25,17 @@ _TURN = 2.0 * np.pi  # rad
 
 
 def lines(chain: Chain, positions: ArrayLike) -> Iterator[str]:
-    """Yield a line for each joint at positions (n,) [rad], which says if they cannot be."""
+    """Yield a line for each joint at positions (n,) [rad or m], which says if they cannot be."""
     for joint, q in zip(chain.joints, np.asarray(positions, np.float64), strict=True):
-        text = f'{joint.name:24} {q:8.3f} of {joint.lower:.2f} to {joint.upper:.2f} rad'
+        unit = 'm' if joint.kind == 'prismatic' else 'rad'
+        text = (
+            f'{joint.name:24} {q:8.3f} of {joint.lower:.2f} to {joint.upper:.2f} {unit}'
+        )
         if joint.lower <= q <= joint.upper:
             yield text
             continue
-        turns = [s for s in (-_TURN, _TURN) if joint.lower <= q + s <= joint.upper]
+        shifts = (-_TURN, _TURN) if unit == 'rad' else ()
+        turns = [s for s in shifts if joint.lower <= q + s <= joint.upper]
         hint = f': {turns[0]:+.3f} rad, a turn, would be within' if turns else ''
         yield f'{text}: outside{hint}'
 

@@ -25,7 +25,7 @@ from blf_dsc_controller.motors.damiao import ranges_of
 from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
 from blf_dsc_controller.run import FIRST_STAMP, NANOSECOND
 from blf_dsc_controller.supervision.drive_load import DriveLoad
-from sim_plant.motors import MotorPlant
+from sim_plant.motors import IN_REAL_TIME, MotorPlant
 from sim_plant.plant import plant_of
 from sim_plant.sampled_plant import Plant
 from sim_plant.settings import plant_settings
@@ -35,7 +35,6 @@ SIMULATED = 'simulated'
 """The address of a simulated arm."""
 
 _BEHIND = 0.05  # s, which are caught up with; more are left behind
-_MOTORS = 2000.0  # Hz, of motors in real time, in Python
 
 
 class SimulatedDriver(Driver):
@@ -170,7 +169,7 @@ class SimulatedMotorsDriver(SimulatedDriver):
         super().write(frame.torque)
 
     def _build(self, config: PlantConfig) -> None:
-        self._motors = MotorPlant(config, self._ranges, _MOTORS)
+        self._motors = MotorPlant(config, self._ranges, IN_REAL_TIME)
         self.plant = self._motors.plant
         self._built = self._motors.config
         self._frame = torque_alone(np.zeros(self.facts.joints))

@@ -25,12 +25,12 @@ _MOST_FRICTION = 3.0  # times its initial estimate
 
 
 def model_of(config: ControllerConfig) -> ArmModel:
-    """Return the model named by `model`, with the geometry known to the controller."""
+    """Return the model of the arm, with the geometry known to the controller."""
     if config.model == 'urdf':
         robot = config.robot
         base = parameters_of(robot, robot.chain(config.joints))
         return deepcopy(base.model)  # has working memory
-    return arm_model(config.model, config.arm.l1, config.arm.gravity)
+    return arm_model(config.arm.l1, config.arm.gravity)
 
 
 class Column(NamedTuple):

@@ -219,7 +219,8 @@ def _listen(
 def main() -> int:
     """Run until the controller ends."""
     descriptor, domain, node_name, namespace, action, enclave, *joints = sys.argv[1:]
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the controller may still brake
+    for number in (signal.SIGINT, signal.SIGTERM):  # the controller may still brake
+        signal.signal(number, signal.SIG_IGN)
     # the controller's real-time priority is not for goals
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     link = Link(socket.socket(fileno=int(descriptor)), _LARGEST)
@@ -236,6 +237,18 @@ def main() -> int:
         start_parameter_services=False,
     )
     server = TrajectoryActionServer(node, action, joints, link)
+    try:
+        _spin(node, server, link)
+    except ExternalShutdownException:
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _spin(node: Node, server: TrajectoryActionServer, link: Link) -> None:
+    """Serve clients, and tell them what the controller sends, until it ends."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     over = Future()
@@ -249,14 +262,7 @@ def main() -> int:
         daemon=True,
     )
     listener.start()
-    try:
-        executor.spin_until_future_complete(over)
-    except ExternalShutdownException:
-        pass
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    executor.spin_until_future_complete(over)
 
 
 if __name__ == '__main__':

@@ -11,7 +11,8 @@ from functools import partial
 from typing import Any
 
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.configuration.nodes import RECORDER, RecorderConfig
+from blf_dsc_controller.configuration.nodes import RECORDER
+from blf_dsc_controller.configuration.side_nodes import RecorderConfig
 from blf_dsc_controller.messages.codecs import UnknownTypeError, joint_state_stamp
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.topics import JOINT_STATES

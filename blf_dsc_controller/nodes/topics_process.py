@@ -12,7 +12,8 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -52,11 +53,6 @@ class LoopTopics:
         """Create the topics of these kinds."""
         self._node = node
         self._link = link
-        self._log: dict[str, Callable[[str], Any]] = {
-            'info': node.get_logger().info,
-            'warning': node.get_logger().warning,
-            'error': node.get_logger().error,
-        }
         shared = {topics.STATE, topics.DIAGNOSTICS}
         self.publishers = {
             kind: create_publisher(node, TOPICS[kind])
@@ -84,8 +80,17 @@ class LoopTopics:
         elif kind == STOP:
             self._answers.put(topic_link.decode(content))
         elif kind == LOG:
-            entry = topic_link.decode(content)
-            self._log[entry['level']](entry['text'])
+            self._write_log(**topic_link.decode(content))
+
+    def _write_log(self, level: str, text: str) -> None:
+        """Log a text; rclpy refuses a second level from the same place in the code."""
+        log = self._node.get_logger()
+        if level == 'info':
+            log.info(text)
+        elif level == 'warning':
+            log.warning(text)
+        else:
+            log.error(text)
 
     def _report(self, status: dict[str, Any]) -> None:
         parts = (
@@ -102,6 +107,9 @@ class LoopTopics:
         self._link.flush()
 
     def _stop(self) -> str:
+        with suppress(Empty):  # what came too late for an earlier stop
+            while True:
+                self._answers.get_nowait()
         self._link.put(STOP, b'null')
         self._link.flush()
         try:

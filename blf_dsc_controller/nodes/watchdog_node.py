@@ -23,14 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import (
-    CONTROLLER,
-    WATCHDOG,
-    WatchdogConfig,
-    load,
-)
+from blf_dsc_controller.configuration.nodes import CONTROLLER, WATCHDOG, load
 from blf_dsc_controller.configuration.received import without_files
 from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.side_nodes import WatchdogConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
@@ -238,10 +234,21 @@ class WatchdogNode(PlainNode):
             elif message.handle is topics.COMMANDS and not self._encoder.has_layout(
                 raw
             ):
-                self._commands.decode(raw)
-                watchdog.take_torque(self._commands.values, now)
+                watchdog.take_torque(self._torque_in(raw), now)
         except MessageError as error:
             self.get_logger().warning(f'ignored: {error}', throttle_duration_sec=10.0)
+
+    def _torque_in(self, raw: bytes) -> np.ndarray:
+        """Return the torque (n,) [N m] of a command.
+
+        Raises:
+            MessageError: it is for other joints, so that no drive applies it.
+        """
+        size = self._commands.decode(raw)
+        torque = self._commands.values
+        if size != torque.size:
+            raise MessageError(f'{size} torques for {torque.size} joints')
+        return torque
 
     def _change_command(self, watchdog: TorqueWatchdog) -> None:
         """Report who commands now, and poll as fast as the torque's rate needs."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_traits import OWN
+from blf_dsc_controller.configuration.plausibility import LONGEST_LAG
 from blf_dsc_controller.configuration.robot import (
     implausible_friction,
 )
@@ -37,7 +38,6 @@ Floats = NDArray[np.float64]
 
 _FIRST_ERROR = 1.5  # recommended bound over the first error
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
-_LONGEST_LAG = 0.1  # s; drivers have up to 0.03
 _LONG = 5.0  # s: a time in ms is a thousand times as long as it should be
 _TIMES = (
     'state_timeout',
@@ -52,7 +52,7 @@ _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
 def _of_units(config: ControllerConfig) -> Iterator[str]:
     """Check for values that are those of another unit."""
     lag = config.robot.lag
-    if lag > _LONGEST_LAG:
+    if lag > LONGEST_LAG:
         yield (
             f'robot.lag: {lag:g} s between a state and its torque is too long for any loop: is it '
             f'in ms? Give {1e-3 * lag:g}'

@@ -38,7 +38,7 @@ def check_first_torque(
     controller: Controller,
     config: ControllerConfig,
     measurement: Vector,
-    acting: Vector | None = None,
+    acting: Vector | None,
 ) -> None:
     """Raise StartError if the first torque must not be sent; the controller has begun.
 

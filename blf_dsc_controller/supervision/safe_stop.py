@@ -132,7 +132,7 @@ class SafeStop:
 
     def name_swings(self) -> str:
         """Return a text about joints that swing in the stop and have not been named; or empty."""
-        return self._swings.text(self._torque.has_swung)
+        return self._swings.name(self._torque.has_swung)
 
     @property
     def missing_effect(self) -> str:

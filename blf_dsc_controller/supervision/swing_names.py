@@ -20,8 +20,8 @@ class SwingNames:
         """Begin a stop."""
         self._named[:] = False
 
-    def text(self, has_swung: NDArray[np.bool_]) -> str:
-        """Return a text about joints (n,) that are not named yet; or empty.
+    def name(self, has_swung: NDArray[np.bool_]) -> str:
+        """Name those joints (n,) that are not named yet, in a text; empty: all are.
 
         Only the first text of a stop says what that means: the others follow it.
         """

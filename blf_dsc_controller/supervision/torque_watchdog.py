@@ -179,7 +179,7 @@ class TorqueWatchdog:
 
     def name_swings(self) -> str:
         """Return a text about joints that swing under its torque, each once; or empty."""
-        return self._swings.text(self._safe.has_swung)
+        return self._swings.name(self._safe.has_swung)
 
     def leave(self) -> Vector | None:
         """Return the torque to leave behind, None if the controller commands."""

@@ -9,39 +9,32 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import logging
 import os
 import socket
-import sysconfig
 import time
-import xml.etree.ElementTree as ET
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from html import escape
-from math import inf, isfinite
-from pathlib import Path
-from typing import Any, NamedTuple
+from math import inf
+from typing import Any
 
 import numpy as np
 
 from blf_dsc_controller.analysis.panels import ALARM, COLOURS, GREEN, INK, MUTED, ORANGE
-from blf_dsc_controller.arms.two_link import urdf
-from blf_dsc_controller.arms.urdf import Chain, frames, read_chain
+from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import resolve
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import missing_extra
-from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.run import Floats
 from blf_dsc_controller.view.model_error import shares
+from blf_dsc_controller.view.shown_arm import arm_of
+from blf_dsc_controller.view.snapshot import Snapshot
+from blf_dsc_controller.view.texts import caption, contact_of, event_list
 
 PAST = 20.0
 """Time span of the plots [s]."""
 
-_THICKNESS = 0.025  # radius of a link relative to the length of all links
-_SHORTEST = 1e-3  # m, length below which a link is not drawn
-_SAME = 1e-3  # m and of rotation matrices, between two URDFs of the same arm
 _TRAIL = 4.0  # s of the tip's path
 _SHOWN = 3.0  # s that an event is named beside the arm
 _GHOST = (0, 200, 120, 0.35)
@@ -83,36 +76,7 @@ _SHEET = (
     '<style>@media (max-width:36em){[style*="width: 20em"]'
     '{width:100%!important;max-height:50vh!important}}</style>'
 )
-_MESHES = ('.stl', '.dae', '.obj', '.ply', '.off', '.glb', '.gltf')
-_LARGEST_MESH = 1 << 28  # bytes
 _LEVELS = {'OK': GREEN, 'WARN': ORANGE, 'ERROR': ALARM, 'STALE': MUTED}
-
-
-class Snapshot(NamedTuple):
-    """Values of n joints and m estimates at one time; NaN where unknown."""
-
-    time: float  # s
-    position: Floats  # (n,) rad, q
-    error: Floats  # (n,) rad, xi1
-    bound: Floats  # (n,) rad, k_c
-    torque: Floats  # (n,) N m
-    estimate: Floats  # (m,) theta^; NaN: a rejected column
-    truth: Floats  # (m,)
-    lambda_min: float
-    squares: Floats  # (3,) (N m)^2, see `ModelError`
-    load: Sequence[float] = (np.nan,) * 8  # of topics.LOAD
-    loaded: bool = False  # the true parameters differ from those at the start
-    tool: Sequence[float] = (np.nan,) * 4  # of topics.TOOL
-    external: Floats = np.zeros(0)  # (n,) N m, from outside
-    interval: Floats = np.zeros(0)  # (n,) N m, what model and noise explain of it
-    touched: bool = False  # whether something touches the arm
-
-    @property
-    def felt_at(self) -> int | None:
-        """Number of the joint where a contact shows most; None: no contact."""
-        if not self.touched or not np.isfinite(self.external).all():
-            return None
-        return int(np.argmax(np.abs(self.external) / self.interval))
 
 
 def require_viser() -> None:
@@ -465,168 +429,8 @@ def with_marks(t: Floats, curves: Floats, marks: Sequence[float]) -> tuple[Float
     )
 
 
-def contact_text(joint: str, torque: float, interval: float) -> str:
-    """Return the external torque of a contact, and how much of it is no contact."""
-    return (
-        f'external torque on {joint}: {torque:+.3g} N m, of which model error and noise '
-        f'explain at most {interval:.2g} N m'
-    )
-
-
-def contact_of(joints: Sequence[str], now: Snapshot) -> str:
-    """Return what touches the arm; empty if nothing does."""
-    k = now.felt_at
-    if k is None:
-        return ''
-    return contact_text(joints[k], float(now.external[k]), float(now.interval[k]))
-
-
-def caption(now: Snapshot, contact: str = '') -> str:
-    """Return the caption: time, contact, tool, load and excitation."""
-    tool = ''
-    if np.isfinite(now.tool[0]):
-        error, bound = (1e3 * each for each in now.tool[:2])
-        tool = f', tool {error:.2f} of {bound:.2f} mm'
-    held = f', held: {load_text(now.load)}' if np.isfinite(now.load[0]) else ''
-    excited = f', lambda_min {now.lambda_min:.2g}' if now.lambda_min > 0.0 else ''
-    felt = f', <b style="color:{ALARM}">{escape(contact)}</b>' if contact else ''
-    return (
-        f'<div style="margin:4px">t = {now.time:.2f} s{felt}{tool}{held}{excited}</div>'
-    )
-
-
 def weights(load: Floats) -> Floats:
     """Return the load and its 95 % interval (3, k) [kg] from LOAD (k, 8)."""
     mass = load[:, 0]
     half = load[:, 4]
     return np.vstack((mass, mass - half, mass + half))
-
-
-def event_list(events: Sequence[tuple[float, str, str]]) -> str:
-    """Return the lines of events, the last one first."""
-    return ''.join(
-        f'<div style="margin:4px">{t:.2f} s <b>{escape(kind)}</b> {escape(text)}</div>'
-        for t, kind, text in reversed(events)
-    )
-
-
-# The arm: the shapes of its URDF, else known meshes, else cylinders.
-
-
-class ShownArm(NamedTuple):
-    """The text of a URDF and the chain of its controlled joints."""
-
-    text: str
-    chain: Chain
-
-    @property
-    def reach(self) -> float:
-        """Total length of all links [m]."""
-        offsets = [joint.placement[:3, 3] for joint in self.chain.joints]
-        steps = np.array([*offsets, self.chain.tip_placement[:3, 3]])
-        return float(np.linalg.norm(steps, axis=1).sum())
-
-    def model(self) -> Any:
-        """Return the yourdfpy model with meshes, else other shapes, else cylinders."""
-        has_meshes = '<mesh' in self.text
-        model = _load(self.text if has_meshes else known_model(self.text, self.chain))
-        if not model.scene.geometry:
-            _add_cylinders(model, _THICKNESS * self.reach)
-        return model
-
-
-def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
-    """Return the arm of a controller.
-
-    Planar links have the lengths of its plant, if known.
-    """
-    robot = config.robot
-    if config.model == 'urdf':
-        return ShownArm(robot.text, robot.chain(config.joints))
-    given = [plant.get(name) for name in ('arm.l1', 'arm.l2')]
-    lengths = [
-        each if isinstance(each, float) and isfinite(each) else config.arm.l1
-        for each in given
-    ]
-    text = urdf(config.joints, lengths, (1.0, 1.0))
-    return ShownArm(text, read_chain(text, '', 'tip', config.joints))
-
-
-def known_model(text: str, chain: Chain) -> str:
-    """Return the URDF with the meshes of `example-robot-data`, else its own.
-
-    The same arm has the same joints, in the same places.
-    """
-    names = tuple(joint.name for joint in chain.joints)
-    for path in sorted(_installed('example-robot-data').glob('robots/*/urdf/*.urdf')):
-        known = path.read_text(encoding='utf-8')
-        if not all(f'"{name}"' in known for name in names):
-            continue
-        with suppress(BlfDscError):
-            joints = read_chain(known, chain.base, chain.joints[-1].link, names).joints
-            pairs = zip(joints, chain.joints, strict=True)
-            if all(np.allclose(a.placement, b.placement, atol=_SAME) for a, b in pairs):
-                return known
-    return text
-
-
-def _installed(package: str) -> Path:
-    """Return the folder of a description that is installed as a wheel."""
-    return Path(sysconfig.get_path('purelib'), 'cmeel.prefix', 'share', package)
-
-
-def _add_cylinders(model: Any, radius: float) -> None:
-    """Draw a cylinder of this radius [m] between joints, a ball at each joint."""
-    import trimesh
-
-    def add(shape: Any, joint: str, link: str) -> None:
-        name = f'{joint} {link}'
-        model.scene.add_geometry(
-            shape, node_name=name, geom_name=name, parent_node_name=link
-        )
-
-    for joint in model.robot.joints:
-        end = model.get_transform(joint.child, joint.parent)[:3, 3]
-        if np.linalg.norm(end) > _SHORTEST:
-            cylinder = trimesh.creation.cylinder(radius, segment=(np.zeros(3), end))
-            add(cylinder, joint.name, joint.parent)
-        if joint.type != 'fixed':
-            add(
-                trimesh.creation.icosphere(radius=1.6 * radius), joint.name, joint.child
-            )
-
-
-def _load(text: str) -> Any:
-    import yourdfpy
-
-    # it warns about missing meshes
-    logging.getLogger('yourdfpy').setLevel(logging.ERROR)
-    # As `read_chain` has understood it: of another encoding that the text declares,
-    # another parser would make entities of a comment.
-    root = ET.fromstring(text)  # noqa: S314 - `read_chain` has accepted it
-    try:
-        model = yourdfpy.URDF.load(
-            io.BytesIO(ET.tostring(root)), filename_handler=_mesh
-        )
-    except Exception as error:  # its libraries raise nearly anything
-        raise BlfDscError(f'the arm cannot be drawn: {error!r}') from error
-    for joint in model.robot.joints:
-        if joint.axis is not None:  # yourdfpy scales prismatic motion by its length
-            joint.axis = joint.axis / np.linalg.norm(joint.axis)
-    return model
-
-
-def _mesh(fname: str) -> str:  # yourdfpy prescribes the argument's name
-    """Return the path of a mesh, empty if the file is none: it is a stranger who names it."""
-    path = _file(fname)
-    with suppress(OSError):
-        if path.suffix.lower() in _MESHES and path.stat().st_size <= _LARGEST_MESH:
-            return str(path)
-    return ''
-
-
-def _file(name: str) -> Path:
-    with suppress(BlfDscError, OSError):
-        return resolve(name.removeprefix('file://'))
-    package, _, rest = name.removeprefix('package://').partition('/')
-    return _installed(package) / rest

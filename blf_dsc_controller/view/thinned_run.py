@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from blf_dsc_controller.view.page import Snapshot
+from blf_dsc_controller.view.snapshot import Snapshot
 
 KEPT = 2000
 """Snapshots of a run that are kept, at most."""
