@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration import known_arm, law_file, received
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
@@ -279,6 +280,7 @@ def load(
     return config
 
 
+@logged_compilation()
 def load_loop(
     given: str | Path,
     overrides: Mapping[str, Mapping[str, object]] | None = None,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
@@ -94,6 +95,7 @@ class ArmController:
         joints: names of the n joints, in the order of all arrays.
     """
 
+    @logged_compilation()
     def __init__(
         self,
         config: ControllerConfig | str | Path,
