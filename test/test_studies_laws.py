@@ -355,6 +355,19 @@ def test_limits_of_the_gain_search_are_valid_configurations(name):
         change(config, laws.law_changes(studied, config, values))
 
 
+def test_events_of_a_file_become_the_pick_up_of_its_heaviest_load():
+    events = {
+        'events.begin': [1.0, 2.0],
+        'events.duration': [0.0, 3.0],
+        'events.payload': [0.5, 2.0],
+        'events.ramp': [0.5, 0.0],
+        'events.force': [0.0, 0.0, 0.0, 0.0, 0.0, -5.0],
+    }
+    plant = laws.trial('ur5e_rigid', 0, {'sim_plant': events}).plant
+    assert plant.events.payload == (2.0,)
+    assert plant.events == laws.trial('ur5e_rigid', 0).plant.events
+
+
 def test_every_trial_has_its_own_truth_motion_and_noise():
     trials = [laws.trial('ur5e_rigid', seed) for seed in range(4)]
     for get in (

@@ -22,6 +22,7 @@ import numpy as np
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
+from blf_dsc_controller.configuration.plant import pick_ups
 from blf_dsc_controller.configuration.schema import change, suggestion
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.inertia import joint_inertia
@@ -280,10 +281,7 @@ def trial(
         'duration': DURATION,
         'seed': seed,
         'truth.seed': loop.plant.truth.seed + seed,
-        'events.begin': [PICK_UP],
-        'events.duration': [0.0],
-        'events.payload': [max(events.payload, default=0.0)],
-    }
+    } | pick_ups([PICK_UP], [max(events.payload, default=0.0)])
     # No funnel, since the other laws have none: all approach the motion from rest.
     law = change(
         loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
