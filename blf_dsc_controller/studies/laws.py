@@ -136,6 +136,8 @@ def law_changes(
 ) -> dict[str, object]:
     """Return the parameters for this law with these gains."""
     changes: dict[str, object] = {'law': studied.law}
+    if studied.law != 'blf_dsc':  # which alone has a load observer
+        changes['disturbance.observer_bandwidth'] = 0.0
     config = change(config, changes)  # a law of a file has gains of its own
     if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
@@ -159,6 +161,18 @@ def law_changes(
         limit = np.maximum(config.barrier.slope_limit, _STIFFEST * weight)
         changes['barrier.slope_limit'] = limit.tolist()
     return changes
+
+
+def unsuitable(name: str, config: ControllerConfig) -> str:
+    """Return why the gains of a law are none for the arm of a configuration; empty if they are."""
+    law = LAWS[name]
+    untuned = law.law == COMPUTED_TORQUE and not law.gains
+    if config.feedback.inertia == 'whole' or not (untuned or _DAMPING in law.gains):
+        return ''
+    return (
+        f'{name}: its gains act through the inertia, and those of this arm on each joint '
+        f'(feedback.inertia {config.feedback.inertia}): choose laws such as computed_torque_tuned'
+    )
 
 
 def inertia_of_joints(config: ControllerConfig) -> np.ndarray:
@@ -236,7 +250,11 @@ def load_laws(path: Path) -> list[str]:
         )
     added: dict[str, StudiedLaw] = getattr(module, 'LAWS', {})
     if not added or not all(isinstance(each, StudiedLaw) for each in added.values()):
-        raise BlfDscError(f'{path}: LAWS must be a dict of StudiedLaw by name')
+        raise BlfDscError(
+            f'{path}: LAWS must be a dict of StudiedLaw by name. For the law of a file, write a '
+            "second one with LAWS = {'mine': StudiedLaw('my law', (), 'my_law.py')}, as in "
+            'doc/tutorial_law.md'
+        )
     for name, law in added.items():
         if LAWS.setdefault(name, law) is not law:
             raise BlfDscError(
@@ -337,11 +355,16 @@ def compare(
 ) -> dict[str, dict[str, Result]]:
     """Tune and run everything, write figures.json, and return the results.
 
-    `laws` are as in `chosen_laws`.
+    `laws` are as in `chosen_laws`. Those that are `unsuitable` for an arm are left out there.
     """
     names = chosen_laws(laws)
     results: dict[str, dict[str, Result]] = {arm: {} for arm in arms}
-    rows = [(arm, name) for arm in arms for name in names]
+    rows = [
+        (arm, name)
+        for arm in arms
+        for name in names
+        if not unsuitable(name, trial(arm, 0).controller)
+    ]
     with ProcessPoolExecutor(
         cores(), initializer=chosen_laws, initargs=(laws,)
     ) as pool:
