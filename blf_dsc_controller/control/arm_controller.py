@@ -240,12 +240,16 @@ class ArmController:
         self, name: str, values: ArrayLike, shape: tuple[int, ...] = ()
     ) -> Vector:
         """Return an array of a shape, by default (n,)."""
-        array = np.asarray(values, dtype=np.float64)
         needed = shape or (len(self.joints),)
+        try:
+            array = np.asarray(values, dtype=np.float64)
+            got = f'an array of shape {array.shape}'
+        except (TypeError, ValueError):
+            array, got = np.empty(0), 'what is no array of numbers'
         if array.shape != needed:
             raise StateError(
-                f'{name}: got an array of shape {array.shape}, but {needed} is needed: one value '
-                f'for each of {", ".join(self.joints)}'
+                f'{name}: got {got}, but {needed} is needed: one value for each of '
+                f'{", ".join(self.joints)}'
             )
         return array
 
