@@ -10,7 +10,6 @@ reaction `hold`, the law stops the reference by itself at a contact, within mill
 import numpy as np
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.errors import MotionFailedError
 
 OVERRIDES = {
     'blf_dsc_controller': {
@@ -39,7 +38,7 @@ with blf.Drive('panda', OVERRIDES, robot='simulated') as arm:
     while True:
         try:
             arm.move_to(start + ADVANCE, speed=0.1)
-        except MotionFailedError as error:
+        except blf.MotionFailedError as error:
             contacts += 1
             print(f'{arm.state.time:5.2f} s: {error}')
             arm.move_to(arm.state.reference - 0.1 * ADVANCE)  # away from it

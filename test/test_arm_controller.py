@@ -10,9 +10,12 @@ import signal
 import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
+import yaml
 from recorded_run import limited_files, small_disk
 
 import blf_dsc_controller as blf
@@ -110,6 +113,8 @@ def test_reference_is_that_of_the_last_sample_and_its_own_copy():
         ((0.0, [0.0] * 3, [0.0] * 2), r'q: got an array of shape \(3,\), but \(2,\)'),
         ((0.0, [0.0] * 2, 0.0), r'dq: got an array of shape \(\), but \(2,\)'),
         ((0.0, [0.0] * 2, [0.0] * 2, [0.0]), r'effort: got an array of shape \(1,\)'),
+        ((0.0, 'high', [0.0] * 2), r'q: got what is no array of numbers, but \(2,\)'),
+        ((0.0, [0.0, [0.0]], [0.0] * 2), 'q: got what is no array of numbers'),
         ((math.nan, [0.0] * 2, [0.0] * 2), 'stamp: got nan, but a finite time'),
     ],
 )
@@ -308,3 +313,38 @@ def test_recording_of_a_loop_that_was_killed_is_not_said_to_be_whole(tmp_path, c
     recover(tmp_path / 'bag', tmp_path / 'saved')
     assert main(['replay', str(tmp_path / 'saved')]) == PARTIAL
     assert 'MISSING in the bag: the end of the run' in capsys.readouterr().out
+
+
+def errors_of_a_heavy_panda(config, record=None):
+    """Return the largest error [rad] of the first second, and of 7 more, in MuJoCo."""
+    arm = mujoco.MjModel.from_xml_path(str(blf.share_folder() / 'config/panda.urdf'))
+    arm.opt.timestep = 0.001
+    arm.dof_armature[:] = 0.1
+    arm.body_mass[:] *= 1.25  # the URDF is a fifth too light
+    arm.body_inertia[:] *= 1.25
+    data = mujoco.MjData(arm)
+    data.qpos[:7] = [-0.14, -0.04, -0.03, -1.43, -0.05, 1.66, 0.27]
+    errors = []
+    with blf.ArmController(config, record=record) as controller:
+        for _ in range(8000):
+            data.qfrc_applied[:7] = controller.update(
+                data.time, data.qpos[:7], data.qvel[:7]
+            )
+            mujoco.mj_step(arm, data)
+            errors.append(np.abs(controller.error).max())
+    return max(errors[:1000]), max(errors[1000:])
+
+
+def test_next_day_begins_with_what_a_day_has_shown(tmp_path, monkeypatch, capsys):
+    """As the page says: `blf_dsc identify` of the recorded day, and its robot.* in the file."""
+    monkeypatch.chdir(tmp_path)
+    first, _ = errors_of_a_heavy_panda('panda', 'day1')
+    arm = ['--urdf', 'panda.urdf', '--tip', 'panda_hand_tcp', '--effort', 'command']
+    outputs = ['--out', 'learned.urdf', '--out', 'learned.yaml']
+    assert main(['identify', 'day1', *arm, *outputs]) == 0, capsys.readouterr().err
+    learned = yaml.safe_load(Path('learned.yaml').read_text())['/**']['ros__parameters']
+    given = {name: learned[name] for name in learned if name != 'joints'}
+    loop = blf.load_loop('panda', {'blf_dsc_controller': given, 'sim_plant': given})
+    errors = errors_of_a_heavy_panda(loop.controller)
+    assert first > 0.01  # rad; 13 mrad
+    assert max(errors) < 0.001  # 0.5 mrad

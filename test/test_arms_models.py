@@ -565,3 +565,53 @@ def test_zero_tensor_rounding_below_zero_and_the_namespace_of_an_expanded_file_a
         '<robot name', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name'
     )
     assert len(panda(text).joints) == 7
+
+
+def tree(*chains):
+    """Return a URDF of chains of revolute joints `name1`, `name2`, ...: (name, parent, n)."""
+    links, joints = ['base'], []
+    for name, first, n in chains:
+        for k in range(1, n + 1):
+            parent = first if k == 1 else links[-1]
+            links.append(f'{name}{k}')
+            joints.append(
+                f'<joint name="{name}_joint{k}" type="revolute"><parent link="{parent}" />'
+                f'<child link="{links[-1]}" /></joint>'
+            )
+    inertial = '<inertial><mass value="1" /></inertial>'
+    bodies = [f'<link name="{link}">{inertial}</link>' for link in links]
+    return f'<robot name="tree">{"".join(bodies + joints)}</robot>'
+
+
+@pytest.mark.parametrize(
+    ('chains', 'message'),
+    [
+        (  # two arms with hands on a torso that also carries a head
+            (
+                ('torso', 'base', 1),
+                ('head', 'torso1', 2),
+                ('left', 'torso1', 7),
+                ('thumb', 'left7', 4),
+                ('index', 'left7', 4),
+                ('right', 'torso1', 7),
+            ),
+            ' and 9 more. Set robot.tip to the last link of the arm, such as left7 or right7',
+        ),
+        (  # a head above the first joint of the arm
+            (('yaw', 'base', 1), ('head', 'yaw1', 1), ('arm', 'yaw1', 6)),
+            'such as arm6',
+        ),
+        ((('arm', 'base', 6), ('f', 'arm6', 1), ('g', 'arm6', 1)), 'such as arm6'),
+    ],
+)
+def test_branching_arms_are_proposed_by_their_last_links(chains, message):
+    with pytest.raises(BlfDscError) as caught:
+        read_chain(tree(*chains), '', '', ())
+    assert str(caught.value).endswith(message)
+
+
+@pytest.mark.parametrize('joint', ['jointGripper', 'left_finger_joint', 'wrist'])
+def test_last_joint_that_is_called_a_gripper_is_taken_for_one(joint):
+    text = tree(('arm', 'base', 4)).replace('arm_joint4', joint)
+    found = read_chain(text, '', '', ()).gripper
+    assert found == ('' if joint == 'wrist' else joint)

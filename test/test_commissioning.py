@@ -597,6 +597,19 @@ def test_mode_that_is_all_noise_makes_no_resonance_between_two_lines():
     assert largest_of(refined(at_lines)) < 1.01 * largest_of(at_lines)
 
 
+def test_events_of_the_simulated_arm_are_not_measured():
+    """They are those of its own reference, such as a load that fades in."""
+    events = {
+        'events.begin': [1.0, 2.0],
+        'events.payload': [0.5, 0.0],
+        'events.ramp': [0.5, 0.0],
+        'events.torque': [0.0, 0.0, 1.0, 1.0],
+    }
+    run, _ = simulated.measured(planned(), change(ARM, events), 0.1)
+    alone, _ = simulated.measured(planned(), ARM, 0.1)
+    assert np.array_equal(run.torque, alone.torque)
+
+
 def test_simulated_arm_holds_with_the_chosen_gains():
     config = build(
         ControllerConfig,

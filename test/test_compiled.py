@@ -28,6 +28,7 @@ import plants
 import pytest
 from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
+from numba.core import event
 from numba.core.errors import TypingError, UnsupportedError
 from planted import Planted
 from random_arm import fill_states, random_urdf
@@ -36,6 +37,7 @@ import blf_dsc_controller
 from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled import (
+    announcement,
     dependencies,
     entry,
     jit,
@@ -51,16 +53,19 @@ from blf_dsc_controller.compiled.layout import (
     source_of,
     view_of,
 )
+from blf_dsc_controller.configuration import nodes
 from blf_dsc_controller.configuration.law_file import load_law
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.control import arm_controller
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import called_law
 from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.numerics import elementary
 from blf_dsc_controller.numerics.algebra import independent_columns, inverse, product
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
-from blf_dsc_controller.simulation import compiled_loop
+from blf_dsc_controller.simulation import compiled_loop, loop
 from blf_dsc_controller.simulation.compiled_loop import run_loop
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
@@ -828,6 +833,45 @@ def test_kernels_are_for_the_same_processors_when_numba_reads_its_environment_ag
     monkeypatch.setenv('NUMBA_HIGHLIGHT_DUMPS', '0')
     numba.config.reload_config()
     assert numba.config.CPU_NAME == 'x86-64-v3'
+
+
+@pytest.mark.parametrize(
+    ('module', 'first', 'name', 'arguments'),
+    [
+        (nodes, '_load_all', 'load_loop', ('recommended',)),
+        (loop, 'plant_of', 'simulate', ()),
+        (arm_controller, 'GuardedLoop', 'ArmController', ('recommended',)),
+    ],
+)
+def test_log_tells_a_caller_from_python_what_is_compiled(
+    module, first, name, arguments, monkeypatch, caplog
+):
+    """Nothing else would tell why a first call takes a minute."""
+    if name == 'simulate':
+        given = load_loop('recommended')
+        arguments = given.controller, given.plant
+    kernel = kernel_cache.KERNELS[0]
+
+    def compiles(*_given, **_named):
+        with event.trigger_event('numba:compile', data={'dispatcher': kernel}):
+            raise BlfDscError('compiled')
+
+    monkeypatch.setattr(module, first, compiles)
+    with pytest.raises(BlfDscError, match='compiled'):
+        getattr(module, name)(*arguments)
+    (record,) = caplog.records
+    assert record.levelname == 'WARNING'
+    assert record.getMessage().startswith('compiling kernel 1 of at most ')
+
+    caplog.clear()
+    notices = []
+    with (
+        announcement.announced_compilation(notices.append),
+        pytest.raises(BlfDscError, match='compiled'),
+    ):
+        getattr(module, name)(*arguments)
+    assert len(notices) == 1
+    assert not caplog.records
 
 
 RACE = """

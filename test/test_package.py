@@ -21,6 +21,7 @@ import pytest
 import yaml
 
 import blf_dsc_controller
+from blf_dsc_controller import errors
 from blf_dsc_controller.compiled import linked
 from blf_dsc_controller.errors import (
     BlfDscError,
@@ -268,6 +269,15 @@ def test_public_names_are_documented_and_imported_on_first_use(tmp_path):
         assert getattr(blf_dsc_controller, name).__doc__, name
     program = 'import sys, blf_dsc_controller; assert "numpy" not in sys.modules'
     subprocess.run([sys.executable, '-c', program], cwd=tmp_path, check=True)
+
+
+def test_errors_to_catch_are_public():
+    kinds = vars(errors).values()
+    names = {each.__name__ for each in kinds if isinstance(each, type)}
+    for method in vars(blf_dsc_controller.ArmController).values():
+        names.update(re.findall(r'^ +(\w+Error): ', method.__doc__ or '', re.MULTILINE))
+    assert {'BlfDscError', 'StartError', 'StateError', 'TrajectoryError'} <= names
+    assert names <= set(blf_dsc_controller.__all__)
 
 
 def test_errors_can_be_passed_between_processes():

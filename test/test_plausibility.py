@@ -98,18 +98,23 @@ def test_value_of_a_simulated_arm_likewise(case, arm):
 @given(
     seed=st.integers(0, 10_000),
     n=st.integers(1, 7),
+    unlimited=st.integers(0, 7),
     effort=st.floats(1e-2, 1e4),
     velocity=st.floats(1e-2, 1e2),
     width=st.floats(0.05, 10.0),
 )
-def test_what_follows_from_any_urdf_is_accepted(seed, n, effort, velocity, width):
-    """Weak and strong arms, slow and fast, of narrow and wide ranges."""
+def test_what_follows_from_any_urdf_is_accepted(
+    seed, n, unlimited, effort, velocity, width
+):
+    """Weak and strong arms, slow and fast, of narrow and wide ranges, or of none in part."""
     text, _ = random_urdf(n, seed)
     limit = (
         f'<limit lower="{-width / 2!r}" upper="{width / 2!r}" velocity="{velocity!r}" '
         f'effort="{effort!r}" />'
     )
-    arm = {'robot.urdf': re.sub('<limit [^>]*>', limit, text), 'robot.tip': 'tip'}
+    text = re.sub('<limit [^>]*>', limit, text)
+    text = text.replace(limit, '', unlimited).replace('revolute', 'continuous')
+    arm = {'robot.urdf': text, 'robot.tip': 'tip'}
     build(ControllerConfig, arm)
     build(PlantConfig, arm)
 

@@ -18,6 +18,7 @@ Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed 
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -43,6 +44,8 @@ from blf_dsc_controller.numerics.elementary import cos, sin
 
 _MOVING = ('revolute', 'continuous', 'prismatic')
 _MOST_KINDS = 5  # that a message names
+_MOST_NAMES = 16  # likewise
+_GRIPPER = re.compile('gripper|finger|jaw', re.IGNORECASE)
 _ACCELERATIONS = ('acceleration', 'deceleration')  # of URDF 1.2
 _MAX_ELEMENTS = 500  # of links, and of joints
 _LIMITS = ('lower', 'upper', 'velocity', 'effort', *_ACCELERATIONS)
@@ -100,12 +103,16 @@ class Chain:
 
     @property
     def gripper(self) -> str:
-        """Name of a last joint that slides where all others turn; empty if there is none.
+        """Name of a last joint that may be that of a gripper; empty if there is none.
 
-        It may be that of a gripper.
+        It slides where all others turn, or is called so.
         """
-        *arm, last = (joint.kind == 'prismatic' for joint in self.joints)
-        return self.joints[-1].name if last and arm and not any(arm) else ''
+        *arm, last = self.joints
+        if not arm:
+            return ''
+        slides = [joint.kind == 'prismatic' for joint in self.joints]
+        is_one = _GRIPPER.search(last.name) or (slides[-1] and sum(slides) == 1)
+        return last.name if is_one else ''
 
 
 @lru_cache(maxsize=16)
@@ -297,6 +304,25 @@ class Tree(NamedTuple):
         common = set.intersection(*map(set, leaves)) if leaves else set()
         return tuple(name for name in max(paths, key=len, default=()) if name in common)
 
+    def limbs(self) -> tuple[str, ...]:
+        """Return where the longest chains that do not branch end, such as the arms of a torso."""
+        ends = {
+            name: _link(joint, 'child')
+            for name, joint in self.joints.items()
+            if joint.get('type') in _MOVING
+        }
+        paths = {name: _moving(self.path(self.root, ends[name])) for name in ends}
+        next_ones = Counter(path[-2] for path in paths.values() if len(path) > 1)
+        lengths = {}
+        for name, path in paths.items():
+            if next_ones[name] != 1:
+                inner = itertools.takewhile(
+                    lambda each: next_ones[each] == 1, path[-2::-1]
+                )
+                lengths[name] = len([*inner])
+        longest = max(lengths.values(), default=0)
+        return tuple(ends[name] for name in lengths if lengths[name] == longest)
+
     def turning(self, joints: Sequence[str]) -> np.ndarray:
         """Return which of some joints turn (n,), the others being prismatic."""
         kinds = [self.joints[name].get('type') for name in joints]
@@ -317,12 +343,10 @@ class Tree(NamedTuple):
             )
         trunk = self.trunk()
         if len(trunk) < len(moving):
-            such = (
-                f', such as {_link(self.joints[trunk[-1]], "child")}' if trunk else ''
-            )
+            such = ' or '.join(self.limbs()[:_MOST_KINDS])
             raise BlfDscError(
                 'neither a tip nor joints were given, and the moving joints are not one chain: '
-                f'{_listed(moving)}. Set robot.tip to the last link of the arm{such}'
+                f'{_shortened(moving)}. Set robot.tip to the last link of the arm, such as {such}'
             )
         return trunk
 
@@ -570,3 +594,9 @@ def _of_comma(text: str) -> str:
 
 def _listed(names: Iterable[object]) -> str:
     return ', '.join(map(str, names)) or 'none'
+
+
+def _shortened(names: Sequence[str]) -> str:
+    """Return the first of many names, and how many follow."""
+    more = len(names) - _MOST_NAMES
+    return _listed(names[:_MOST_NAMES]) + (f' and {more} more' if more > 0 else '')

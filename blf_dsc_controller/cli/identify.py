@@ -174,9 +174,8 @@ def _facts(found: Identified, options: Namespace) -> list[str]:
     lines = [origin, header_of(found), *problems_of(found, options.effort)]
     if found.chain.gripper and not options.tip:
         lines.append(
-            f'{found.chain.gripper}, which slides at the end of an arm that turns, was identified '
-            'as a joint of the arm; if it is a gripper, give the link that carries it: --tip '
-            f'{found.chain.joints[-2].link}'
+            f'{found.chain.gripper} was identified as a joint of the arm; if it is that of a '
+            f'gripper, give the link that carries it: --tip {found.chain.joints[-2].link}'
         )
     return [textwrap.fill(line, _WIDTH) for line in [*lines, *notes_of(found)]]
 

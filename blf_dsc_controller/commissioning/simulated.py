@@ -18,7 +18,7 @@ from blf_dsc_controller.commissioning.own_loop import (
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import cycles_of
 from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.plant import PlantConfig, pick_ups
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
@@ -46,10 +46,7 @@ def measured(planned: Planned, plant: PlantConfig, payload: float = 0.0) -> Meas
     arm = {
         'duration': planned.duration,
         'initial.position': planned.posture.tolist(),
-        'events.begin': [0.0] * len(loaded),
-        'events.duration': [0.0] * len(loaded),
-        'events.payload': loaded,
-    }
+    } | pick_ups([0.0] * len(loaded), loaded)
     run = simulate(planned.config, change(plant, arm)).run()
     for stop in run.stops:
         raise BlfDscError(f'the simulated arm stopped: {stop.text}')

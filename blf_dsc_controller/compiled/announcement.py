@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from numba.core import event
@@ -16,18 +17,32 @@ COMPILING = 'compiling kernel '
 """How a notice begins."""
 
 
-def announced_compilation(
-    say: Callable[[str], object],
-) -> AbstractContextManager[object]:
+_contexts: list[object] = []  # in which compilation is announced
+
+
+@contextmanager
+def announced_compilation(say: Callable[[str], object]) -> Iterator[None]:
     """Call `say` with a notice for each kernel not in the cache that is compiled in this context.
 
     Only numba knows this: a kernel has a version for each type of arguments. Of those
     that are loaded, some may not be called.
     """
-    listener: AbstractContextManager[object] = event.install_listener(
-        'numba:compile', _Listener(say)
-    )
-    return listener
+    _contexts.append(say)
+    try:
+        with event.install_listener('numba:compile', _Listener(say)):
+            yield
+    finally:
+        _contexts.remove(say)
+
+
+@contextmanager
+def logged_compilation() -> Iterator[None]:
+    """Log the notices, for who calls the package from Python, unless they are announced."""
+    if _contexts:
+        yield
+        return
+    with announced_compilation(logging.getLogger('blf_dsc_controller').warning):
+        yield
 
 
 class _Listener(event.Listener):  # type: ignore[misc]

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration import known_arm, law_file, received
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
@@ -224,6 +225,7 @@ def load(
     return config
 
 
+@logged_compilation()
 def load_loop(
     given: str | Path,
     overrides: Mapping[str, Mapping[str, object]] | None = None,

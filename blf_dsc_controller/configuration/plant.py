@@ -9,7 +9,7 @@ controller.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -81,6 +81,17 @@ class Events:
     viscous: PerEventAndJoint = _of_events('change in viscous friction', 'N m s/rad')
     coulomb: PerEventAndJoint = _of_events('change in Coulomb friction', 'N m')
     offset: PerEventAndJoint = _of_events('change in encoder offset', 'rad')
+
+
+def pick_ups(times: Sequence[float], masses: Sequence[float]) -> dict[str, Value]:
+    """Return the changes of a plant whose only events are loads [kg], from `times` [s] on."""
+    lists = [name for name, value in vars(Events()).items() if value == ()]
+    changes: dict[str, Value] = {f'events.{name}': () for name in lists}
+    return changes | {
+        'events.begin': tuple(times),
+        'events.duration': (0.0,) * len(times),
+        'events.payload': tuple(masses),
+    }
 
 
 @dataclass(frozen=True)

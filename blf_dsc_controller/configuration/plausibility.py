@@ -136,14 +136,18 @@ def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
 def _of_velocity(config: Checked, chain: Chain | None) -> Iterator[_Doubt]:
     """Check the velocity of a broken measurement against the speed of the joints."""
     limit = config.safety.velocity_limit
-    joints = chain.joints if chain else ()
-    speeds = [joint.velocity for joint in joints if math.isfinite(joint.velocity)]
-    fastest = max(speeds, default=max(config.limits.velocity))
-    if limit > (_BROKEN if speeds else _UNKNOWN) * fastest:
+    motions = config.limits.velocity
+    unlimited = [math.inf] * len(motions)
+    speeds = [joint.velocity for joint in chain.joints] if chain else unlimited
+    pairs = list(zip(speeds, motions, strict=True))
+    known = max((speed for speed, _ in pairs if math.isfinite(speed)), default=0.0)
+    assumed = max((motion for speed, motion in pairs if math.isinf(speed)), default=0.0)
+    if limit > max(_BROKEN * known, _UNKNOWN * assumed):
+        fastest, source = (assumed, ' (limits.velocity)') if assumed else (known, '')
         yield _Doubt(
             'safety.velocity_limit',
-            f'got {limit:g} rad/s, but the fastest joint has {fastest:.3g} rad/s'
-            f'{"" if speeds else " (limits.velocity)"}: {_of_degrees(limit)}',
+            f'got {limit:g} rad/s, but the fastest joint has {fastest:.3g} rad/s{source}: '
+            f'{_of_degrees(limit)}',
         )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
@@ -94,6 +95,7 @@ class ArmController:
         joints: names of the n joints, in the order of all arrays.
     """
 
+    @logged_compilation()
     def __init__(
         self,
         config: ControllerConfig | str | Path,
@@ -238,12 +240,16 @@ class ArmController:
         self, name: str, values: ArrayLike, shape: tuple[int, ...] = ()
     ) -> Vector:
         """Return an array of a shape, by default (n,)."""
-        array = np.asarray(values, dtype=np.float64)
         needed = shape or (len(self.joints),)
+        try:
+            array = np.asarray(values, dtype=np.float64)
+            got = f'an array of shape {array.shape}'
+        except (TypeError, ValueError):
+            array, got = np.empty(0), 'what is no array of numbers'
         if array.shape != needed:
             raise StateError(
-                f'{name}: got an array of shape {array.shape}, but {needed} is needed: one value '
-                f'for each of {", ".join(self.joints)}'
+                f'{name}: got {got}, but {needed} is needed: one value for each of '
+                f'{", ".join(self.joints)}'
             )
         return array
 

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
@@ -52,6 +53,7 @@ from sim_plant.settings import parameter_names_of, steps_of
 _CHUNK = 1000  # samples; the guard takes about 20 ms for them
 
 
+@logged_compilation()
 def simulate(
     controller_config: ControllerConfig,
     plant_config: PlantConfig,

@@ -22,6 +22,7 @@ import numpy as np
 from blf_dsc_controller.analysis.output import aligned, write_json
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
+from blf_dsc_controller.configuration.plant import pick_ups
 from blf_dsc_controller.configuration.schema import change, suggestion
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.inertia import joint_inertia
@@ -135,6 +136,8 @@ def law_changes(
 ) -> dict[str, object]:
     """Return the parameters for this law with these gains."""
     changes: dict[str, object] = {'law': studied.law}
+    if studied.law != 'blf_dsc':  # which alone has a load observer
+        changes['disturbance.observer_bandwidth'] = 0.0
     config = change(config, changes)  # a law of a file has gains of its own
     if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
@@ -158,6 +161,18 @@ def law_changes(
         limit = np.maximum(config.barrier.slope_limit, _STIFFEST * weight)
         changes['barrier.slope_limit'] = limit.tolist()
     return changes
+
+
+def unsuitable(name: str, config: ControllerConfig) -> str:
+    """Return why the gains of a law are none for the arm of a configuration; empty if they are."""
+    law = LAWS[name]
+    untuned = law.law == COMPUTED_TORQUE and not law.gains
+    if config.feedback.inertia == 'whole' or not (untuned or _DAMPING in law.gains):
+        return ''
+    return (
+        f'{name}: its gains act through the inertia, and those of this arm on each joint '
+        f'(feedback.inertia {config.feedback.inertia}): choose laws such as computed_torque_tuned'
+    )
 
 
 def inertia_of_joints(config: ControllerConfig) -> np.ndarray:
@@ -235,7 +250,11 @@ def load_laws(path: Path) -> list[str]:
         )
     added: dict[str, StudiedLaw] = getattr(module, 'LAWS', {})
     if not added or not all(isinstance(each, StudiedLaw) for each in added.values()):
-        raise BlfDscError(f'{path}: LAWS must be a dict of StudiedLaw by name')
+        raise BlfDscError(
+            f'{path}: LAWS must be a dict of StudiedLaw by name. For the law of a file, write a '
+            "second one with LAWS = {'mine': StudiedLaw('my law', (), 'my_law.py')}, as in "
+            'doc/tutorial_law.md'
+        )
     for name, law in added.items():
         if LAWS.setdefault(name, law) is not law:
             raise BlfDscError(
@@ -280,10 +299,7 @@ def trial(
         'duration': DURATION,
         'seed': seed,
         'truth.seed': loop.plant.truth.seed + seed,
-        'events.begin': [PICK_UP],
-        'events.duration': [0.0],
-        'events.payload': [max(events.payload, default=0.0)],
-    }
+    } | pick_ups([PICK_UP], [max(events.payload, default=0.0)])
     # No funnel, since the other laws have none: all approach the motion from rest.
     law = change(
         loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
@@ -339,11 +355,16 @@ def compare(
 ) -> dict[str, dict[str, Result]]:
     """Tune and run everything, write figures.json, and return the results.
 
-    `laws` are as in `chosen_laws`.
+    `laws` are as in `chosen_laws`. Those that are `unsuitable` for an arm are left out there.
     """
     names = chosen_laws(laws)
     results: dict[str, dict[str, Result]] = {arm: {} for arm in arms}
-    rows = [(arm, name) for arm in arms for name in names]
+    rows = [
+        (arm, name)
+        for arm in arms
+        for name in names
+        if not unsuitable(name, trial(arm, 0).controller)
+    ]
     with ProcessPoolExecutor(
         cores(), initializer=chosen_laws, initargs=(laws,)
     ) as pool:

@@ -118,9 +118,8 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     chain = config.robot.chain(config.joints)
     if chain.gripper and not config.robot.tip:
         yield (
-            f'robot.tip: without it, {chain.gripper}, which slides at the end of a turning arm, '
-            'is one of the joints of the arm. If it is a gripper, give the link that carries it: '
-            f'{chain.joints[-2].link}'
+            f'robot.tip: without it, {chain.gripper} is one of the joints of the arm. If it is '
+            f'that of a gripper, give the link that carries it: {chain.joints[-2].link}'
         )
     for joint, limit, inertia in zip(
         chain.joints, config.torque.limit, load.free_inertia, strict=True
