@@ -36,7 +36,6 @@ from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
 from blf_dsc_controller.drive.drivers import find_driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.drive.ticks import Ticks
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Register, Status
