@@ -280,7 +280,7 @@ def test_friction_is_measured_once_a_window_says_enough(rows, least, learns):
     law.state.latch.least_residual[0] = least
     reverse(law, 0.8, 5)
     assert (
-        bool(law.state.friction.reversal_estimate[0, 0] == pytest.approx(0.8, abs=0.05))
+        bool(law.state.friction.reversals.coulomb[0, 0] == pytest.approx(0.8, abs=0.05))
         == learns
     )
 
@@ -330,7 +330,7 @@ def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed
     assumed = settings.initial
     learned = assumed * random.uniform(1.0 / 3.0, 3.0, n)
     claims = assumed * random.uniform(0.0, 3.0, (4, n))
-    state.reversal_estimate[:] = claims[:2]
+    state.reversals.coulomb[:] = claims[:2]
     state.drift_extremes[0] = np.minimum(claims[2] - learned, 0.0)
     state.drift_extremes[1] = np.maximum(claims[3] - learned, 0.0)
     state.breakaway[:] = random.uniform(0.0, 1.0, n)
@@ -341,7 +341,7 @@ def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed
         used = friction.coulomb_torque(settings, state, work, learned[i], i)
         band = settings.unmodelled[i]
         changed = learned[i] + state.drift_extremes[:, i]
-        for true in (learned[i], *state.reversal_estimate[:, i], *changed):
+        for true in (learned[i], *state.reversals.coulomb[:, i], *changed):
             error = abs(used - scale[i] * true)
             not_knowing = abs(assumed[i] - scale[i] * true)
             assert error <= not_knowing + scale[i] * band + 1e-12
@@ -354,7 +354,7 @@ def test_evidence_changes_no_torque_until_the_joint_reverses():
     estimate, disturbance = law.state.estimate, law.state.disturbance
     learned = estimate[settings.first_coulomb :]
     learned *= 2.0
-    state.reversal_estimate[:] = learned
+    state.reversals.coulomb[:] = learned
     work.sign[:] = [1.0, -1.0, 0.5, 0.0, 1.0, -1.0]
     for i, c in enumerate(learned):
         work.torque[i] = friction.coulomb_torque(settings, state, work, c, i)

@@ -20,7 +20,8 @@ least squares give c and c k from what the other columns leave of the torque, e:
 
 with b = s exp(-(v / v_s)^2).  The sums forget once they contain `_ENERGY`, some eight
 reversals.  If the last two reversals both contradict them by more than the unmodelled
-torque f, they overrule what is older.
+torque f, they overrule what is older.  If the arm has changed, the rows since some 0.2 s
+before that was found are forgotten: of these, the step is the change's.
 
 *Used within the evidence.*  What is learned of friction must not cost more than not knowing it,
 which errs by |c_0 - c|.  Two things may contradict c^ before the sums do: a reversal that shows
@@ -52,6 +53,7 @@ _SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its frictio
 _PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
+_LATE = 0.15  # s, by which a change of the arm is found
 _MOVING = 0.9  # of |s|: below it a joint reverses
 
 # Rows of the sums over products of s_h, b_h and e_h
@@ -79,6 +81,16 @@ class Settings(NamedTuple):
     gain: Annotated[Array, 'n']  # Gamma kappa of its columns, 1/s
 
 
+class Reversals(NamedTuple):
+    """What the reversals of the joints have shown."""
+
+    # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
+    past: Annotated[Array, 5, 'n']
+    present: Annotated[Array, 5, 'n']  # likewise, over the present one
+    # Coulomb friction by the last reversal and the one before, N m
+    coulomb: Annotated[Array, 2, 'n']
+
+
 class State(NamedTuple):
     """What it keeps from one sample to the next."""
 
@@ -87,11 +99,10 @@ class State(NamedTuple):
     shape_lags: Annotated[Array, 2, 3, 'n']
     column_lags: Annotated[Array, 2, 2, 'n']  # of s_h and b_h
     torque_lags: Annotated[Array, 2, 'n']  # of e_h, N m
-    # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
-    reversal_sums: Annotated[Array, 5, 'n']
-    latest_sums: Annotated[Array, 5, 'n']  # likewise, over the present one
-    # Coulomb friction by the last reversal and the one before, N m
-    reversal_estimate: Annotated[Array, 2, 'n']
+    reversals: Reversals
+    earlier: Reversals  # some `_LATE` ago or less
+    earliest: Reversals  # one to two times as long ago
+    since_kept: Cell  # s, since they were kept
     # k^, breakaway torque relative to Coulomb friction
     breakaway: Annotated[Array, 'n']
     moves: Annotated[Array, 'n']  # 1 while the joint does not reverse
@@ -116,8 +127,17 @@ class Work(NamedTuple):
 def begin(settings: Settings, state: State) -> None:
     """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
     for i in range(settings.initial.size):
-        state.reversal_estimate[0, i] = settings.initial[i]
-        state.reversal_estimate[1, i] = settings.initial[i]
+        state.reversals.coulomb[0, i] = settings.initial[i]
+        state.reversals.coulomb[1, i] = settings.initial[i]
+    copy(state.reversals, state.earlier)
+    copy(state.reversals, state.earliest)
+
+
+@inner
+def is_coulomb(settings: Settings, j: int) -> bool:
+    """Whether entry j of theta is Coulomb friction that reversals show, not the window."""
+    at = j - settings.first_coulomb
+    return bool(settings.learns == 1 and 0 <= at < settings.initial.size)
 
 
 @inner
@@ -136,8 +156,8 @@ def coulomb_torque(
     if settings.learns == 1 and settings.bumpless == 1:
         band = settings.unmodelled[i]
         for evidence in (
-            beyond(state.reversal_estimate[0, i] - learned, band),
-            beyond(state.reversal_estimate[1, i] - learned, band),
+            beyond(state.reversals.coulomb[0, i] - learned, band),
+            beyond(state.reversals.coulomb[1, i] - learned, band),
             beyond(state.observer_drift[i], band),
             beyond(state.drift_extremes[0, i], band),
             beyond(state.drift_extremes[1, i], band),
@@ -291,8 +311,9 @@ def measure_reversals(
     """
     gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
-    latest = state.latest_sums
+    latest = state.reversals.present
     lags = state.column_lags
+    keep_reversals(state, dt)
     for i in range(rows.shape[0]):
         e = unexplained(rows[i], estimate, settings.first_coulomb + i)
         s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
@@ -318,7 +339,7 @@ def update_since_latch(state: State, latched: float, dt: float) -> float:
 def shown_energy(state: State, i: int) -> float:
     """Return p int (g s)_h^2 dt of the present reversal of joint i."""
     k = state.breakaway[i]
-    latest = state.latest_sums
+    latest = state.reversals.present
     return float(latest[_SS, i] + 2.0 * k * latest[_SB, i] + k * k * latest[_BB, i])
 
 
@@ -328,21 +349,28 @@ def estimate_reversal(settings: Settings, state: State, i: int, before: float) -
     energy = shown_energy(state, i)
     if energy <= _SHOWN:
         return
-    found = state.reversal_estimate
+    found = state.reversals.coulomb
     if before <= _SHOWN:
         found[1, i] = found[0, i]
         state.drift_extremes[0, i] = 0.0
         state.drift_extremes[1, i] = 0.0
-    latest = state.latest_sums
+    found[0, i] = friction_shown(settings, state, i)
+
+
+@inner
+def friction_shown(settings: Settings, state: State, i: int) -> float:
+    """Return the Coulomb friction of joint i by the present reversal alone [N m]."""
+    latest = state.reversals.present
     torque = latest[_SE, i] + state.breakaway[i] * latest[_BE, i]
-    found[0, i] = clip(torque / energy, settings.least[i], settings.most[i])
+    least, most = settings.least[i], settings.most[i]
+    return clip(torque / shown_energy(state, i), least, most)
 
 
 @inner
 def close_reversal(settings: Settings, state: State, i: int) -> None:
     """Add the sums of the present reversal of joint i to those of all; begin new ones."""
-    latest = state.latest_sums
-    sums = state.reversal_sums
+    latest = state.reversals.present
+    sums = state.reversals.past
     is_shown = shown_energy(state, i) > _SHOWN
     excess = sums[_SS, i] + latest[_SS, i] - _ENERGY
     keep = 1.0
@@ -356,22 +384,61 @@ def close_reversal(settings: Settings, state: State, i: int) -> None:
 
 
 @inner
-def forget_begun(state: State) -> None:
-    """Forget reversals that have just begun, since the arm changed.
+def keep_reversals(state: State, dt: float) -> None:
+    """Keep what reversals have shown, each `_LATE`, and what was kept before."""
+    state.since_kept[0] += dt
+    if state.since_kept[0] > _LATE:
+        state.since_kept[0] = 0.0
+        copy(state.earlier, state.earliest)
+        copy(state.reversals, state.earlier)
 
-    Most of their rows are of the change, and a load looks like the step of friction.
+
+@inner
+def copy(source: Reversals, out: Reversals) -> None:
+    """Copy what reversals have shown."""
+    for i in range(out.coulomb.shape[1]):
+        for k in range(5):
+            out.past[k, i] = source.past[k, i]
+            out.present[k, i] = source.present[k, i]
+        for k in range(2):
+            out.coulomb[k, i] = source.coulomb[k, i]
+
+
+@inner
+def take_back(settings: Settings, state: State) -> None:
+    """Take back what the last rows have shown, since the arm changed.
+
+    They are of the change, and a load looks like the step of friction.  A reversal that
+    has just begun is forgotten as a whole.
     """
-    for i in range(state.moves.size):
+    copy(state.earliest, state.reversals)
+    for i in range(settings.initial.size):
         if shown_energy(state, i) <= _SHOWN:
             for k in range(5):
-                state.latest_sums[k, i] = 0.0
+                state.reversals.present[k, i] = 0.0
+    copy(state.reversals, state.earliest)
+    copy(state.reversals, state.earlier)
+
+
+@inner
+def return_estimate(
+    settings: Settings, state: State, active: Array, estimate: Array
+) -> None:
+    """Set c^, in theta^ (m,), and k^ to what reversals show, if it is learned and `active` (m,)."""
+    if settings.learns == 0:
+        return
+    for i in range(settings.initial.size):
+        j = settings.first_coulomb + i
+        if active[j] == 1.0 and settings.gain[i] > 0.0:
+            coulomb, state.breakaway[i] = learned_friction(settings, state, i)
+            estimate[j] = clip(coulomb, settings.least[i], settings.most[i])
 
 
 @inner
 def overrule(settings: Settings, state: State, i: int) -> None:
     """Give the sums of joint i the friction of the last two reversals if both contradict them."""
     coulomb, stribeck = learned_friction(settings, state, i)
-    found = state.reversal_estimate
+    found = state.reversals.coulomb
     band = settings.unmodelled[i]
     last = beyond(found[0, i] - coulomb, band)
     other = beyond(found[1, i] - coulomb, band)
@@ -379,7 +446,7 @@ def overrule(settings: Settings, state: State, i: int) -> None:
         return
     level = 0.5 * (found[0, i] + found[1, i])
     extra = level * stribeck
-    sums = state.reversal_sums
+    sums = state.reversals.past
     sums[_SE, i] = level * sums[_SS, i] + extra * sums[_SB, i]
     sums[_BE, i] = level * sums[_SB, i] + extra * sums[_BB, i]
 
@@ -389,8 +456,8 @@ def learned_friction(settings: Settings, state: State, i: int) -> tuple[float, f
     """Return c [N m] and k of joint i by all sums, k within its limits."""
     f = settings.unmodelled[i]
     pull = _PRIOR * f * f / settings.variance[i]
-    sums = state.reversal_sums
-    latest = state.latest_sums
+    sums = state.reversals.past
+    latest = state.reversals.present
     se = sums[_SE, i] + latest[_SE, i] + pull * settings.initial[i]
     be = sums[_BE, i] + latest[_BE, i]
     ss = sums[_SS, i] + latest[_SS, i] + pull
