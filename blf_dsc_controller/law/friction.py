@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction along the reference: what reversals show of it, and how much of that is used.
+"""Friction along the reference: how much of what reversals show of it is used.
 
 Coulomb friction changes its sign where a joint reverses, faster than d^3 can follow: an
 error of the estimate pushes the joint by twice that in each reversal.  In geared joints
@@ -10,18 +10,9 @@ has when the torque acts, is
 
 with the shapes of `arms.friction`.
 
-*Learned from reversals.*  The window cannot be trusted with it: its rows are dominated by the
-frequencies of the reference, at which a sin w t against the velocity takes 0.64 a off the estimate
-and leaves no residual.  What only friction has is the step.  So the rows, and s and g s of the
+*Learned from reversals.*  What only friction has is the step.  So the rows, and s and g s of the
 measured velocity, pass a band around the pole p of the row's filter, x_h = (s / (s + p))^2 x, and
-least squares give c and c k from what the other columns leave of the torque, e:
-
-    min  p int (e_h - c s_h - c k b_h)^2 dt + l (c - c_0)^2 + l_b (c k)^2
-
-with b = s exp(-(v / v_s)^2).  The sums forget once they contain `_ENERGY`, some eight
-reversals.  If the last two reversals both contradict them by more than the unmodelled
-torque f, they overrule what is older.  If the arm has changed, the rows since some 0.2 s
-before that was found are forgotten: of these, the step is the change's.
+`reversals` finds c^ and k^ from what the other columns leave of the torque.
 
 *Used within the evidence.*  What is learned of friction must not cost more than not knowing it,
 which errs by |c_0 - c|.  Two things may contradict c^ before the sums do: a reversal that shows
@@ -45,19 +36,12 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fading, sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law import reversals
 from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
+from blf_dsc_controller.law.reversals import beyond
 
-_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
-_SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
-_PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
-_STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
-_MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
-_LATE = 0.15  # s, by which a change of the arm is found
 _MOVING = 0.9  # of |s|: below it a joint reverses
-
-# Rows of the sums over products of s_h, b_h and e_h
-_SE, _BE, _SS, _SB, _BB = range(5)
 
 
 class Settings(NamedTuple):
@@ -73,22 +57,8 @@ class Settings(NamedTuple):
     coulomb_velocity: float  # v_c, rad/s
     lag: float  # of measured velocities and applied torques together, s
     pole: float  # p of the row filters, rad/s
-    unmodelled: Annotated[Array, 'n']  # f, rms torque that no column describes, N m
-    initial: Annotated[Array, 'n']  # c_0, N m
-    variance: Annotated[Array, 'n']  # of c_0, (N m)^2
-    least: Annotated[Array, 'n']  # value that c^ can have, N m
-    most: Annotated[Array, 'n']
+    reversals: reversals.Settings
     gain: Annotated[Array, 'n']  # Gamma kappa of its columns, 1/s
-
-
-class Reversals(NamedTuple):
-    """What the reversals of the joints have shown."""
-
-    # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
-    past: Annotated[Array, 5, 'n']
-    present: Annotated[Array, 5, 'n']  # likewise, over the present one
-    # Coulomb friction by the last reversal and the one before, N m
-    coulomb: Annotated[Array, 2, 'n']
 
 
 class State(NamedTuple):
@@ -99,10 +69,7 @@ class State(NamedTuple):
     shape_lags: Annotated[Array, 2, 3, 'n']
     column_lags: Annotated[Array, 2, 2, 'n']  # of s_h and b_h
     torque_lags: Annotated[Array, 2, 'n']  # of e_h, N m
-    reversals: Reversals
-    earlier: Reversals  # some `_LATE` ago or less
-    earliest: Reversals  # one to two times as long ago
-    since_kept: Cell  # s, since they were kept
+    reversals: reversals.State
     # k^, breakaway torque relative to Coulomb friction
     breakaway: Annotated[Array, 'n']
     moves: Annotated[Array, 'n']  # 1 while the joint does not reverse
@@ -126,24 +93,14 @@ class Work(NamedTuple):
 @inner
 def begin(settings: Settings, state: State) -> None:
     """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
-    for i in range(settings.initial.size):
-        state.reversals.coulomb[0, i] = settings.initial[i]
-        state.reversals.coulomb[1, i] = settings.initial[i]
-    copy(state.reversals, state.earlier)
-    copy(state.reversals, state.earliest)
+    reversals.begin(settings.reversals, state.reversals)
 
 
 @inner
 def is_coulomb(settings: Settings, j: int) -> bool:
     """Whether entry j of theta is Coulomb friction that reversals show, not the window."""
     at = j - settings.first_coulomb
-    return bool(settings.learns == 1 and 0 <= at < settings.initial.size)
-
-
-@inner
-def beyond(x: float, band: float) -> float:
-    """Return z(x), by how much x is outside of [-band, band]."""
-    return x - clip(x, -band, band)
+    return bool(settings.learns == 1 and 0 <= at < settings.reversals.initial.size)
 
 
 @inner
@@ -154,10 +111,11 @@ def coulomb_torque(
     low = learned
     high = learned
     if settings.learns == 1 and settings.bumpless == 1:
-        band = settings.unmodelled[i]
+        band = settings.reversals.unmodelled[i]
+        shown = state.reversals.shown.coulomb
         for evidence in (
-            beyond(state.reversals.coulomb[0, i] - learned, band),
-            beyond(state.reversals.coulomb[1, i] - learned, band),
+            beyond(shown[0, i] - learned, band),
+            beyond(shown[1, i] - learned, band),
             beyond(state.observer_drift[i], band),
             beyond(state.drift_extremes[0, i], band),
             beyond(state.drift_extremes[1, i], band),
@@ -165,7 +123,7 @@ def coulomb_torque(
             low = min(low, learned + evidence)
             high = max(high, learned + evidence)
     scale = 1.0 + state.breakaway[i] * work.stribeck[i]
-    level = clip(settings.initial[i], scale * low, scale * high)
+    level = clip(settings.reversals.initial[i], scale * low, scale * high)
     return float(level * work.sign[i])
 
 
@@ -240,7 +198,8 @@ def follow_motion(settings: Settings, state: State, work: Work) -> None:
             extremes[1, i] = max(extremes[1, i], drift[i])
             drift[i] = 0.0
         if not moves and state.moves[i] == 1.0:
-            close_reversal(settings, state, i)
+            shown = state.reversals.shown
+            reversals.close(settings.reversals, shown, i, state.breakaway[i])
         state.moves[i] = 1.0 if moves else 0.0
 
 
@@ -311,21 +270,26 @@ def measure_reversals(
     """
     gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
-    latest = state.reversals.present
     lags = state.column_lags
-    keep_reversals(state, dt)
+    reversals.keep(state.reversals, dt)
     for i in range(rows.shape[0]):
         e = unexplained(rows[i], estimate, settings.first_coulomb + i)
         s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
         b_h = high_pass(lags[1], i, gain, state.shape_lags[1, 2, i], begins)
         e_h = high_pass(state.torque_lags, i, gain, e, begins)
-        before = shown_energy(state, i)
-        latest[_SE, i] += weight * s_h * e_h
-        latest[_BE, i] += weight * b_h * e_h
-        latest[_SS, i] += weight * s_h * s_h
-        latest[_SB, i] += weight * s_h * b_h
-        latest[_BB, i] += weight * b_h * b_h
-        estimate_reversal(settings, state, i, before)
+        is_new = reversals.add_row(
+            settings.reversals,
+            state.reversals.shown,
+            i,
+            s_h,
+            b_h,
+            e_h,
+            weight,
+            state.breakaway[i],
+        )
+        if is_new:
+            state.drift_extremes[0, i] = 0.0
+            state.drift_extremes[1, i] = 0.0
 
 
 @inner
@@ -336,146 +300,18 @@ def update_since_latch(state: State, latched: float, dt: float) -> float:
 
 
 @inner
-def shown_energy(state: State, i: int) -> float:
-    """Return p int (g s)_h^2 dt of the present reversal of joint i."""
-    k = state.breakaway[i]
-    latest = state.reversals.present
-    return float(latest[_SS, i] + 2.0 * k * latest[_SB, i] + k * k * latest[_BB, i])
-
-
-@inner
-def estimate_reversal(settings: Settings, state: State, i: int, before: float) -> None:
-    """Compute c_1 of joint i once its reversal shows it; `before` is its energy a row ago."""
-    energy = shown_energy(state, i)
-    if energy <= _SHOWN:
-        return
-    found = state.reversals.coulomb
-    if before <= _SHOWN:
-        found[1, i] = found[0, i]
-        state.drift_extremes[0, i] = 0.0
-        state.drift_extremes[1, i] = 0.0
-    found[0, i] = friction_shown(settings, state, i)
-
-
-@inner
-def friction_shown(settings: Settings, state: State, i: int) -> float:
-    """Return the Coulomb friction of joint i by the present reversal alone [N m]."""
-    latest = state.reversals.present
-    torque = latest[_SE, i] + state.breakaway[i] * latest[_BE, i]
-    least, most = settings.least[i], settings.most[i]
-    return clip(torque / shown_energy(state, i), least, most)
-
-
-@inner
-def close_reversal(settings: Settings, state: State, i: int) -> None:
-    """Add the sums of the present reversal of joint i to those of all; begin new ones."""
-    latest = state.reversals.present
-    sums = state.reversals.past
-    is_shown = shown_energy(state, i) > _SHOWN
-    excess = sums[_SS, i] + latest[_SS, i] - _ENERGY
-    keep = 1.0
-    if excess > 0.0:
-        keep = max(0.0, 1.0 - excess / sums[_SS, i])
-    for k in range(5):
-        sums[k, i] = keep * sums[k, i] + latest[k, i]
-        latest[k, i] = 0.0
-    if is_shown:
-        overrule(settings, state, i)
-
-
-@inner
-def keep_reversals(state: State, dt: float) -> None:
-    """Keep what reversals have shown, each `_LATE`, and what was kept before."""
-    state.since_kept[0] += dt
-    if state.since_kept[0] > _LATE:
-        state.since_kept[0] = 0.0
-        copy(state.earlier, state.earliest)
-        copy(state.reversals, state.earlier)
-
-
-@inner
-def copy(source: Reversals, out: Reversals) -> None:
-    """Copy what reversals have shown."""
-    for i in range(out.coulomb.shape[1]):
-        for k in range(5):
-            out.past[k, i] = source.past[k, i]
-            out.present[k, i] = source.present[k, i]
-        for k in range(2):
-            out.coulomb[k, i] = source.coulomb[k, i]
-
-
-@inner
-def take_back(settings: Settings, state: State) -> None:
-    """Take back what the last rows have shown, since the arm changed.
-
-    They are of the change, and a load looks like the step of friction.  A reversal that
-    has just begun is forgotten as a whole.
-    """
-    copy(state.earliest, state.reversals)
-    for i in range(settings.initial.size):
-        if shown_energy(state, i) <= _SHOWN:
-            for k in range(5):
-                state.reversals.present[k, i] = 0.0
-    copy(state.reversals, state.earliest)
-    copy(state.reversals, state.earlier)
-
-
-@inner
 def return_estimate(
     settings: Settings, state: State, active: Array, estimate: Array
 ) -> None:
     """Set c^, in theta^ (m,), and k^ to what reversals show, if it is learned and `active` (m,)."""
     if settings.learns == 0:
         return
-    for i in range(settings.initial.size):
+    of, shown = settings.reversals, state.reversals.shown
+    for i in range(of.initial.size):
         j = settings.first_coulomb + i
         if active[j] == 1.0 and settings.gain[i] > 0.0:
-            coulomb, state.breakaway[i] = learned_friction(settings, state, i)
-            estimate[j] = clip(coulomb, settings.least[i], settings.most[i])
-
-
-@inner
-def overrule(settings: Settings, state: State, i: int) -> None:
-    """Give the sums of joint i the friction of the last two reversals if both contradict them."""
-    coulomb, stribeck = learned_friction(settings, state, i)
-    found = state.reversals.coulomb
-    band = settings.unmodelled[i]
-    last = beyond(found[0, i] - coulomb, band)
-    other = beyond(found[1, i] - coulomb, band)
-    if last * other <= 0.0:
-        return
-    level = 0.5 * (found[0, i] + found[1, i])
-    extra = level * stribeck
-    sums = state.reversals.past
-    sums[_SE, i] = level * sums[_SS, i] + extra * sums[_SB, i]
-    sums[_BE, i] = level * sums[_SB, i] + extra * sums[_BB, i]
-
-
-@inner
-def learned_friction(settings: Settings, state: State, i: int) -> tuple[float, float]:
-    """Return c [N m] and k of joint i by all sums, k within its limits."""
-    f = settings.unmodelled[i]
-    pull = _PRIOR * f * f / settings.variance[i]
-    sums = state.reversals.past
-    latest = state.reversals.present
-    se = sums[_SE, i] + latest[_SE, i] + pull * settings.initial[i]
-    be = sums[_BE, i] + latest[_BE, i]
-    ss = sums[_SS, i] + latest[_SS, i] + pull
-    sb = sums[_SB, i] + latest[_SB, i]
-    bb = sums[_BB, i] + latest[_BB, i] + _STRIBECK_PRIOR * pull
-    determinant = ss * bb - sb * sb
-    k = 0.0
-    if determinant > 0.0:
-        coulomb = se * bb - be * sb
-        stribeck = be * ss - se * sb
-        if coulomb > 0.0:
-            k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
-        elif stribeck > 0.0:
-            k = _MOST_STRIBECK
-    energy = ss + 2.0 * k * sb + k * k * bb
-    if energy <= 0.0:
-        return settings.initial[i], 0.0
-    return (se + k * be) / energy, k
+            coulomb, state.breakaway[i] = reversals.learned(of, shown, i)
+            estimate[j] = clip(coulomb, of.least[i], of.most[i])
 
 
 @inner
@@ -493,12 +329,13 @@ def follow_reversals(
     """
     if settings.learns == 0:
         return
-    for i in range(settings.initial.size):
+    of, shown = settings.reversals, state.reversals.shown
+    for i in range(of.initial.size):
         j = settings.first_coulomb + i
         work.breakaway_error[i] = 0.0
         if active[j] == 0.0:
             continue
-        coulomb, stribeck = learned_friction(settings, state, i)
+        coulomb, stribeck = reversals.learned(of, shown, i)
         rate[j] = coulomb - estimate[j]
         work.breakaway_error[i] = stribeck - state.breakaway[i]
 
@@ -508,6 +345,6 @@ def adapt_breakaway(settings: Settings, state: State, work: Work, dt: float) -> 
     """Advance k^ by `dt` [s]: k^' = Gamma kappa (k - k^)."""
     if settings.learns == 0:
         return
-    for i in range(settings.initial.size):
+    for i in range(settings.gain.size):
         rate = settings.gain[i] * work.breakaway_error[i]
         state.breakaway[i] += dt * rate

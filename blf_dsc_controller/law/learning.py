@@ -34,6 +34,7 @@ from blf_dsc_controller.law import (
     friction,
     load_observer,
     prediction,
+    reversals,
     ripple,
     torque_sensors,
     window,
@@ -285,7 +286,7 @@ def detect_change(
         )
     if not has_changed:
         return
-    friction.take_back(settings.friction, state.friction)
+    reversals.take_back(state.friction.reversals, state.friction.breakaway)
     if latch.latched[0] == 1.0:
         friction.return_estimate(
             settings.friction, state.friction, latch.active, state.estimate
