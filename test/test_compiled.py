@@ -576,6 +576,30 @@ print(*(sum(twice.stats[k].values()) for k in (1, 2)))
 
 
 @compiling
+@pytest.mark.parametrize(
+    'content',
+    [pickle.dumps(numba.__version__) + b'cblf_dsc_controller.errors\nGone\n.', b''],
+    ids=['type of another release', 'cut'],
+)
+def test_index_that_cannot_be_read_is_replaced(tmp_path, content):
+    script = tmp_path / 'shared.py'
+    script.write_text(SHARED)
+    paths = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
+    environment = os.environ | paths | {'PYTHONPATH': str(PACKAGE.parent)}
+
+    def found_and_compiled():
+        run = finished(sys.executable, script, env=environment)
+        assert run.returncode == 0, run.stderr
+        return run.stdout.split()
+
+    assert found_and_compiled() == ['0', '1']
+    (index,) = tmp_path.glob('cache/*/*twice*.nbi')
+    index.write_bytes(content)
+    assert found_and_compiled() == ['0', '1']
+    assert found_and_compiled() == ['1', '0']
+
+
+@compiling
 def test_machine_code_that_others_could_write_is_not_read_but_replaced(tmp_path):
     script = tmp_path / 'shared.py'
     script.write_text(SHARED)

@@ -19,7 +19,7 @@ from benchmark.studies import load_study
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
-from blf_dsc_controller.law import friction
+from blf_dsc_controller.law import friction, reversals
 from blf_dsc_controller.law.learning import measure_reversals
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
@@ -258,11 +258,23 @@ def reversing_law():
     return law
 
 
-def reverse(law, coulomb, reversals):
+def close_reversal(law):
+    settings, state = law.settings.friction, law.state.friction
+    shown = state.reversals.shown
+    reversals.close(settings.reversals, shown, 0, state.breakaway[0])
+
+
+def learned_friction(law):
+    """Return the Coulomb friction of its first joint [N m], and what breakaway adds to that."""
+    shown = law.state.friction.reversals.shown
+    return reversals.learned(law.settings.friction.reversals, shown, 0)
+
+
+def reverse(law, coulomb, number):
     """Show the law some reversals of its first joint with a Coulomb friction [N m]."""
     settings, state = law.settings, law.state
-    for k in range(reversals):
-        friction.close_reversal(settings.friction, state.friction, 0)
+    for k in range(number):
+        close_reversal(law)
         sign = (-1.0) ** k
         for _ in range(300):
             state.friction.shape_lags[0, 2, 0] = sign
@@ -280,7 +292,10 @@ def test_friction_is_measured_once_a_window_says_enough(rows, least, learns):
     law.state.latch.least_residual[0] = least
     reverse(law, 0.8, 5)
     assert (
-        bool(law.state.friction.reversal_estimate[0, 0] == pytest.approx(0.8, abs=0.05))
+        bool(
+            law.state.friction.reversals.shown.coulomb[0, 0]
+            == pytest.approx(0.8, abs=0.05)
+        )
         == learns
     )
 
@@ -289,33 +304,31 @@ def test_friction_is_not_forgotten_at_rest():
     """The sums age by what reversals tell, not by time."""
     law = reversing_law()
     settings, state = law.settings, law.state
-    part = settings.friction, state.friction
     reverse(law, 0.4, 20)
     state.friction.column_lags[:] = 0.0
     state.friction.torque_lags[:] = 0.0
     state.friction.shape_lags[:] = 0.0
     state.row.filter2[:] = 0.0
-    before = friction.learned_friction(*part, 0)
+    before = learned_friction(law)
     assert before[0] == pytest.approx(0.4, abs=0.02)
     for _ in range(3_000):
         measure_reversals(settings, state, 0.001)
-    assert friction.learned_friction(*part, 0) == before
+    assert learned_friction(law) == before
     state.latch.latched[0] = 0.0
     measure_reversals(settings, state, 0.001)
     assert state.friction.since_latch[0] == 0.0
 
 
 @pytest.mark.parametrize(
-    ('other', 'reversals', 'most'), [(0.8, 3, 0.02), (0.42, 40, 0.005)]
+    ('other', 'number', 'most'), [(0.8, 3, 0.02), (0.42, 40, 0.005)]
 )
-def test_the_last_two_reversals_overrule_older_ones(other, reversals, most):
+def test_the_last_two_reversals_overrule_older_ones(other, number, most):
     """Friction that differs by less than what is unmodelled is averaged over eight or so."""
     law = reversing_law()
     reverse(law, 0.4, 30)
-    reverse(law, other, reversals)
-    part = law.settings.friction, law.state.friction
-    friction.close_reversal(*part, 0)
-    coulomb, _ = friction.learned_friction(*part, 0)
+    reverse(law, other, number)
+    close_reversal(law)
+    coulomb, _ = learned_friction(law)
     assert coulomb == pytest.approx(other, abs=most)
 
 
@@ -327,10 +340,10 @@ def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed
     work = law.signals.friction
     n = law.settings.n
     random = np.random.default_rng(seed)
-    assumed = settings.initial
+    assumed = settings.reversals.initial
     learned = assumed * random.uniform(1.0 / 3.0, 3.0, n)
     claims = assumed * random.uniform(0.0, 3.0, (4, n))
-    state.reversal_estimate[:] = claims[:2]
+    state.reversals.shown.coulomb[:] = claims[:2]
     state.drift_extremes[0] = np.minimum(claims[2] - learned, 0.0)
     state.drift_extremes[1] = np.maximum(claims[3] - learned, 0.0)
     state.breakaway[:] = random.uniform(0.0, 1.0, n)
@@ -339,9 +352,9 @@ def test_compensation_lies_between_what_is_assumed_and_whatever_may_be_true(seed
     scale = 1.0 + state.breakaway * work.stribeck
     for i in range(n):
         used = friction.coulomb_torque(settings, state, work, learned[i], i)
-        band = settings.unmodelled[i]
+        band = settings.reversals.unmodelled[i]
         changed = learned[i] + state.drift_extremes[:, i]
-        for true in (learned[i], *state.reversal_estimate[:, i], *changed):
+        for true in (learned[i], *state.reversals.shown.coulomb[:, i], *changed):
             error = abs(used - scale[i] * true)
             not_knowing = abs(assumed[i] - scale[i] * true)
             assert error <= not_knowing + scale[i] * band + 1e-12
@@ -354,7 +367,7 @@ def test_evidence_changes_no_torque_until_the_joint_reverses():
     estimate, disturbance = law.state.estimate, law.state.disturbance
     learned = estimate[settings.first_coulomb :]
     learned *= 2.0
-    state.reversal_estimate[:] = learned
+    state.reversals.shown.coulomb[:] = learned
     work.sign[:] = [1.0, -1.0, 0.5, 0.0, 1.0, -1.0]
     for i, c in enumerate(learned):
         work.torque[i] = friction.coulomb_torque(settings, state, work, c, i)

@@ -261,11 +261,29 @@ def test_joints_with_gains_of_their_own_learn_before_the_first_window_is_full(pr
     assert errors[0] < 0.9 * errors[1]
 
 
-def test_load_that_is_held_for_a_moment_of_the_first_window_leaves_no_friction():
-    """Its pick-up was in a reversal, and looked like 0.3 N m of friction: three times the error."""
-    load = several({'begin': 2.5, 'duration': 1.5, 'payload': 2.0})
+@pytest.mark.parametrize('begin', [2.5, 2.6, 2.9])
+def test_load_that_is_held_for_a_moment_of_the_first_window_leaves_no_friction(begin):
+    """Its pick-up was in a reversal, and looked like up to 3 N m of friction.
+
+    The errors that followed were 3, 2.4 and 1.9 times those without learning.
+    """
+    load = several({'begin': begin, 'duration': 1.5, 'payload': 2.0})
     errors = [rms_error('fr3_direct', 8.0, 5.0, law, load) for law in ({}, OFF)]
     assert errors[0] < 1.3 * errors[1]
+
+
+def test_friction_that_was_learned_outlasts_a_change_of_the_arm():
+    """A load says nothing of it.  It went back to what was assumed, twice what there is.
+
+    The last joint is left out: it just reverses for the first time.
+    """
+    load = several({'begin': 4.0, 'duration': 0.0, 'payload': 1.0})
+    learning = run_preset(4.3, load, preset='panda')
+    first = learning.controller.settings.friction.first_coulomb
+    found = learning.estimate[:, first : first + 6]
+    assert learning.changes[-1] == 1.0
+    np.testing.assert_allclose(found[-1], found[3990], rtol=0.1)
+    assert (found[-1] < 0.7 * found[0]).all()
 
 
 def test_lasting_disturbance_above_the_floor_does_not_end_learning():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of the learned friction: its compensation, its evidence, its reversals."""
+"""The parts of the learned friction: its compensation and its evidence."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller.compiled.layout import size_of, view_of
-from blf_dsc_controller.law import friction
+from blf_dsc_controller.law import friction, reversals
 from blf_dsc_controller.law.friction import Settings, State, Work
 
 N = 1  # joints; theta = (a parameter, Coulomb friction)
@@ -24,11 +24,13 @@ SETTINGS = Settings(
     coulomb_velocity=0.02,
     lag=0.0,
     pole=20.0,
-    unmodelled=np.array([F]),
-    initial=np.array([3.0]),
-    variance=np.array([2.25]),
-    least=np.array([1.0]),
-    most=np.array([9.0]),
+    reversals=reversals.Settings(
+        unmodelled=np.array([F]),
+        initial=np.array([3.0]),
+        variance=np.array([2.25]),
+        least=np.array([1.0]),
+        most=np.array([9.0]),
+    ),
     gain=np.array([2.0]),
 )
 
@@ -42,7 +44,7 @@ def part(layout):
 def learned_case(learned):
     """A joint in motion, of which all evidence agrees with what is learned [N m]."""
     state, work = part(State), part(Work)
-    state.reversal_estimate[:] = learned
+    state.reversals.shown.coulomb[:] = learned
     work.sign[:] = 1.0
     return state, work
 
@@ -56,10 +58,10 @@ def compensation(state, work, learned, settings=SETTINGS):
     [
         (None, 0.0, 1.0),  # all agrees with 1 N m, in place of the assumed 3 N m
         # Up to the dead band of 0.1 N m, the compensation is the nearest to 3 N m:
-        ('reversal_estimate', (2.0, 1.0), 1.9),  # the last reversal showed 2 N m
-        ('reversal_estimate', (1.0, 2.0), 1.9),  # the one before did
-        ('reversal_estimate', (9.0, 1.0), 3.0),  # no more than is assumed
-        ('reversal_estimate', (0.5, 1.0), 1.0),  # less is no reason to go away from it
+        ('coulomb', (2.0, 1.0), 1.9),  # the last reversal showed 2 N m
+        ('coulomb', (1.0, 2.0), 1.9),  # the one before did
+        ('coulomb', (9.0, 1.0), 3.0),  # no more than is assumed
+        ('coulomb', (0.5, 1.0), 1.0),  # less is no reason to go away from it
         ('observer_drift', (0.5,), 1.4),
         ('observer_drift', (-0.5,), 1.0),
         ('drift_extremes', (-0.5, 0.0), 1.0),
@@ -69,7 +71,9 @@ def compensation(state, work, learned, settings=SETTINGS):
 def test_friction_is_compensated_within_the_evidence(evidence, value, expected):
     state, work = learned_case(1.0)
     if evidence:
-        part_of = getattr(state, evidence)
+        part_of = getattr(
+            state.reversals.shown if evidence == 'coulomb' else state, evidence
+        )
         part_of[:] = np.reshape(value, part_of.shape)
     assert compensation(state, work, 1.0) == pytest.approx(expected)
     work.sign[:] = -1.0
@@ -100,62 +104,46 @@ def test_breakaway_is_relative_to_the_learned_friction():
     assert compensation(state, work, 9.0) == pytest.approx(1.5 * 9.0)
 
 
-SE, BE, SS, SB, BB = range(5)
+def after_a_reversal(seconds, friction_of):
+    """The state so long after a joint has reversed whose friction [N m] is that of a time [s]."""
+    state, estimate, dt = part(State), np.array([0.0, 3.0]), 0.01
+    friction.begin(SETTINGS, state)
+    state.drift_extremes[:, 0] = -1.0, 1.0
+    for k in range(round(seconds / dt)):
+        s = state.shape_lags[0, 2, 0] = 1.0 if k else -1.0
+        row = np.array([[0.0, s, s * friction_of(k * dt)]])
+        friction.measure_reversals(SETTINGS, state, row, estimate, k == 0, dt)
+    return state
+
+
+@pytest.mark.parametrize(('seconds', 'is_kept'), [(0.01, True), (0.02, False)])
+def test_reversal_that_shows_its_friction_forgets_earlier_drift(seconds, is_kept):
+    """It does so with the first row of the step."""
+    state = after_a_reversal(seconds, lambda _: 5.0)
+    assert state.drift_extremes.any() == is_kept
 
 
 @pytest.mark.parametrize(
-    ('last', 'before', 'expected'),
+    ('at', 'shown', 'kept'),
     [
-        (4.0, 5.0, 4.5),  # both are above 3 N m: their mean
-        (2.0, 1.0, 1.5),  # both are below
-        (4.0, 2.0, 3.0),  # they contradict each other
-        (4.0, 3.05, 3.0),  # one of them agrees, within 0.1 N m
+        (0.01, 9.0, 3.0),  # the reversal had just begun, and is forgotten as a whole
+        (0.19, 4.2, 3.0),
+        (0.22, 4.47, 5.0),  # it had shown its friction 0.15 s ago
+        (0.49, 4.99, 5.0),  # it is long over
     ],
 )
-def test_two_reversals_overrule_the_sums_if_both_contradict_them(
-    last, before, expected
-):
-    """The sums of eight reversals, which say 3 N m as the prior does, without breakaway.
-
-    The prior pulls to 3 N m by 0.015 (0.1 / 1.5)^2, 7e-5 of the sums.
-    """
-    state = part(State)
-    state.reversal_sums[[SE, SS], 0] = 3.0, 1.0
-    state.reversal_sums[BB] = 1.0
-    state.reversal_estimate[:, 0] = last, before
-    friction.overrule(SETTINGS, state, 0)
-    coulomb, stribeck = friction.learned_friction(SETTINGS, state, 0)
-    assert coulomb == pytest.approx(expected, abs=1e-3)
-    assert stribeck == 0.0
-
-
-def test_reversal_shows_its_friction_within_limits_and_forgets_earlier_drift():
-    """Once p int s_h^2 dt is 0.06, half a reversal."""
-    state = part(State)
-    friction.begin(SETTINGS, state)
-    state.drift_extremes[:, 0] = -1.0, 1.0
-    state.latest_sums[[SE, SS], 0] = 0.05 * 4.0, 0.05
-    friction.estimate_reversal(SETTINGS, state, 0, 0.0)
-    assert state.reversal_estimate[:, 0].tolist() == [3.0, 3.0]
-    assert state.drift_extremes.any()
-    state.latest_sums[[SE, SS], 0] = 0.07 * 4.0, 0.07
-    friction.estimate_reversal(SETTINGS, state, 0, 0.05)
-    np.testing.assert_allclose(state.reversal_estimate[:, 0], [4.0, 3.0])
-    assert not state.drift_extremes.any()
-    state.latest_sums[SE] = 0.07 * 40.0
-    friction.estimate_reversal(SETTINGS, state, 0, 0.07)
-    assert state.reversal_estimate[:, 0].tolist() == [9.0, 3.0]  # the most
-
-
-@pytest.mark.parametrize(('energy', 'stays'), [(0.07, True), (0.05, False)])
-def test_reversal_that_has_just_begun_is_forgotten_when_the_arm_changes(energy, stays):
-    """Most of its rows are of the change; 0.06 is what shows a friction."""
-    state, _ = learned_case(2.0)
-    state.reversal_sums[:] = 0.5
-    state.latest_sums[[SE, SS], 0] = 7.0 * energy, energy
-    friction.forget_begun(state)
-    assert state.latest_sums.any() == stays
-    assert (state.reversal_sums == 0.5).all()
+def test_rows_of_a_change_show_no_friction(at, shown, kept):
+    """20 N m come on `at` seconds after a joint with 5 N m reverses, and are found 0.1 s later."""
+    state = after_a_reversal(at + 0.1, lambda t: 5.0 + 20.0 * (t >= at))
+    found = state.reversals.shown
+    assert found.coulomb[0, 0] == pytest.approx(shown, abs=0.01)
+    reversals.take_back(state.reversals, state.breakaway)
+    assert found.coulomb[0, 0] == pytest.approx(kept, abs=0.01)
+    assert found.present.any() == (kept == 5.0)
+    # another change, found at once: nothing of the first comes back
+    reversals.keep(state.reversals, 1.0)
+    reversals.take_back(state.reversals, state.breakaway)
+    assert found.coulomb[0, 0] == pytest.approx(kept, abs=0.01)
 
 
 def test_drift_of_the_observer_is_counted_along_the_motion_until_the_joint_reverses():
@@ -174,7 +162,7 @@ def test_change_of_the_friction_is_taken_from_the_disturbance_estimate():
     """Their sum does not change: it is the torque."""
     state, work = learned_case(4.0)
     work.torque[:] = compensation(state, work, 4.0)
-    state.reversal_estimate[:] = 5.0
+    state.reversals.shown.coulomb[:] = 5.0
     disturbance = np.array([0.7])
     friction.transfer_learned(SETTINGS, state, work, np.array([0.0, 5.0]), disturbance)
     assert work.torque[0] == pytest.approx(5.0)
@@ -183,8 +171,8 @@ def test_change_of_the_friction_is_taken_from_the_disturbance_estimate():
 
 def test_learned_friction_moves_the_estimate_unless_its_column_was_rejected():
     state, work = part(State), part(Work)
-    state.reversal_sums[[SE, SS], 0] = 4.0, 1.0
-    state.reversal_sums[BB] = 1.0
+    # sums of s e, s^2 and b^2: 4 N m, and no breakaway
+    state.reversals.shown.past[[0, 2, 4], 0] = 4.0, 1.0, 1.0
     rate = np.zeros(2)
     estimate = np.array([0.0, 3.0])
     for active, expected in ((0.0, 0.0), (1.0, 1.0)):

@@ -59,7 +59,7 @@ _HEAVIEST = 1.5
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = 5.0  # s
 _REGULARISATION = 1e-5  # pulls P (about 1) to 0
-_ANCHOR = 5.0  # times the mean square of the unmodelled torque
+_ANCHOR = 15.0  # times the mean square of the unmodelled torque
 # Of feedback through the inertia: over m omega_b^2, or over omega_b
 _BARRIER, _INTEGRAL, _DAMPING = 0.5, 0.4, 0.6
 _SURFACE = 0.4, 1.3  # K and mu

@@ -29,6 +29,7 @@ import secrets
 from functools import partial
 from itertools import count
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numba
@@ -231,10 +232,18 @@ class KernelCache(_Stored):
         return found
 
     def _load_own(self, signature: Any, context: Any) -> Any:
-        """Return the compiled kernel, or None; what others can write is not read."""
+        """Return the compiled kernel, or None; what others can write is not read.
+
+        An index that cannot be read is emptied: its types may be of another release of
+        this package, whose kernel had the same sources, or the disk was full.
+        """
         if not is_own(self._folder):
             return None
-        return super().load_overload(signature, context)
+        try:
+            return super().load_overload(signature, context)
+        except (AttributeError, ImportError, EOFError, UnpicklingError):
+            self.flush()
+            return None
 
     def save_overload(self, signature: Any, data: Any) -> None:
         """Write a compiled kernel, for the processes that wait for it, too."""

@@ -45,6 +45,7 @@ from blf_dsc_controller.law import (
     friction,
     load_observer,
     prediction,
+    reversals,
     surface,
     torque,
     truth,
@@ -362,11 +363,13 @@ def friction_settings(settings: Settings) -> friction.Settings:
         coulomb_velocity=of.coulomb_velocity,
         lag=settings.row.lag,
         pole=settings.row.filter_pole,
-        unmodelled=settings.contact.unmodelled,
-        initial=of_coulomb(settings.initial_estimate),
-        variance=of_coulomb(adapts.variance),
-        least=of_coulomb(adapts.least),
-        most=of_coulomb(adapts.most),
+        reversals=reversals.Settings(
+            unmodelled=settings.contact.unmodelled,
+            initial=of_coulomb(settings.initial_estimate),
+            variance=of_coulomb(adapts.variance),
+            least=of_coulomb(adapts.least),
+            most=of_coulomb(adapts.most),
+        ),
         gain=of_coulomb(adapts.adaptation_gain * adapts.weight),
     )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction along the reference: what reversals show of it, and how much of that is used.
+"""Friction along the reference: how much of what reversals show of it is used.
 
 Coulomb friction changes its sign where a joint reverses, faster than d^3 can follow: an
 error of the estimate pushes the joint by twice that in each reversal.  In geared joints
@@ -10,17 +10,9 @@ has when the torque acts, is
 
 with the shapes of `arms.friction`.
 
-*Learned from reversals.*  The window cannot be trusted with it: its rows are dominated by the
-frequencies of the reference, at which a sin w t against the velocity takes 0.64 a off the estimate
-and leaves no residual.  What only friction has is the step.  So the rows, and s and g s of the
+*Learned from reversals.*  What only friction has is the step.  So the rows, and s and g s of the
 measured velocity, pass a band around the pole p of the row's filter, x_h = (s / (s + p))^2 x, and
-least squares give c and c k from what the other columns leave of the torque, e:
-
-    min  p int (e_h - c s_h - c k b_h)^2 dt + l (c - c_0)^2 + l_b (c k)^2
-
-with b = s exp(-(v / v_s)^2).  The sums forget once they contain `_ENERGY`, some eight
-reversals.  If the last two reversals both contradict them by more than the unmodelled
-torque f, they overrule what is older.
+`reversals` finds c^ and k^ from what the other columns leave of the torque.
 
 *Used within the evidence.*  What is learned of friction must not cost more than not knowing it,
 which errs by |c_0 - c|.  Two things may contradict c^ before the sums do: a reversal that shows
@@ -44,18 +36,12 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fading, sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law import reversals
 from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
+from blf_dsc_controller.law.reversals import beyond
 
-_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
-_SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
-_PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
-_STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
-_MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _MOVING = 0.9  # of |s|: below it a joint reverses
-
-# Rows of the sums over products of s_h, b_h and e_h
-_SE, _BE, _SS, _SB, _BB = range(5)
 
 
 class Settings(NamedTuple):
@@ -71,11 +57,7 @@ class Settings(NamedTuple):
     coulomb_velocity: float  # v_c, rad/s
     lag: float  # of measured velocities and applied torques together, s
     pole: float  # p of the row filters, rad/s
-    unmodelled: Annotated[Array, 'n']  # f, rms torque that no column describes, N m
-    initial: Annotated[Array, 'n']  # c_0, N m
-    variance: Annotated[Array, 'n']  # of c_0, (N m)^2
-    least: Annotated[Array, 'n']  # value that c^ can have, N m
-    most: Annotated[Array, 'n']
+    reversals: reversals.Settings
     gain: Annotated[Array, 'n']  # Gamma kappa of its columns, 1/s
 
 
@@ -87,11 +69,7 @@ class State(NamedTuple):
     shape_lags: Annotated[Array, 2, 3, 'n']
     column_lags: Annotated[Array, 2, 2, 'n']  # of s_h and b_h
     torque_lags: Annotated[Array, 2, 'n']  # of e_h, N m
-    # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
-    reversal_sums: Annotated[Array, 5, 'n']
-    latest_sums: Annotated[Array, 5, 'n']  # likewise, over the present one
-    # Coulomb friction by the last reversal and the one before, N m
-    reversal_estimate: Annotated[Array, 2, 'n']
+    reversals: reversals.State
     # k^, breakaway torque relative to Coulomb friction
     breakaway: Annotated[Array, 'n']
     moves: Annotated[Array, 'n']  # 1 while the joint does not reverse
@@ -115,15 +93,14 @@ class Work(NamedTuple):
 @inner
 def begin(settings: Settings, state: State) -> None:
     """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
-    for i in range(settings.initial.size):
-        state.reversal_estimate[0, i] = settings.initial[i]
-        state.reversal_estimate[1, i] = settings.initial[i]
+    reversals.begin(settings.reversals, state.reversals)
 
 
 @inner
-def beyond(x: float, band: float) -> float:
-    """Return z(x), by how much x is outside of [-band, band]."""
-    return x - clip(x, -band, band)
+def is_coulomb(settings: Settings, j: int) -> bool:
+    """Whether entry j of theta is Coulomb friction that reversals show, not the window."""
+    at = j - settings.first_coulomb
+    return bool(settings.learns == 1 and 0 <= at < settings.reversals.initial.size)
 
 
 @inner
@@ -134,10 +111,11 @@ def coulomb_torque(
     low = learned
     high = learned
     if settings.learns == 1 and settings.bumpless == 1:
-        band = settings.unmodelled[i]
+        band = settings.reversals.unmodelled[i]
+        shown = state.reversals.shown.coulomb
         for evidence in (
-            beyond(state.reversal_estimate[0, i] - learned, band),
-            beyond(state.reversal_estimate[1, i] - learned, band),
+            beyond(shown[0, i] - learned, band),
+            beyond(shown[1, i] - learned, band),
             beyond(state.observer_drift[i], band),
             beyond(state.drift_extremes[0, i], band),
             beyond(state.drift_extremes[1, i], band),
@@ -145,7 +123,7 @@ def coulomb_torque(
             low = min(low, learned + evidence)
             high = max(high, learned + evidence)
     scale = 1.0 + state.breakaway[i] * work.stribeck[i]
-    level = clip(settings.initial[i], scale * low, scale * high)
+    level = clip(settings.reversals.initial[i], scale * low, scale * high)
     return float(level * work.sign[i])
 
 
@@ -220,7 +198,8 @@ def follow_motion(settings: Settings, state: State, work: Work) -> None:
             extremes[1, i] = max(extremes[1, i], drift[i])
             drift[i] = 0.0
         if not moves and state.moves[i] == 1.0:
-            close_reversal(settings, state, i)
+            shown = state.reversals.shown
+            reversals.close(settings.reversals, shown, i, state.breakaway[i])
         state.moves[i] = 1.0 if moves else 0.0
 
 
@@ -291,20 +270,26 @@ def measure_reversals(
     """
     gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
-    latest = state.latest_sums
     lags = state.column_lags
+    reversals.keep(state.reversals, dt)
     for i in range(rows.shape[0]):
         e = unexplained(rows[i], estimate, settings.first_coulomb + i)
         s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
         b_h = high_pass(lags[1], i, gain, state.shape_lags[1, 2, i], begins)
         e_h = high_pass(state.torque_lags, i, gain, e, begins)
-        before = shown_energy(state, i)
-        latest[_SE, i] += weight * s_h * e_h
-        latest[_BE, i] += weight * b_h * e_h
-        latest[_SS, i] += weight * s_h * s_h
-        latest[_SB, i] += weight * s_h * b_h
-        latest[_BB, i] += weight * b_h * b_h
-        estimate_reversal(settings, state, i, before)
+        is_new = reversals.add_row(
+            settings.reversals,
+            state.reversals.shown,
+            i,
+            s_h,
+            b_h,
+            e_h,
+            weight,
+            state.breakaway[i],
+        )
+        if is_new:
+            state.drift_extremes[0, i] = 0.0
+            state.drift_extremes[1, i] = 0.0
 
 
 @inner
@@ -315,100 +300,18 @@ def update_since_latch(state: State, latched: float, dt: float) -> float:
 
 
 @inner
-def shown_energy(state: State, i: int) -> float:
-    """Return p int (g s)_h^2 dt of the present reversal of joint i."""
-    k = state.breakaway[i]
-    latest = state.latest_sums
-    return float(latest[_SS, i] + 2.0 * k * latest[_SB, i] + k * k * latest[_BB, i])
-
-
-@inner
-def estimate_reversal(settings: Settings, state: State, i: int, before: float) -> None:
-    """Compute c_1 of joint i once its reversal shows it; `before` is its energy a row ago."""
-    energy = shown_energy(state, i)
-    if energy <= _SHOWN:
+def return_estimate(
+    settings: Settings, state: State, active: Array, estimate: Array
+) -> None:
+    """Set c^, in theta^ (m,), and k^ to what reversals show, if it is learned and `active` (m,)."""
+    if settings.learns == 0:
         return
-    found = state.reversal_estimate
-    if before <= _SHOWN:
-        found[1, i] = found[0, i]
-        state.drift_extremes[0, i] = 0.0
-        state.drift_extremes[1, i] = 0.0
-    latest = state.latest_sums
-    torque = latest[_SE, i] + state.breakaway[i] * latest[_BE, i]
-    found[0, i] = clip(torque / energy, settings.least[i], settings.most[i])
-
-
-@inner
-def close_reversal(settings: Settings, state: State, i: int) -> None:
-    """Add the sums of the present reversal of joint i to those of all; begin new ones."""
-    latest = state.latest_sums
-    sums = state.reversal_sums
-    is_shown = shown_energy(state, i) > _SHOWN
-    excess = sums[_SS, i] + latest[_SS, i] - _ENERGY
-    keep = 1.0
-    if excess > 0.0:
-        keep = max(0.0, 1.0 - excess / sums[_SS, i])
-    for k in range(5):
-        sums[k, i] = keep * sums[k, i] + latest[k, i]
-        latest[k, i] = 0.0
-    if is_shown:
-        overrule(settings, state, i)
-
-
-@inner
-def forget_begun(state: State) -> None:
-    """Forget reversals that have just begun, since the arm changed.
-
-    Most of their rows are of the change, and a load looks like the step of friction.
-    """
-    for i in range(state.moves.size):
-        if shown_energy(state, i) <= _SHOWN:
-            for k in range(5):
-                state.latest_sums[k, i] = 0.0
-
-
-@inner
-def overrule(settings: Settings, state: State, i: int) -> None:
-    """Give the sums of joint i the friction of the last two reversals if both contradict them."""
-    coulomb, stribeck = learned_friction(settings, state, i)
-    found = state.reversal_estimate
-    band = settings.unmodelled[i]
-    last = beyond(found[0, i] - coulomb, band)
-    other = beyond(found[1, i] - coulomb, band)
-    if last * other <= 0.0:
-        return
-    level = 0.5 * (found[0, i] + found[1, i])
-    extra = level * stribeck
-    sums = state.reversal_sums
-    sums[_SE, i] = level * sums[_SS, i] + extra * sums[_SB, i]
-    sums[_BE, i] = level * sums[_SB, i] + extra * sums[_BB, i]
-
-
-@inner
-def learned_friction(settings: Settings, state: State, i: int) -> tuple[float, float]:
-    """Return c [N m] and k of joint i by all sums, k within its limits."""
-    f = settings.unmodelled[i]
-    pull = _PRIOR * f * f / settings.variance[i]
-    sums = state.reversal_sums
-    latest = state.latest_sums
-    se = sums[_SE, i] + latest[_SE, i] + pull * settings.initial[i]
-    be = sums[_BE, i] + latest[_BE, i]
-    ss = sums[_SS, i] + latest[_SS, i] + pull
-    sb = sums[_SB, i] + latest[_SB, i]
-    bb = sums[_BB, i] + latest[_BB, i] + _STRIBECK_PRIOR * pull
-    determinant = ss * bb - sb * sb
-    k = 0.0
-    if determinant > 0.0:
-        coulomb = se * bb - be * sb
-        stribeck = be * ss - se * sb
-        if coulomb > 0.0:
-            k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
-        elif stribeck > 0.0:
-            k = _MOST_STRIBECK
-    energy = ss + 2.0 * k * sb + k * k * bb
-    if energy <= 0.0:
-        return settings.initial[i], 0.0
-    return (se + k * be) / energy, k
+    of, shown = settings.reversals, state.reversals.shown
+    for i in range(of.initial.size):
+        j = settings.first_coulomb + i
+        if active[j] == 1.0 and settings.gain[i] > 0.0:
+            coulomb, state.breakaway[i] = reversals.learned(of, shown, i)
+            estimate[j] = clip(coulomb, of.least[i], of.most[i])
 
 
 @inner
@@ -426,12 +329,13 @@ def follow_reversals(
     """
     if settings.learns == 0:
         return
-    for i in range(settings.initial.size):
+    of, shown = settings.reversals, state.reversals.shown
+    for i in range(of.initial.size):
         j = settings.first_coulomb + i
         work.breakaway_error[i] = 0.0
         if active[j] == 0.0:
             continue
-        coulomb, stribeck = learned_friction(settings, state, i)
+        coulomb, stribeck = reversals.learned(of, shown, i)
         rate[j] = coulomb - estimate[j]
         work.breakaway_error[i] = stribeck - state.breakaway[i]
 
@@ -441,6 +345,6 @@ def adapt_breakaway(settings: Settings, state: State, work: Work, dt: float) -> 
     """Advance k^ by `dt` [s]: k^' = Gamma kappa (k - k^)."""
     if settings.learns == 0:
         return
-    for i in range(settings.initial.size):
+    for i in range(settings.gain.size):
         rate = settings.gain[i] * work.breakaway_error[i]
         state.breakaway[i] += dt * rate

@@ -34,6 +34,7 @@ from blf_dsc_controller.law import (
     friction,
     load_observer,
     prediction,
+    reversals,
     ripple,
     torque_sensors,
     window,
@@ -285,20 +286,28 @@ def detect_change(
         )
     if not has_changed:
         return
-    if latch.latched[0] == 1.0 and not window.is_full(settings.window, state.window):
-        take_back(settings, state, signals)
+    reversals.take_back(state.friction.reversals, state.friction.breakaway)
+    if latch.latched[0] == 1.0:
+        friction.return_estimate(
+            settings.friction, state.friction, latch.active, state.estimate
+        )
+        if not window.is_full(settings.window, state.window):
+            take_back(settings, state, signals)
     change.count_change(state.change, latch, sliding, prior, state.estimate, dt)
-    friction.forget_begun(state.friction)
     prediction.forget(state.row)
 
 
 @inner
 def take_back(settings: Settings, state: State, signals: Signals) -> None:
-    """Return to the estimate before the window; the torque stays the same, if configured."""
+    """Return to the estimate before the window; the torque stays the same, if configured.
+
+    Coulomb friction is not of the window but of reversals, and stays.
+    """
     before = signals.adaptation.tracked  # scratch here
     for j in range(settings.m):
         before[j] = state.estimate[j]
-        state.estimate[j] = state.latch.anchor[j]
+        if not friction.is_coulomb(settings.friction, j):
+            state.estimate[j] = state.latch.anchor[j]
     if settings.disturbance.bumpless == 1:
         transfer_learned(settings, state, signals, before)
 

@@ -54,7 +54,7 @@ def fill_coulomb(settings: Settings, state: State, coulomb: Array) -> None:
     """Write the Coulomb friction of each joint, learned or assumed, to `coulomb` (n,) [N m]."""
     of = settings.friction
     for i in range(coulomb.size):
-        coulomb[i] = of.initial[i]
+        coulomb[i] = of.reversals.initial[i]
         if of.coulomb == 1:
             coulomb[i] = state.estimate[of.first_coulomb + i]
 

@@ -36,7 +36,7 @@ def known_friction(settings: Settings, i: int, velocity: float) -> float:
         viscous = settings.initial_estimate[settings.friction.first_viscous + i]
         friction += viscous * velocity
     if settings.columns.coulomb == 1:
-        coulomb = settings.friction.initial[i]
+        coulomb = settings.friction.reversals.initial[i]
         friction += coulomb * sliding(velocity, settings.columns.coulomb_velocity)
     return friction
 

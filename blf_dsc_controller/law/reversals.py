@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What reversals of the joints show of their friction, and what of that is taken back.
+
+The window of the learning cannot be trusted with Coulomb friction: its rows are dominated by the
+frequencies of the reference, at which a sin w t against the velocity takes 0.64 a off the estimate
+and leaves no residual.  What only friction has is the step, where the joint reverses.  So
+least squares give c and c k from what the other columns leave of the torque, e, behind a
+high pass that only a step passes (index h; `friction` has the filters):
+
+    min  p int (e_h - c s_h - c k b_h)^2 dt + l (c - c_0)^2 + l_b (c k)^2
+
+with s the direction of the motion and b what breakaway has in excess.  The sums forget once they
+contain `_ENERGY`, some eight reversals.  If the last two reversals both contradict them by
+more than the unmodelled torque f, they overrule what is older.
+
+If the arm has changed, what reversals have shown since some 0.2 s before that was found
+is taken back: a load that comes on in a reversal looks like the step of friction.
+"""
+
+from typing import Annotated, NamedTuple
+
+from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law.clipping import clip
+
+_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
+_SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
+_PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
+_STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
+_MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
+_LATE = 0.15  # s, by which a change of the arm is found
+
+# Rows of the sums over products of s_h, b_h and e_h
+_SE, _BE, _SS, _SB, _BB = range(5)
+
+
+class Settings(NamedTuple):
+    """What is known of Coulomb friction before any reversal."""
+
+    unmodelled: Annotated[Array, 'n']  # f, rms torque that no column describes, N m
+    initial: Annotated[Array, 'n']  # c_0, N m
+    variance: Annotated[Array, 'n']  # of c_0, (N m)^2
+    least: Annotated[Array, 'n']  # value that c^ can have, N m
+    most: Annotated[Array, 'n']
+
+
+class Shown(NamedTuple):
+    """What reversals have shown."""
+
+    # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
+    past: Annotated[Array, 5, 'n']
+    present: Annotated[Array, 5, 'n']  # likewise, over the present one
+    # Coulomb friction by the last reversal and the one before, N m
+    coulomb: Annotated[Array, 2, 'n']
+
+
+class State(NamedTuple):
+    """What it keeps from one row to the next."""
+
+    shown: Shown
+    earlier: Shown  # some `_LATE` ago or less
+    earliest: Shown  # one to two times as long ago
+    since_kept: Cell  # s
+
+
+@inner
+def begin(settings: Settings, state: State) -> None:
+    """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
+    for i in range(settings.initial.size):
+        for k in range(2):
+            state.shown.coulomb[k, i] = settings.initial[i]
+    copy(state.shown, state.earlier)
+    copy(state.shown, state.earliest)
+
+
+@inner
+def beyond(x: float, band: float) -> float:
+    """Return z(x), by how much x is outside of [-band, band]."""
+    return x - clip(x, -band, band)
+
+
+@inner
+def add_row(
+    settings: Settings,
+    shown: Shown,
+    i: int,
+    s: float,
+    b: float,
+    e: float,
+    weight: float,
+    k: float,
+) -> bool:
+    """Add s_h, b_h and e_h of a row of joint i to its present reversal, by their weight p dt.
+
+    Return whether that shows its friction since this row.  k is k^.
+    """
+    now = shown.present
+    before = energy(shown, i, k)
+    now[_SE, i] += weight * s * e
+    now[_BE, i] += weight * b * e
+    now[_SS, i] += weight * s * s
+    now[_SB, i] += weight * s * b
+    now[_BB, i] += weight * b * b
+    return find_last(settings, shown, i, k, before)
+
+
+@inner
+def find_last(
+    settings: Settings, shown: Shown, i: int, k: float, before: float
+) -> bool:
+    """Compute c_1 of joint i once its reversal shows it; return whether this is the first time.
+
+    `before` is the energy of the reversal a row ago.
+    """
+    if energy(shown, i, k) <= _SHOWN:
+        return False
+    is_first = before <= _SHOWN
+    if is_first:
+        shown.coulomb[1, i] = shown.coulomb[0, i]
+    torque = shown.present[_SE, i] + k * shown.present[_BE, i]
+    shown.coulomb[0, i] = clip(
+        torque / energy(shown, i, k), settings.least[i], settings.most[i]
+    )
+    return is_first
+
+
+@inner
+def energy(shown: Shown, i: int, k: float) -> float:
+    """Return p int (g s)_h^2 dt of the present reversal of joint i."""
+    now = shown.present
+    return float(now[_SS, i] + 2.0 * k * now[_SB, i] + k * k * now[_BB, i])
+
+
+@inner
+def close(settings: Settings, shown: Shown, i: int, k: float) -> None:
+    """Add the sums of the present reversal of joint i to those of all; begin new ones."""
+    latest, sums = shown.present, shown.past
+    is_shown = energy(shown, i, k) > _SHOWN
+    excess = sums[_SS, i] + latest[_SS, i] - _ENERGY
+    keep = 1.0
+    if excess > 0.0:
+        keep = max(0.0, 1.0 - excess / sums[_SS, i])
+    for row in range(5):
+        sums[row, i] = keep * sums[row, i] + latest[row, i]
+        latest[row, i] = 0.0
+    if is_shown:
+        overrule(settings, shown, i)
+
+
+@inner
+def overrule(settings: Settings, shown: Shown, i: int) -> None:
+    """Give the sums of joint i the friction of the last two reversals if both contradict them."""
+    coulomb, stribeck = learned(settings, shown, i)
+    found = shown.coulomb
+    band = settings.unmodelled[i]
+    last = beyond(found[0, i] - coulomb, band)
+    other = beyond(found[1, i] - coulomb, band)
+    if last * other <= 0.0:
+        return
+    level = 0.5 * (found[0, i] + found[1, i])
+    extra = level * stribeck
+    sums = shown.past
+    sums[_SE, i] = level * sums[_SS, i] + extra * sums[_SB, i]
+    sums[_BE, i] = level * sums[_SB, i] + extra * sums[_BB, i]
+
+
+@inner
+def learned(settings: Settings, shown: Shown, i: int) -> tuple[float, float]:
+    """Return c [N m] and k of joint i by all sums, k within its limits."""
+    f = settings.unmodelled[i]
+    pull = _PRIOR * f * f / settings.variance[i]
+    sums = shown.past
+    latest = shown.present
+    se = sums[_SE, i] + latest[_SE, i] + pull * settings.initial[i]
+    be = sums[_BE, i] + latest[_BE, i]
+    ss = sums[_SS, i] + latest[_SS, i] + pull
+    sb = sums[_SB, i] + latest[_SB, i]
+    bb = sums[_BB, i] + latest[_BB, i] + _STRIBECK_PRIOR * pull
+    determinant = ss * bb - sb * sb
+    k = 0.0
+    if determinant > 0.0:
+        coulomb = se * bb - be * sb
+        stribeck = be * ss - se * sb
+        if coulomb > 0.0:
+            k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
+        elif stribeck > 0.0:
+            k = _MOST_STRIBECK
+    total = ss + 2.0 * k * sb + k * k * bb
+    if total <= 0.0:
+        return settings.initial[i], 0.0
+    return (se + k * be) / total, k
+
+
+@inner
+def keep(state: State, dt: float) -> None:
+    """Keep what reversals have shown, each `_LATE`, and what was kept before; `dt` [s] later."""
+    state.since_kept[0] += dt
+    if state.since_kept[0] > _LATE:
+        state.since_kept[0] = 0.0
+        copy(state.earlier, state.earliest)
+        copy(state.shown, state.earlier)
+
+
+@inner
+def take_back(state: State, breakaway: Array) -> None:
+    """Take back what the last rows have shown, since they are of a change of the arm.
+
+    A reversal that has just begun is forgotten as a whole.  `breakaway` (n,) is k^.
+    """
+    shown = state.shown
+    copy(state.earliest, shown)
+    for i in range(breakaway.size):
+        if energy(shown, i, breakaway[i]) <= _SHOWN:
+            for row in range(5):
+                shown.present[row, i] = 0.0
+    copy(shown, state.earliest)
+    copy(shown, state.earlier)
+
+
+@inner
+def copy(source: Shown, out: Shown) -> None:
+    """Copy what reversals have shown."""
+    for i in range(out.coulomb.shape[1]):
+        for row in range(5):
+            out.past[row, i] = source.past[row, i]
+            out.present[row, i] = source.present[row, i]
+        for row in range(2):
+            out.coulomb[row, i] = source.coulomb[row, i]

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What reversals show of friction: their sums, the last two of them, a change of the arm."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blf_dsc_controller.compiled.layout import size_of, view_of
+from blf_dsc_controller.law import reversals
+from blf_dsc_controller.law.reversals import Settings, State
+
+SETTINGS = Settings(
+    unmodelled=np.array([0.1]),
+    initial=np.array([3.0]),
+    variance=np.array([2.25]),
+    least=np.array([1.0]),
+    most=np.array([9.0]),
+)
+SE, BE, SS, SB, BB = range(5)
+
+
+def begun():
+    """The state of one joint that has not reversed yet."""
+    sizes = SimpleNamespace(n=1)
+    state = view_of(State)(np.zeros(size_of(State)(sizes)), sizes)
+    reversals.begin(SETTINGS, state)
+    return state
+
+
+@pytest.mark.parametrize(
+    ('last', 'before', 'expected'),
+    [
+        (4.0, 5.0, 4.5),  # both are above 3 N m: their mean
+        (2.0, 1.0, 1.5),  # both are below
+        (4.0, 2.0, 3.0),  # they contradict each other
+        (4.0, 3.05, 3.0),  # one of them agrees, within 0.1 N m
+    ],
+)
+def test_two_reversals_overrule_the_sums_if_both_contradict_them(
+    last, before, expected
+):
+    """The sums of eight reversals, which say 3 N m as the prior does, without breakaway.
+
+    The prior pulls to 3 N m by 0.015 (0.1 / 1.5)^2, 7e-5 of the sums.
+    """
+    shown = begun().shown
+    shown.past[[SE, SS, BB], 0] = 3.0, 1.0, 1.0
+    shown.coulomb[:, 0] = last, before
+    reversals.overrule(SETTINGS, shown, 0)
+    coulomb, stribeck = reversals.learned(SETTINGS, shown, 0)
+    assert coulomb == pytest.approx(expected, abs=1e-3)
+    assert stribeck == 0.0
+
+
+def test_reversal_shows_its_friction_once_and_within_limits():
+    """Once p int s_h^2 dt is 0.06, half a reversal."""
+    shown = begun().shown
+
+    def add(energy, friction):
+        """Add a row without breakaway."""
+        s = np.sqrt(energy)
+        return reversals.add_row(SETTINGS, shown, 0, s, 0.0, friction * s, 1.0, 0.0)
+
+    assert not add(0.05, 4.0)
+    assert shown.coulomb[:, 0].tolist() == [3.0, 3.0]
+    assert add(0.02, 4.0)
+    np.testing.assert_allclose(shown.coulomb[:, 0], [4.0, 3.0])
+    assert not add(0.01, 400.0)
+    assert shown.coulomb[:, 0].tolist() == [9.0, 3.0]  # the most
+
+
+def test_sums_of_past_reversals_forget_what_is_older_than_eight():
+    """Friction that differs by less than what is unmodelled is averaged."""
+    shown = begun().shown
+    for friction, expected in ((5.0, 5.0), (5.08, 5.08)):
+        for _ in range(40):
+            shown.present[[SE, SS], 0] = 0.125 * friction, 0.125
+            shown.coulomb[:] = friction
+            reversals.close(SETTINGS, shown, 0, 0.0)
+            assert not shown.present.any()
+            assert shown.past[SS, 0] <= 1.0 + 1e-12
+        found, _ = reversals.learned(SETTINGS, shown, 0)
+        assert found == pytest.approx(expected, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ('ago', 'coulomb', 'last'),
+    [
+        (0.1, 3.0, 3.0),  # s since a reversal with 8 N m has ended
+        (0.4, 8.0, 8.0),
+    ],
+)
+def test_reversal_that_ended_as_the_arm_changed_is_taken_back(ago, coulomb, last):
+    state = begun()
+    state.shown.present[[SE, SS], 0] = 0.125 * 8.0, 0.125
+    state.shown.coulomb[0] = 8.0
+    reversals.close(SETTINGS, state.shown, 0, 0.0)
+    for _ in range(round(100 * ago)):
+        reversals.keep(state, 0.01)
+    reversals.take_back(state, np.zeros(1))
+    found, _ = reversals.learned(SETTINGS, state.shown, 0)
+    assert found == pytest.approx(coulomb, abs=0.01)
+    assert state.shown.coulomb[0, 0] == last
