@@ -329,8 +329,8 @@ def test_gains_too_soft_for_any_bound_are_refused(whole, capsys, monkeypatch):
     A lag of the damping would let this arm bear more.
     """
     monkeypatch.setattr(cli_commission, 'LAGS', ())
-    coarsen(whole, '4.0e-4')
-    assert commission(whole, 'plant', '--yes', '--torque', '0.01') == 1
+    coarsen(whole, '6.0e-4')
+    assert commission(whole, 'plant', '--yes', '--torque', '0.015') == 1
     told, why = capsys.readouterr()
     off = re.search(
         r'too soft for any bound: joint1 would be off by up to (.*) rad', why

@@ -420,4 +420,4 @@ def test_settings_of_friction_are_those_of_its_columns(bias):
     own = slice(found.first_coulomb, found.first_coulomb + 2)
     for name in ('variance', 'least', 'most'):
         of_theta = getattr(settings.adaptation, name)
-        np.testing.assert_array_equal(getattr(found, name), of_theta[own])
+        np.testing.assert_array_equal(getattr(found.reversals, name), of_theta[own])

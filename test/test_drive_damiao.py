@@ -270,6 +270,10 @@ def test_identifier_that_stands_for_two_motors_is_refused(given, text):
         build(DriveConfig, given)
 
 
+def test_motor_may_answer_with_its_own_identifier():
+    build(DriveConfig, {'motor_ids': [1, 2], 'feedback_ids': [1, 2]})
+
+
 TURNED = {
     'motor_directions': [1, -1, 1, -1, -1, 1, -1],
     'motor_offsets': [0.3, -0.2, 0.0, 1.0, -0.7, 0.05, 2.0],  # rad

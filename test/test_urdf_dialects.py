@@ -171,7 +171,7 @@ def test_gripper_that_becomes_a_joint_is_named():
     assert config.joints[-1] == 'grip'
     warnings = [each for each in config_warnings(config) if 'robot.tip' in each]
     assert len(warnings) == 1
-    assert 'grip, which slides' in warnings[0]
+    assert 'grip is one of the joints' in warnings[0]
     assert warnings[0].endswith('l2')
     given = {'robot.urdf': text, 'robot.tip': 'l2'}
     config = build(ControllerConfig, given)

@@ -139,7 +139,11 @@ class DriveConfig:
                 )
         motors = max(len(self.motor_ids), len(self.feedback_ids))
         ids, answers = self.identifiers(motors)
-        if both := sorted(set(ids) & set(answers)):
+        # a motor may answer with its own identifier
+        both = [
+            each for k, each in enumerate(ids) if each in answers[:k] + answers[k + 1 :]
+        ]
+        if both:
             yield (
                 f'motor_ids: got {both[0]}, with which another one answers: a motor would take '
                 'answers for its commands'
