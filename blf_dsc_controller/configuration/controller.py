@@ -57,6 +57,7 @@ from blf_dsc_controller.configuration.schema import (
     flatten,
 )
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
 
 _FILTERED = '; of the law paper, gains.prediction filtered'
 
@@ -123,6 +124,12 @@ class ControllerConfig(ArmConfig):
         The defaults suit the two-link arm.
         """
         return followed_by(given)
+
+    @property
+    def units(self) -> tuple[JointUnits, ...]:
+        """Units of each joint."""
+        sliding = self.robot.sliding(self.joints)
+        return tuple(SLIDING if each in sliding else TURNING for each in self.joints)
 
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other and against the model."""
