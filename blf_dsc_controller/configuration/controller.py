@@ -144,8 +144,8 @@ class ControllerConfig(ArmConfig):
         yield from self._stiffness_problems()
         yield from self.arm_problems(f'model {self.model}', needed)
         yield from self.reference.problems()
-        yield from self.limits.problems(self.joints)
-        yield from self.barrier.problems(self.joints)
+        yield from self.limits.problems(self.joints, self.units)
+        yield from self.barrier.problems(self.joints, self.units)
         yield from tool_bound.problems(self)
         radius = self.learning.radius
         known = known_arm.known_arm(self)

@@ -129,7 +129,8 @@ def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
             allowed = strongest
             source = 'no drive of an arm of this weight has more than'
         if limit > _ROUNDED * allowed:
-            text = f'got {limit:g} N m for {joint.name}, but {source} {allowed:.4g} N m'
+            unit = 'N' if joint.kind == 'prismatic' else 'N m'
+            text = f'got {limit:g} {unit} for {joint.name}, but {source} {allowed:.4g} {unit}'
             yield _Doubt('torque.limit', text)
 
 
