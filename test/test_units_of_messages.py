@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.commissioning.page import _wider
 from blf_dsc_controller.commissioning.planned import _check_posture
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build, change
@@ -23,6 +24,8 @@ from blf_dsc_controller.run import SLIDING, TURNING
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.bound_warnings import width_warnings
 from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.supervision.expected_errors import expectation
+from blf_dsc_controller.supervision.gear_warnings import gear_warnings
 from blf_dsc_controller.supervision.state_check import StateCheck
 
 JOINTS = ('turning', 'sliding')
@@ -157,6 +160,29 @@ def test_warnings_of_a_narrow_bound_and_of_efforts_that_are_not_given():
         'torque.limit: no effort in the URDF for turning, sliding: 100 N m or 100 N is assumed; '
         'give the rated torque of each drive'
     )
+
+
+def test_bounds_that_are_too_fine_or_become_wider():
+    both_slide = URDF.replace('revolute', 'prismatic')
+    given = {'robot.urdf': both_slide, 'robot.tip': 'tip', 'barrier.tool_bound': 1e-9}
+    with pytest.raises(ConfigurationError, match=r'\w+ would be \S+ m, finer'):
+        build(ControllerConfig, {'joints': list(JOINTS), **given})
+    before, after = (
+        change(arm(), {'barrier.bound': [0.1, bound]}) for bound in (0.05, 0.06)
+    )
+    found = SimpleNamespace(joints=JOINTS, before=before, config=after)
+    assert _wider(found) == {'barrier.bound': ['sliding 0.06 m instead of 0.05']}
+
+
+def test_errors_to_expect_and_gains_that_nobody_measured():
+    assert re.fullmatch(
+        r'\d+ mm by friction, .*; \d+ mm of sliding when 3 kg are picked up in motion',
+        expectation(arm()),
+    )
+    damping = np.array([2.0, 1.0])
+    settings = SimpleNamespace(feedback=SimpleNamespace(gain=damping))
+    (soft,) = gear_warnings(arm(), settings)
+    assert 'sliding with a damping of 1 N s/m.' in soft
 
 
 def test_stop_at_the_bound():

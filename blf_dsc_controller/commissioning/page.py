@@ -282,9 +282,9 @@ def _wider(found: Commissioned) -> dict[str, list[str]]:
             for name, (unit, wide, usual) in bounds.items()
         }
     wider = [
-        f'{joint} {wide:g} rad instead of {usual:g}'
-        for joint, wide, usual in zip(
-            found.joints, after.bound, before.bound, strict=True
+        f'{joint} {wide:g} {unit} instead of {usual:g}'
+        for joint, (unit, _), wide, usual in zip(
+            found.joints, found.config.units, after.bound, before.bound, strict=True
         )
         if wide > usual
     ]
