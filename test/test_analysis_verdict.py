@@ -50,6 +50,16 @@ def load(mass, interval):
     ('given', 'title', 'expected'),
     [
         ({}, 'of the bound', ('40 %', 'largest error, any joint')),
+        (
+            LEFT | {'max_error_ratio': 0.97},
+            'of the bound',
+            ('97 %', 'largest error, any joint, before the stop'),
+        ),
+        (
+            LEFT | {'max_error_ratio': 1.2},
+            'of the bound',
+            ('120 %', 'largest error, any joint'),
+        ),
         ({'max_error_ratio': nan}, 'of the bound', ('-', 'not recorded')),
         ({}, 'largest error', ('0.8 mrad', 'shoulder')),
         ({'sliding': ('shoulder',)}, 'largest error', ('0.8 mm', 'shoulder')),
@@ -99,3 +109,17 @@ def test_table_for_the_terminal_aligns_titles_and_sentences(metrics):
     lines = format_table(metrics).partition('\n\n')[2].splitlines()
     assert lines[0] == 'run         1.999 s, 2000 samples'
     assert lines[1] == 'bound       held by every joint'
+
+
+@pytest.mark.parametrize(
+    ('ratio', 'ending'),
+    [
+        (0.97, ', by the error of the stop; the table ends with the sample before'),
+        (1.2, ''),
+    ],
+)
+def test_bound_that_is_left_inside_the_table_is_explained(metrics, ratio, ending):
+    """No message has the sample that causes a stop."""
+    left = replace(metrics, **LEFT, max_error_ratio=ratio)
+    line = format_table(left).partition('\n\n')[2].splitlines()[1]
+    assert line == f'bound       VIOLATED, first by elbow at 1.500 s{ending}'

@@ -25,7 +25,11 @@ from blf_dsc_controller.cli.bags import PARTIAL
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import StateError
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import (
+    BlfDscError,
+    ConfigurationError,
+    LoopEndedError,
+)
 from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import COMMANDS
@@ -36,6 +40,7 @@ from sim_plant.plant import plant_of
 from sim_plant.settings import steps_of
 
 LOOP = blf.load_loop('recommended', {'sim_plant': {'duration': 1.0}})
+AT_REST = (2.2, 1.6), (0.0, 0.0)  # q [rad], dq
 LONG = blf.load_loop('recommended', {'sim_plant': {'duration': 4.0}})
 
 KILLED = """
@@ -291,6 +296,27 @@ def test_output_that_fails_is_dropped_and_the_others_go_on():
     assert controller.output_problem == 'ValueError: a mistake of the user'
     simulated = blf.simulate(LOOP.controller, LOOP.plant).run()
     np.testing.assert_array_equal(torques, simulated.torque[:100])
+
+
+@pytest.mark.parametrize(
+    'use',
+    [
+        lambda each: each.update(1.001, *AT_REST),
+        lambda each: each.prepare(AT_REST[0]),
+        lambda each: each.follow([blf.TrajectoryPoint(1.0, AT_REST[0])]),
+        blf.ArmController.start,
+        blf.ArmController.reset,
+    ],
+)
+def test_closed_controller_commands_no_more_and_still_says_what_it_found(use):
+    with blf.ArmController(LOOP.controller) as controller:
+        q, dq, effort = plant_of(LOOP.plant).measure().reshape(3, -1)
+        controller.update(1.0, q, dq, effort)
+        found = controller.estimates
+    with pytest.raises(LoopEndedError, match=r'is closed.*: make another one'):
+        use(controller)
+    assert controller.estimates == found
+    assert controller.close() is not None
 
 
 def test_error_at_the_end_of_the_recording_does_not_lose_the_last_torque(tmp_path):

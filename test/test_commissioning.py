@@ -26,6 +26,7 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.commission import _lags as lags_of
+from blf_dsc_controller.cli.commission import _told as told_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
@@ -1231,6 +1232,22 @@ def test_bound_at_the_tool_that_cannot_be_widened_is_refused():
     both = at_the_tool(**{'barrier.bound': (0.001, 0.001)})
     with pytest.raises(BlfDscError, match=r'drop barrier\.bound, which then follows'):
         stiff(build(ControllerConfig, both)).parameters()
+
+
+@pytest.mark.parametrize(('bags', 'advises'), [([], False), (['bag_1'], True)])
+def test_gains_are_to_be_proven_only_where_there_is_a_robot(bags, advises):
+    """Without bags and a robot, the command has measured the simulated arm."""
+    seen = found()
+    stuck = seen.findings._replace(
+        inertia=np.array([np.nan, 1.0]), damping=1.1 * seen.choice.gains.damping
+    )
+    unfit = stuck._replace(unfit=np.array([[True, False]]))
+    options = SimpleNamespace(config='arm', bags=bags, robot=None, ros=False)
+    for each, remedy in ((stuck, 'take half of'), (unfit, 'with a larger --torque')):
+        told = ' '.join(told_of(options, seen._replace(findings=each), []))
+        assert remedy in told
+        assert 'friction damps joint2 more' in told
+        assert told.count('--prove') == 2 * advises
 
 
 def test_what_friction_and_inertia_do_to_the_gains_is_told():

@@ -194,7 +194,10 @@ def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypa
     driver = made(at={100: mute, 103: unmute, 150: mute})
     outcome = run(driver)
     assert outcome.end is End.LOST
-    assert driver.lost >= 3 + 10
+    assert outcome.states in (
+        159,
+        160,
+    )  # the frame before may have been answered already
     assert (
         'motor 0x03 of openarm_left_joint3 has not answered 11 frames' in outcome.text
     )

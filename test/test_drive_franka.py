@@ -25,7 +25,12 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.drive.driver import disagreements
+from blf_dsc_controller.drive.driver import (
+    ConnectionLostError,
+    DriverError,
+    ReflexError,
+    disagreements,
+)
 from blf_dsc_controller.errors import LoopEndedError
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.messages.topics import MOTOR_STATES
@@ -33,6 +38,8 @@ from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
     pytest.skip('needs pylibfranka and franky-sim', allow_module_level=True)
+
+import pylibfranka
 
 from blf_dsc_controller.drive.franka import FrankaDriver
 
@@ -383,6 +390,36 @@ def test_motors_that_are_where_their_links_are_say_nothing(theta, has_motors):
     )
     driver._control = SimpleNamespace(readOnce=lambda: (state, None))
     assert (driver.read().motors is not None) == has_motors
+
+
+@pytest.mark.parametrize('call', ['readOnce', 'writeOnce'])
+@pytest.mark.parametrize(
+    ('raised', 'expected', 'remedy'),
+    [
+        ('NetworkException', ConnectionLostError, 'check its computer and the cable'),
+        ('ControlException', ReflexError, ''),
+        ('CommandException', ReflexError, 'see Desk, which names the cause'),
+        ('InvalidOperationException', DriverError, 'end what else reads or moves'),
+        ('RealtimeException', DriverError, 'see Desk, and start again'),
+        ('FrankaException', DriverError, 'see Desk, and start again'),
+    ],
+)
+def test_what_libfranka_raises_in_motion_is_an_error_of_a_driver(
+    call, raised, expected, remedy
+):
+    """All of its exceptions, none of which is another's base class in Python."""
+
+    def fail(*_):
+        raise getattr(pylibfranka, raised)('libfranka: it said no')
+
+    given = blf.load_loop('fr3_direct').controller
+    driver = FrankaDriver('', given, build(DriveConfig, {}))
+    driver._control = SimpleNamespace(**{call: fail})
+    use = driver.read if call == 'readOnce' else driver.finish
+    with pytest.raises(DriverError, match=f'it said no.*{remedy}') as caught:
+        use()
+    assert type(caught.value) is expected
+    assert 'libfranka' not in str(caught.value)
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):

@@ -43,6 +43,7 @@ from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.topics import TARGETS
+from blf_dsc_controller.run import SLIDING, TURNING
 
 # rad: the bound of the preset, to which any error of the arm adds up
 NEAR = 0.045
@@ -214,13 +215,19 @@ def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):
     [
         ([0.5, 0.05], ''),
         ([-3.0, 0.2], ''),  # past the limits: braked on the way there
-        ([30.0, 0.05], 'a is to be at 30 rad'),
-        ([0.5, -45.0], 'b is to be at -45 rad'),
+        (
+            [30.0, 0.05],
+            'a is to be at 30 rad, and its limits are -2 to 1: not followed. If these are degr',
+        ),
+        (
+            [0.5, -45.0],
+            'b is to be at -45 m, and its limits are 0 to 0.1: not followed. If these are mm, ',
+        ),
     ],
 )
 def test_only_what_may_be_degrees_is_no_target_of_a_stream(positions, named):
     limits = SimpleNamespace(position_lower=(-2.0, 0.0), position_upper=(1.0, 0.1))
-    config = SimpleNamespace(joints=('a', 'b'), limits=limits)
+    config = SimpleNamespace(joints=('a', 'b'), limits=limits, units=(TURNING, SLIDING))
     found = _far_beyond(np.array(positions), config)
     assert bool(found) == bool(named)
     assert named in found

@@ -8,6 +8,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import interfaces
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from ros_rig import RosRig, activate, cleanup, configure, deactivate
 from std_srvs.srv import Trigger
 
@@ -244,6 +247,46 @@ def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
 def test_bad_values_are_named_with_a_remedy(given, problem):
     with pytest.raises(ConfigurationError, match=problem):
         change(FR3.controller, TOLD | given)
+
+
+def unsent(_request):
+    raise RCLError('failed to send request')
+
+
+@pytest.mark.parametrize(
+    ('call', 'problem'),
+    [
+        (
+            unsent,
+            r'cannot be called \(failed to send request\): see whether its driver',
+        ),
+        (lambda _: answered(), 'its answer does not say whether 2.00 kg are accepted'),
+        (lambda _: answered(success=False), 'refused 2.00 kg: it does not say why'),
+        (lambda _: Future(), 'has not answered for 2001 states'),
+    ],
+)
+def test_call_that_fails_ends_the_declarations_and_not_the_law(ros, call, problem):
+    """An error in `follow` would be one of the law, which stops the arm."""
+    service = service_declaration.ServiceDeclaration(
+        ros.tester, change(FR3.controller, TOLD)
+    )
+    service._type = 'ur_msgs/srv/SetPayload'
+    request = SimpleNamespace(center_of_gravity=SimpleNamespace())
+    service.client = SimpleNamespace(
+        call_async=call,
+        service_is_ready=lambda: True,
+        srv_type=SimpleNamespace(Request=lambda: request),
+    )
+    law = SimpleNamespace(load_to_tell=lambda: DriveLoad(2.0, (0.0, 0.0, 0.1)))
+    for _ in range(20 + 2002):
+        service.follow(law, in_motion=True)
+    assert re.search(f'^{SERVICE}:? {problem}', service.problem)
+
+
+def answered(**fields):
+    future = Future()
+    future.set_result(SimpleNamespace(**fields))
+    return future
 
 
 def test_centre_is_in_the_frame_that_the_service_wants(ros):

@@ -275,8 +275,7 @@ DRIVES = {'robot.rotor_inertia': [0.2175] * 4 + [0.03] * 3}  # known to be as gu
         (
             {'robot.urdf': UNLIMITED},
             [
-                f'torque.limit: panda_joint{k} has no effort in the URDF'
-                for k in (5, 6, 7)
+                'no effort in the URDF for panda_joint5, panda_joint6, panda_joint7: 100 N m is'
             ],
         ),
         (

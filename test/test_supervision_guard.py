@@ -23,6 +23,7 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryError,
     TrajectoryPoint,
 )
+from blf_dsc_controller.run import TURNING
 from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
@@ -97,7 +98,7 @@ def test_ramp_is_linear_and_ends_at_a_moving_goal():
 
 def test_missed_states_are_averaged():
     """With every second state missed, the fraction is one half after a few windows."""
-    states = StateCheck(JOINTS, 1e-3)
+    states = StateCheck(JOINTS, (TURNING, TURNING), 1e-3)
     safety = Safety(overrun_fraction=1.0)
     for k in range(10_001):
         assert states.check(safety, (1 + 2 * k) * MILLISECOND) is None
@@ -695,7 +696,7 @@ def test_velocity_limit_changed_at_run_time_holds_from_the_next_state_on():
     ('gap', 'missed'), [(1.0, 0), (1.4, 0), (1.6, 1), (1.9, 1), (2.1, 1), (2.9, 2)]
 )
 def test_gap_counts_to_the_nearest_number_of_missed_states(gap, missed):
-    check = StateCheck(('joint1', 'joint2'), 1e-3)
+    check = StateCheck(('joint1', 'joint2'), (TURNING, TURNING), 1e-3)
     safety = ControllerConfig().safety
     assert check.check(safety, 10**9) is None
     assert check.check(safety, 10**9 + round(gap * 10**6)) is None
@@ -752,7 +753,9 @@ def test_clock_was_set_if_a_moving_arm_has_moved_for_less_than_half_the_gap(
 ):
     """`share` is the part of `gap` [s] for which it moved at its `speed` [rad/s]."""
     dq = np.array([0.6, -0.8]) * speed
-    fault = StateCheck(JOINTS, 1e-3).clock_step(gap, share * gap * dq, dq)
+    fault = StateCheck(JOINTS, (TURNING, TURNING), 1e-3).clock_step(
+        gap, share * gap * dq, dq
+    )
     assert (fault is not None) == is_set
 
 

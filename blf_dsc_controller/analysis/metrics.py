@@ -108,6 +108,14 @@ class Metrics:
     #: s, after which the parameter error stays below 1 %
     time_to_1_percent: float = math.nan
 
+    @property
+    def left_at_stop(self) -> bool:
+        """Whether the error that left the bound is in the text of the stop alone.
+
+        No message has the sample that causes a stop, so `max_error` is that of those before.
+        """
+        return self.held is False and self.max_error_ratio < 1.0
+
 
 @np.errstate(all='ignore')  # a bag may hold any number
 def measure(run: Run) -> Metrics:

@@ -86,6 +86,8 @@ def _bound_text(of: Metrics) -> str:
     kept = 'unknown' if of.held is None else 'held by every joint'
     if not math.isnan(of.first_violation):
         kept = f'VIOLATED, first by {of.violating_joint} at {of.first_violation:.3f} s'
+    if of.left_at_stop:
+        kept += ', by the error of the stop; the table ends with the sample before'
     if of.stops and of.held:
         kept += ' until the stop'
     return kept

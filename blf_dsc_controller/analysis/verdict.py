@@ -56,11 +56,10 @@ def figures_of(metrics: Metrics) -> list[Figure]:
 def _bound(of: Metrics) -> Figure:
     if math.isnan(of.max_error_ratio):
         return Figure('of the bound', '-', 'not recorded')
-    return Figure(
-        'of the bound',
-        f'{100.0 * of.max_error_ratio:.0f} %',
-        'largest error, any joint',
-    )
+    detail = 'largest error, any joint'
+    if of.left_at_stop:
+        detail += ', before the stop'
+    return Figure('of the bound', f'{100.0 * of.max_error_ratio:.0f} %', detail)
 
 
 def _error(of: Metrics) -> Figure:

@@ -94,7 +94,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
     comment = ''.join(f'# {line}\n' for line in (options.line, *lines))
     dump(options.out, files.of_commissioned(read(path), found), comment)
     print(f'wrote {options.out}')
-    if not (options.bags or options.robot or options.ros):
+    if _is_simulated(options):
         _prove(options.out)
     return 0
 
@@ -103,6 +103,11 @@ def _lags(path: Path) -> Sequence[float]:
     """Return the lags of the damping to try [s]: motors that close the feedback have none."""
     in_motors = load(path, DRIVE, DriveConfig).feedback == 'motor'
     return () if in_motors else LAGS
+
+
+def _is_simulated(options: Namespace) -> bool:
+    """Whether the options measure the simulated arm."""
+    return not (options.bags or options.robot or options.ros)
 
 
 def _check(options: Namespace) -> None:
@@ -138,7 +143,7 @@ def _all_runs(
 
     Also sentences about what was to be measured and could not be.
     """
-    if not (options.bags or options.robot or options.ros):
+    if _is_simulated(options):
         return _simulated(path, commissioning)
     names = [str(bag) for bag in options.bags]
     announce_reading(options.bags, 'read')
@@ -237,7 +242,8 @@ def _told(
         f'{options.config} commissioned on {found.date} by blf_dsc_controller {__version__}, with '
         f'a modulus margin of {found.choice.margin.value:.2g}'
     )
-    told = [origin, *page.sentences(found), *missing]
+    found_out = page.sentences(found, is_simulated=_is_simulated(options))
+    told = [origin, *found_out, *missing]
     return [line for each in told for line in textwrap.wrap(each, _WIDTH)]
 
 

@@ -83,11 +83,14 @@ def table(found: Commissioned) -> str:
     return aligned(rows)
 
 
-def sentences(found: Commissioned) -> Iterator[str]:
-    """Yield what was found, what limits the gains, and what to do about it."""
+def sentences(found: Commissioned, *, is_simulated: bool = False) -> Iterator[str]:
+    """Yield what was found, what limits the gains, and what to do about it.
+
+    Gains of an arm that `is_simulated` cannot be proven: --prove is for a robot.
+    """
     yield from _of_states(found)
-    yield from _of_hidden(found)
-    yield from _of_friction(found)
+    yield from _of_hidden(found, is_simulated=is_simulated)
+    yield from _of_friction(found, is_simulated=is_simulated)
     yield from _of_margin(found)
     yield from _of_lags(found)
     yield from _of_factors(found)
@@ -177,8 +180,11 @@ def _of_factors(found: Commissioned) -> Iterator[str]:
         )
 
 
-def _of_hidden(found: Commissioned) -> Iterator[str]:
+def _of_hidden(found: Commissioned, *, is_simulated: bool) -> Iterator[str]:
     """Yield of which joints no inertia is seen, why, and how much there may be."""
+    first, last = 'prove the gains (--prove), or ', ', and prove the gains (--prove)'
+    if is_simulated:
+        first = last = ''
     names = np.array(found.joints)
     hidden = np.isnan(found.findings.inertia)
     unfit = hidden & found.findings.unfit.any(axis=0)
@@ -186,15 +192,15 @@ def _of_hidden(found: Commissioned) -> Iterator[str]:
     if stuck.any():
         yield (
             f'friction hides the inertia of {", ".join(names[stuck])}: that of the URDF is used, '
-            'and the margin is that of joints that stick, not that of joints that slide: prove '
-            'the gains (--prove), or take half of feedback.stiffness and a wider bound'
+            'and the margin is that of joints that stick, not that of joints that slide: '
+            f'{first}take half of feedback.stiffness and a wider bound'
         )
     if unfit.any():
         yield (
             f'{", ".join(names[unfit])}: an inertia would fit best with a lag of '
             f'{1e3 * LONGEST_LAG:g} ms, the longest that is tried, so it is not believed and '
             'that of the URDF is used: friction or noise hide it, or the drives are as late. '
-            'Measure again with a larger --torque or --travel, and prove the gains (--prove)'
+            f'Measure again with a larger --torque or --travel{last}'
         )
     unseen = ', '.join(
         f'{joint} {more:.2g}'
@@ -208,15 +214,16 @@ def _of_hidden(found: Commissioned) -> Iterator[str]:
         )
 
 
-def _of_friction(found: Commissioned) -> Iterator[str]:
+def _of_friction(found: Commissioned, *, is_simulated: bool) -> Iterator[str]:
     """Yield where friction adds damping that is gone in steady motion, or is not in the file."""
     names = np.array(found.joints)
     hidden = np.isnan(found.findings.inertia)
     rubbing = ~hidden & (found.findings.damping > found.choice.gains.damping)
     if rubbing.any():
+        remedy = '' if is_simulated else ', so prove the gains (--prove)'
         yield (
             f'friction damps {", ".join(names[rubbing])} more than the gains do while shaken, and '
-            'less in a steady motion: the true margin is smaller, so prove the gains (--prove)'
+            f'less in a steady motion: the true margin is smaller{remedy}'
         )
     if found.coulomb is not None:
         measured = ', '.join(f'{each:.2g}' for each in found.coulomb)
@@ -275,9 +282,9 @@ def _wider(found: Commissioned) -> dict[str, list[str]]:
             for name, (unit, wide, usual) in bounds.items()
         }
     wider = [
-        f'{joint} {wide:g} rad instead of {usual:g}'
-        for joint, wide, usual in zip(
-            found.joints, after.bound, before.bound, strict=True
+        f'{joint} {wide:g} {unit} instead of {usual:g}'
+        for joint, (unit, _), wide, usual in zip(
+            found.joints, found.config.units, after.bound, before.bound, strict=True
         )
         if wide > usual
     ]

@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, design
 from blf_dsc_controller.configuration.plausibility import hint_at_degrees
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import TURNING, JointUnits
 from blf_dsc_controller.supervision.reference_load import along
 
 Floats = NDArray[np.float64]
@@ -131,22 +132,25 @@ def _check_posture(config: ControllerConfig, posture: Floats) -> None:
         )
     limits = zip(
         config.joints,
+        config.units,
         posture,
         config.limits.position_lower,
         config.limits.position_upper,
         strict=True,
     )
-    for joint, at, lower, upper in limits:
+    for joint, units, at, lower, upper in limits:
         if not lower + _FROM_LIMITS <= at <= upper - _FROM_LIMITS:
             raise BlfDscError(
-                f'posture: {joint} would be at {at:.4g} rad, '
-                f'{_beyond(float(at), lower, upper)}'
+                f'posture: {joint} would be at {at:.4g} {units.position}, '
+                f'{_beyond(float(at), lower, upper, units)}'
             )
 
 
-def _beyond(at: float, lower: float, upper: float) -> str:
-    """Return how an angle [rad] is past or near the limits of its joint, with a hint at degrees."""
-    limits = f'its limits, {lower:g} to {upper:g} rad'
+def _beyond(at: float, lower: float, upper: float, units: JointUnits) -> str:
+    """Return how a position is past or near the limits of its joint, with a hint at degrees."""
+    unit = units.position
+    limits = f'its limits, {lower:g} to {upper:g} {unit}'
     if lower <= at <= upper:
-        return f'less than {_FROM_LIMITS:g} rad from {limits}'
-    return f'beyond {limits}{hint_at_degrees(at, lower, upper)}'
+        return f'less than {_FROM_LIMITS:g} {unit} from {limits}'
+    hint = hint_at_degrees(at, lower, upper) if units == TURNING else ''
+    return f'beyond {limits}{hint}'

@@ -12,6 +12,7 @@ from blf_dsc_controller.configuration.controller_groups import (
 )
 from blf_dsc_controller.configuration.motion_groups import MotionLimits
 from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.run import JointUnits
 
 
 class Checked(Protocol):
@@ -28,6 +29,10 @@ class Checked(Protocol):
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints, from the base."""
+
+    @property
+    def units(self) -> tuple[JointUnits, ...]:
+        """Units of each joint."""
 
     @property
     def insist(self) -> tuple[str, ...]:

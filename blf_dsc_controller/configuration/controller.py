@@ -57,6 +57,7 @@ from blf_dsc_controller.configuration.schema import (
     flatten,
 )
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
 
 _FILTERED = '; of the law paper, gains.prediction filtered'
 
@@ -124,6 +125,12 @@ class ControllerConfig(ArmConfig):
         """
         return followed_by(given)
 
+    @property
+    def units(self) -> tuple[JointUnits, ...]:
+        """Units of each joint."""
+        sliding = self.robot.sliding(self.joints)
+        return tuple(SLIDING if each in sliding else TURNING for each in self.joints)
+
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other and against the model."""
         needed, count = self._sizes()
@@ -137,8 +144,8 @@ class ControllerConfig(ArmConfig):
         yield from self._stiffness_problems()
         yield from self.arm_problems(f'model {self.model}', needed)
         yield from self.reference.problems()
-        yield from self.limits.problems(self.joints)
-        yield from self.barrier.problems(self.joints)
+        yield from self.limits.problems(self.joints, self.units)
+        yield from self.barrier.problems(self.joints, self.units)
         yield from tool_bound.problems(self)
         radius = self.learning.radius
         known = known_arm.known_arm(self)

@@ -8,7 +8,7 @@ The gains are those of the control laws (28) and (35), and of composite learning
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
@@ -19,6 +19,7 @@ from blf_dsc_controller.configuration.schema import (
     parameter,
     positive,
 )
+from blf_dsc_controller.run import JointUnits
 
 _of_tool = partial(
     non_negative,
@@ -183,23 +184,26 @@ class Barrier:
             for initial, bound in zip(self.initial_bound, self.bound, strict=True)
         )
 
-    def problems(self, joints: tuple[str, ...]) -> Iterator[str]:
+    def problems(
+        self, joints: tuple[str, ...], units: Sequence[JointUnits]
+    ) -> Iterator[str]:
         """Check the weight against the slope limit, and the bounds of the funnel."""
-        for joint, weight, limit in zip(
-            joints, self.weight, self.slope_limit, strict=True
+        for joint, given, weight, limit in zip(
+            joints, units, self.weight, self.slope_limit, strict=True
         ):
+            unit = given.of('N m/rad')
             if limit <= weight:
                 yield (
-                    f'barrier.slope_limit: got {limit:g} N m/rad for {joint}, but it must be above '
-                    f'barrier.weight, {weight:g} N m/rad'
+                    f'barrier.slope_limit: got {limit:g} {unit} for {joint}, but it must be above '
+                    f'barrier.weight, {weight:g} {unit}'
                 )
-        for joint, initial, bound in zip(
-            joints, self.initial_bound, self.bound, strict=True
+        for joint, (unit, _), initial, bound in zip(
+            joints, units, self.initial_bound, self.bound, strict=True
         ):
             if 0.0 < initial < bound:
                 yield (
-                    f'barrier.initial_bound: got {initial:g} rad for {joint}, but it must be 0 '
-                    f'(no funnel) or at least barrier.bound, {bound:g} rad'
+                    f'barrier.initial_bound: got {initial:g} {unit} for {joint}, but it must be 0 '
+                    f'(no funnel) or at least barrier.bound, {bound:g} {unit}'
                 )
         if self.funnel_rate == 0.0 and self.widest != self.bound:
             yield (

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -12,6 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from blf_dsc_controller.configuration.schema import PerJoint, parameter, positive
+from blf_dsc_controller.run import JointUnits
 
 _of_reference = partial(
     parameter,
@@ -145,12 +147,16 @@ class MotionLimits:
             jerk=tuple((share * jerk).tolist()),
         )
 
-    def problems(self, joints: tuple[str, ...]) -> list[str]:
+    def problems(
+        self, joints: tuple[str, ...], units: Sequence[JointUnits]
+    ) -> list[str]:
         """Check that the position limits leave a range."""
-        limits = zip(joints, self.position_lower, self.position_upper, strict=True)
+        limits = zip(
+            joints, units, self.position_lower, self.position_upper, strict=True
+        )
         return [
-            f'limits.position_upper: got {upper:g} rad for {joint}, but it must be above '
-            f'limits.position_lower, {lower:g} rad'
-            for joint, lower, upper in limits
+            f'limits.position_upper: got {upper:g} {unit} for {joint}, but it must be above '
+            f'limits.position_lower, {lower:g} {unit}'
+            for joint, (unit, _), lower, upper in limits
             if upper <= lower
         ]

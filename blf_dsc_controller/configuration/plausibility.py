@@ -122,14 +122,16 @@ def _refused(doubts: Iterable[_Doubt], insist: Sequence[str]) -> Iterator[str]:
 def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
     """Check torques against the efforts of the drives."""
     strongest = max(UNKNOWN_EFFORT, config.robot.largest_effort(chain))
-    for joint, limit in zip(chain.joints, config.torque.limit, strict=True):
+    for joint, (_, unit), limit in zip(
+        chain.joints, config.units, config.torque.limit, strict=True
+    ):
         allowed = joint.effort
         source = 'the URDF gives its drive'
         if math.isinf(allowed):
             allowed = strongest
             source = 'no drive of an arm of this weight has more than'
         if limit > _ROUNDED * allowed:
-            text = f'got {limit:g} N m for {joint.name}, but {source} {allowed:.4g} N m'
+            text = f'got {limit:g} {unit} for {joint.name}, but {source} {allowed:.4g} {unit}'
             yield _Doubt('torque.limit', text)
 
 

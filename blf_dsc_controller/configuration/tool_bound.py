@@ -218,10 +218,11 @@ def problems(config: Checked) -> Iterator[str]:
         yield f'{name}: the law {config.law} keeps no bound: choose blf_dsc, or remove {name}'
     least = min(barrier.bound)
     if least < _FINEST:
-        joint = config.joints[barrier.bound.index(least)]
+        k = barrier.bound.index(least)
+        unit = config.units[k].position
         yield (
-            f'{name}: the joint bound of {joint} would be {least:.2g} rad, finer than any '
-            f'encoder: give at least {_FINEST / max(least, 1e-300):.2g} times this bound'
+            f'{name}: the joint bound of {config.joints[k]} would be {least:.2g} {unit}, finer '
+            f'than any encoder: give at least {_FINEST / max(least, 1e-300):.2g} times this bound'
         )
     kept = certified(config)
     for name, unit, bound, tool in (

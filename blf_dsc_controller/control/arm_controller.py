@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Output, Outputs
-from blf_dsc_controller.errors import BlfDscError, check_type
+from blf_dsc_controller.errors import BlfDscError, LoopEndedError, check_type
 from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -134,6 +134,7 @@ class ArmController:
         self._motors = JointStateEncoder(config.joints, ('position', 'velocity'))
         self._shift: int | None = None  # ns, of the stamps
         self._logged_turns: set[str] = set()
+        self._is_closed = False
         self._loop.guard.starting.activate()
         if text := not_commissioned(config):
             logging.getLogger(__name__).info(text)
@@ -177,7 +178,9 @@ class ArmController:
 
         Raises:
             StateError: an array has another shape, or the stamp is not finite.
+            LoopEndedError: the controller is closed.
         """
+        self._check_open()
         if not math.isfinite(stamp):
             raise StateError(f'stamp: got {stamp}, but a finite time in s is needed')
         n = len(self.joints)
@@ -211,7 +214,9 @@ class ArmController:
             StateError: q has another shape.
             StartError: the law cannot take over there.
             MotionError: no approach from there keeps the limits.
+            LoopEndedError: the controller is closed.
         """
+        self._check_open()
         self._loop.guard.starting.prepare(self._checked('q', q))
 
     def _nanoseconds(self, stamp: float) -> int:
@@ -268,7 +273,9 @@ class ArmController:
         Raises:
             TrajectoryError: with the reasons why it cannot be followed; the reference
                 stays.
+            LoopEndedError: the controller is closed.
         """
+        self._check_open()
         names = tuple(joints) or self.joints
         for point in points:
             if not isinstance(point, TrajectoryPoint):
@@ -333,11 +340,21 @@ class ArmController:
         self._loop.guard.deactivate()
 
     def start(self) -> None:
-        """Take command with the next state, with what was learned."""
+        """Take command with the next state, with what was learned.
+
+        Raises:
+            LoopEndedError: the controller is closed.
+        """
+        self._check_open()
         self._loop.guard.starting.activate()
 
     def reset(self) -> None:
-        """Forget what was learned, and any fault; take command with the next state."""
+        """Forget what was learned, and any fault; take command with the next state.
+
+        Raises:
+            LoopEndedError: the controller is closed.
+        """
+        self._check_open()
         self._loop.guard.starting.reset()
 
     def fail(self, text: str) -> Vector | None:
@@ -437,14 +454,22 @@ class ArmController:
     def close(self) -> Vector | None:
         """Return the torque (n,) [N m] that a drive may hold from now on.
 
-        End the recording; `output_problem` says whether it is whole.
+        End the recording; `output_problem` says whether it is whole.  What was found can still
+        be read, but the arm is commanded no more: that takes another `ArmController`.
         """
+        self._is_closed = True
         torque = self._loop.guard.release()
         self._write_end(torque)
         if self._recorder is not None:
             self._outputs.end(self._recorder, self._recorder.close)
             self._recorder = None
         return None if torque is None else np.array(torque)
+
+    def _check_open(self) -> None:
+        if self._is_closed:
+            raise LoopEndedError(
+                'this ArmController is closed, as at the end of its with block: make another one'
+            )
 
     def add_output(self, output: Output) -> None:
         """Give all messages from now on to an output, too: those that a bag has.

@@ -41,11 +41,7 @@ _UNIT = 0.05  # ms, of time-outs
 
 
 class DamiaoDriver(Driver):
-    """An arm whose motors are Damiao's.
-
-    Attributes:
-        lost: answers that did not arrive in time, of all motors.
-    """
+    """An arm whose motors are Damiao's."""
 
     has_feedback: ClassVar[bool] = True
 
@@ -68,7 +64,6 @@ class DamiaoDriver(Driver):
         super().__init__(address, controller, config)
         n = len(controller.joints)
         self.latency = controller.sample_time
-        self.lost = 0
         self._motors = DamiaoMotors(address, controller.joints, config)
         self._ticks = self.make_ticks()
         self._missed = np.zeros(n, int)  # answers in a row
@@ -141,7 +136,6 @@ class DamiaoDriver(Driver):
         motors.state[0, missing] += self._ticks.period * motors.state[1, missing]
         is_missing = np.isin(np.arange(self._missed.size), missing)
         self._missed = np.where(is_missing, self._missed + 1, 0)
-        self.lost += len(missing)
         if self._missed.max() > _MOST_LOST:
             joint = int(self._missed.argmax())
             self._hold()

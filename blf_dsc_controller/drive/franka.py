@@ -241,6 +241,19 @@ class FrankaDriver(Driver):
             ) from error
         except pylibfranka.ControlException as error:
             raise ReflexError(_reason(error)) from error
+        except pylibfranka.CommandException as error:
+            raise ReflexError(
+                f'{_reason(error)}: the robot has ended the motion; see Desk, which names the cause'
+            ) from error
+        except pylibfranka.InvalidOperationException as error:
+            raise DriverError(
+                f'torque control ended ({_reason(error)}): end what else reads or moves the robot, '
+                'and start again'
+            ) from error
+        except (pylibfranka.RealtimeException, pylibfranka.FrankaException) as error:
+            raise DriverError(
+                f'torque control ended ({_reason(error)}): see Desk, and start again'
+            ) from error
 
 
 def _reason(error: Exception) -> str:

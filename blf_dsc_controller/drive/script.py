@@ -28,6 +28,7 @@ from blf_dsc_controller.messages.script_link import ArmState, encode_sample
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.reference.turns import short_way
+from blf_dsc_controller.run import TURNING
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 _PERIOD = 0.005  # s of the robot's time between two samples
@@ -247,9 +248,11 @@ def _far_beyond(positions: np.ndarray, config: ControllerConfig) -> str:
     if not beyond.size:
         return ''
     k = int(beyond[0])
+    units = config.units[k]
+    remedy = 'degrees, give np.deg2rad of them' if units == TURNING else 'mm, give m'
     return (
-        f'stream: {config.joints[k]} is to be at {positions[k]:.4g} rad, and its limits are '
-        f'{lower[k]:g} to {upper[k]:g}: not followed. If these are degrees, give np.deg2rad of them'
+        f'stream: {config.joints[k]} is to be at {positions[k]:.4g} {units.position}, and its '
+        f'limits are {lower[k]:g} to {upper[k]:g}: not followed. If these are {remedy}'
     )
 
 

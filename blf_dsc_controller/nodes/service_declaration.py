@@ -14,6 +14,7 @@ from math import pi
 from typing import Any
 
 import numpy as np
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.node import Node
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -92,7 +93,7 @@ class ServiceDeclaration(LoadDeclaration):
         """Ask the service to accept a load.
 
         Raises:
-            DeclarationError: its request has other fields.
+            DeclarationError: its request has other fields, or cannot be sent.
         """
         centre = (self.to_frame @ np.append(load.centre, 1.0))[:3]
         request = self.client.srv_type.Request()
@@ -102,13 +103,19 @@ class ServiceDeclaration(LoadDeclaration):
             raise DeclarationError(
                 f'{self._name}: its request has other fields ({error})'
             ) from error
-        self._answer = self.client.call_async(request)
+        try:
+            self._answer = self.client.call_async(request)
+        except RCLError as error:
+            raise DeclarationError(
+                f'{self._name} cannot be called ({error}): see whether its driver still runs'
+            ) from error
 
     def is_in_force(self, load: DriveLoad) -> bool:
         """Whether the service has accepted this load.
 
         Raises:
-            DeclarationError: it has refused the load, or has not answered for long.
+            DeclarationError: it has refused the load, has not answered for long, or does not
+                say whether it has accepted.
         """
         if not self._answer.done():
             if self.states > _PATIENCE:
@@ -117,6 +124,10 @@ class ServiceDeclaration(LoadDeclaration):
                 )
             return False
         answer = self._answer.result()
+        if not hasattr(answer, 'success'):
+            raise DeclarationError(
+                f'{self._name}: its answer does not say whether {load.mass:.2f} kg are accepted'
+            )
         if not answer.success:
             why = getattr(answer, 'error', '') or 'it does not say why'
             raise DeclarationError(f'{self._name} refused {load.mass:.2f} kg: {why}')

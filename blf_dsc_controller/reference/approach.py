@@ -152,12 +152,11 @@ def positions_past_limits(
     limits = np.array((config.limits.position_lower, config.limits.position_upper))
     room = 0.5 * _ROUNDING * (limits[1] - limits[0])
     past = (points < limits[0] - room) | (points > limits[1] + room)
-    kinds = config.robot.kinds(config.joints)
     found = []
     for i in np.flatnonzero(past.any(axis=0)):
         k = int(np.argmax(past[:, i]))
         limit = limits[int(points[k, i] > limits[1, i]), i]
-        unit = 'm' if kinds[i] == 'prismatic' else 'rad'
+        unit = config.units[i].position
         found.append(
             f'point {first + k} has joint {config.joints[i]!r} at {points[k, i]:.6g} {unit}, '
             f'past its limit of {limit:.6g} {unit}'
@@ -265,11 +264,11 @@ def end_of_waypoints(config: ControllerConfig) -> str:
     reference = config.reference
     if reference.type != 'waypoints':
         return ''
-    kinds = config.robot.kinds(config.joints)
+    last = reference.rows(len(config.joints))[-1]
     posture = ', '.join(
-        f'{joint} {value:g} {"m" if kind == "prismatic" else "rad"}'
-        for joint, value, kind in zip(
-            config.joints, reference.rows(len(kinds))[-1], kinds, strict=True
+        f'{joint} {value:g} {unit}'
+        for joint, value, (unit, _) in zip(
+            config.joints, last, config.units, strict=True
         )
     )
     return f'the waypoints end after {reference.times[-1]:g} s at {posture}'
@@ -294,21 +293,25 @@ def check_takeover(
     """
     qr, dqr, ddqr = np.zeros((3, q.size))
     evaluate(reference_vector, t, qr, dqr, ddqr)
-    for joint, error, limit in zip(config.joints, q - qr, bound, strict=True):
+    for joint, (unit, _), error, limit in zip(
+        config.joints, config.units, q - qr, bound, strict=True
+    ):
         if not abs(error) < limit:
             raise StartError(
-                f'joint {joint!r} starts {error:+.6g} rad from the reference, outside its bound of '
-                f'{limit:.6g} rad: start closer to the reference, or widen barrier.bound'
+                f'joint {joint!r} starts {error:+.6g} {unit} from the reference, outside its bound '
+                f'of {limit:.6g} {unit}: start closer to the reference, or widen barrier.bound'
             )
     limits = np.sqrt(
         2.0 * np.array(config.limits.acceleration) * (bound - np.abs(q - qr))
     )
-    for joint, difference, limit in zip(config.joints, dq - dqr, limits, strict=True):
+    for joint, (unit, _), difference, limit in zip(
+        config.joints, config.units, dq - dqr, limits, strict=True
+    ):
         if not abs(difference) < limit:
             raise StartError(
-                f'joint {joint!r} starts {difference:+.6g} rad/s from the velocity of the '
+                f'joint {joint!r} starts {difference:+.6g} {unit}/s from the velocity of the '
                 f'reference, but within its bound and limits.acceleration it can make up only '
-                f'{limit:.6g} rad/s: start with the velocity of the reference, or enable the '
+                f'{limit:.6g} {unit}/s: start with the velocity of the reference, or enable the '
                 'approach (approach.enabled)'
             )
 
@@ -456,13 +459,13 @@ def _braked(
     config: ControllerConfig, q: np.ndarray, dq: np.ndarray, t: float
 ) -> BlendedReference:
     """Plan to hold the arm where it comes to rest from q, dq (n,) at time t [s]."""
-    for joint, speed, limit in zip(
-        config.joints, np.abs(dq), config.limits.velocity, strict=True
+    for joint, (unit, _), speed, limit in zip(
+        config.joints, config.units, np.abs(dq), config.limits.velocity, strict=True
     ):
         if speed > limit + AT_REST:
             raise StartError(
-                f'joint {joint!r} moves at {speed:.4g} rad/s, and its limit is {limit:g} rad/s: '
-                'wait until it is slower, or relax limits.velocity'
+                f'joint {joint!r} moves at {speed:.4g} {unit}/s, and its limit is {limit:g} '
+                f'{unit}/s: wait until it is slower, or relax limits.velocity'
             )
     if np.abs(dq).max() <= AT_REST:  # what it may still have is noise
         _check_limits(config, q)

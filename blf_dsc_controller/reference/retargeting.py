@@ -475,8 +475,9 @@ def _check_positions(
     allowed = np.maximum(past[0], 0.0) + _PAST
     if np.any(past > allowed):
         at, i = np.unravel_index(np.argmax(past - allowed), past.shape)
+        unit = config.units[i].position
         raise MotionError(
-            f'joint {config.joints[i]!r} would be at {q[at, i]:.6g} rad at t = {times[at]:.6g} s, '
-            f'and its limits are {lower[i]:g} to {upper[i]:g} rad: send targets that leave it room '
-            'to stop'
+            f'joint {config.joints[i]!r} would be at {q[at, i]:.6g} {unit} at '
+            f't = {times[at]:.6g} s, and its limits are {lower[i]:g} to {upper[i]:g} {unit}: '
+            'send targets that leave it room to stop'
         )

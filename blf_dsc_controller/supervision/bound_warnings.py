@@ -14,6 +14,7 @@ from blf_dsc_controller.arms.tuning import SAMPLES, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.run import TURNING, JointUnits
 from blf_dsc_controller.supervision.expected_errors import (
     ExpectedErrors,
     guesses_rotors,
@@ -41,7 +42,12 @@ def width_warnings(
         return
     of_joint = widest in barrier.bound
     name = 'barrier.bound' if of_joint else 'barrier.initial_bound'
-    remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
+    units = config.units[barrier.widest.index(widest)]
+    wide = f'{widest:g} {units.position}'
+    remedy = f'is it in mm? Give {1e-3 * widest:.3g}'
+    if units == TURNING:
+        wide += f' is {math.degrees(widest):.3g} degrees and'
+        remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
     if of_tool := _tool_parameter(config):
         name = of_tool
         remedy = 'the bound of a joint follows from this one: give less'
@@ -51,13 +57,12 @@ def width_warnings(
         j = int(needed.argmax())
         if _ROOM * needed[j] > _WIDEST_BOUND:
             remedy = (
-                f'{config.joints[j]} is expected to be up to {needed[j]:.2g} rad from its '
+                f'{config.joints[j]} is expected to be up to {needed[j]:.2g} '
+                f'{config.units[j].position} from its '
                 'reference with these gains. Give less robot.payload, if the arm carries less, or '
                 'stiffer gains, if it bears them; then narrow the bound'
             )
-    yield (
-        f'{name}: {widest:g} rad is {math.degrees(widest):.3g} degrees and bounds nothing: {remedy}'
-    )
+    yield f'{name}: {wide} bounds nothing: {remedy}'
 
 
 def error_warnings(
@@ -91,20 +96,24 @@ def _of_unmodelled(
     worst = int(np.argmax(errors / bound))
     if not errors[worst] > bound[worst]:
         return
+    units = config.units[worst]
+    unit = units.position
     parameter = 'barrier.bound'
-    remedy = f'{_wide_enough(errors[worst])} stiffer gains, if the arm bears them'
+    remedy = (
+        f'{_wide_enough(errors[worst], units)} stiffer gains, if the arm bears them'
+    )
     if of_tool := _tool_parameter(config):
         parameter = of_tool
         wider = float(errors[worst] / bound[worst])
         remedy = (
-            f'past its joint bound of {bound[worst]:g} rad; give more than {wider:.2g} times '
+            f'past its joint bound of {bound[worst]:g} {unit}; give more than {wider:.2g} times '
             'this bound at the tool'
         )
     yield (
         f'{parameter}: friction{_assumed_friction(config)} and unmodelled torque '
         f'(learning.residual_floor){_guessed_rotors(config)} alone are expected to move '
         f'{config.joints[worst]} '
-        f'{errors[worst]:.2g} rad from its reference: {remedy}'
+        f'{errors[worst]:.2g} {unit} from its reference: {remedy}'
     )
 
 
@@ -128,12 +137,12 @@ def _guessed_rotors(config: ControllerConfig) -> str:
     )
 
 
-def _wide_enough(error: float) -> str:
-    """Return what to give against an error [rad], before what else helps."""
+def _wide_enough(error: float, units: JointUnits) -> str:
+    """Return what to give against an error of a joint, before what else helps."""
     wide_enough = _ROOM * error
-    if wide_enough > math.pi:
+    if wide_enough > math.pi and units == TURNING:
         return 'no bound below half a turn is wide enough; give'
-    return f'give {wide_enough:.2g} rad, or'
+    return f'give {wide_enough:.2g} {units.position}, or'
 
 
 def _of_pick_up(
@@ -146,15 +155,16 @@ def _of_pick_up(
         return
     share = bound[worst] / peak
     parameter = 'barrier.bound'
-    wide_enough = _wide_enough(peak)
+    units = config.units[worst]
+    wide_enough = _wide_enough(peak, units)
     if of_tool := _tool_parameter(config):
         parameter = of_tool
         wide_enough = f'give {_ROOM / share:.2g} times this bound at the tool, or'
     payload = config.robot.payload
     yield (
         f'{parameter}: when {payload:g} kg (robot.payload) are picked '
-        f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} rad from its '
-        f'reference, past its bound of {bound[worst]:g} rad: {wide_enough} '
+        f'up in motion, {config.joints[worst]} is expected to be {peak:.2g} {units.position} '
+        f'from its reference, past its bound of {bound[worst]:g} {units.position}: {wide_enough} '
         f'{_remedy_of_pick_up(config, share)}, or pick up at most {share * payload:.2g} kg'
     )
 

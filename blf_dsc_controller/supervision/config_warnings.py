@@ -121,19 +121,34 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
             f'robot.tip: without it, {chain.gripper} is one of the joints of the arm. If it is '
             f'that of a gripper, give the link that carries it: {chain.joints[-2].link}'
         )
-    for joint, limit, inertia in zip(
-        chain.joints, config.torque.limit, load.free_inertia, strict=True
+    yield from _of_unknown_efforts(config)
+    for joint, limit, inertia, units in zip(
+        chain.joints, config.torque.limit, load.free_inertia, config.units, strict=True
     ):
-        if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT:
-            yield (
-                f'torque.limit: {joint.name} has no effort in the URDF: {limit:g} N m is assumed; '
-                'give the rated torque of its drive'
-            )
         if limit / inertia < _SLUGGISH:
             yield (
-                f'robot.urdf: {joint.name} accelerates at only {limit / inertia:.2g} rad/s^2 at '
-                'its torque limit: are masses in kg, inertias in kg m^2, lengths in m?'
+                f'robot.urdf: {joint.name} accelerates at only {limit / inertia:.2g} '
+                f'{units.position}/s^2 at its torque limit: are masses in kg, inertias in kg m^2, '
+                'lengths in m?'
             )
+
+
+def _of_unknown_efforts(config: ControllerConfig) -> Iterator[str]:
+    """Check for joints whose torque limit is assumed, for want of an effort."""
+    joints = config.robot.chain(config.joints).joints
+    assumed = {
+        joint.name: f'{limit:g} {units.torque}'
+        for joint, limit, units in zip(
+            joints, config.torque.limit, config.units, strict=True
+        )
+        if math.isinf(joint.effort) and limit == UNKNOWN_EFFORT
+    }
+    if assumed:
+        limits = ' or '.join(dict.fromkeys(assumed.values()))
+        yield (
+            f'torque.limit: no effort in the URDF for {", ".join(assumed)}: {limits} is assumed; '
+            'give the rated torque of each drive'
+        )
 
 
 def _of_placeholders(config: ControllerConfig) -> Iterator[str]:

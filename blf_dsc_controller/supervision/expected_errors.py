@@ -152,11 +152,14 @@ def expectation(config: ControllerConfig) -> str:
     errors = expected_errors(config, settings_of_config(config))
     if errors.is_endless:
         return 'none can be told, since errors grow from sample to sample: give lower gains'
-    usual, most = (1e3 * float(each.max()) for each in errors)
+    usual, most = (
+        f'{two_digits(1e3 * float(each.max()))} {config.units[int(each.argmax())].of("mrad")}'
+        for each in errors
+    )
     joint = config.joints[int(errors.pick_up.argmax())]
     sensed = config.disturbance.observer_bandwidth > 0.0
     return (
-        f'{two_digits(usual)} mrad by {_causes(config)}; {two_digits(most)} mrad of {joint} when '
+        f'{usual} by {_causes(config)}; {most} of {joint} when '
         f'{config.robot.payload:g} kg are picked up in motion'
         + (', less what joint torque sensors show in time' if sensed else '')
     )

@@ -27,9 +27,10 @@ def gear_warnings(config: ControllerConfig, settings: Settings) -> Iterator[str]
         damping = settings.feedback.gain
         softest = int(np.argmin(damping))
         joint = config.joints[softest]
+        unit = config.units[softest].of('N m s/rad')
         yield (
             'feedback.joint_stiffness: nothing is known of the gears of this arm, so its gains '
-            f'only hold it softly, {joint} with a damping of {damping[softest]:.2g} N m s/rad. '
+            f'only hold it softly, {joint} with a damping of {damping[softest]:.2g} {unit}. '
             'Measure it with `blf_dsc commission`, or give feedback.joint_stiffness and '
             'feedback.joint_damping as the maker of the arm publishes them, or '
             'robot.joint_stiffness'

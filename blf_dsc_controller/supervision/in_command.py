@@ -71,7 +71,7 @@ class InCommand:
         self.config = config
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
-        self.states = StateCheck(config.joints, config.sample_time)
+        self.states = StateCheck(config.joints, config.units, config.sample_time)
         self.calming = Calming(config, self.controller)
         self.estimates = KeptEstimates(self.controller)
         self.samples = SampleCheck(

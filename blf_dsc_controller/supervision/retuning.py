@@ -82,11 +82,14 @@ def _outside_bound(
     """Yield which joints the bound of a configuration leaves outside at t [s]."""
     bounds = barrier.bound_at(settings.barrier, t)
     errors = np.abs(controller.sample.xi1)
-    for joint, error, bound in zip(config.joints, errors, bounds, strict=True):
+    for joint, (unit, _), error, bound in zip(
+        config.joints, config.units, errors, bounds, strict=True
+    ):
         if not error < bound:
             yield (
-                f'barrier.bound: {joint} is {error:.6g} rad from its reference now, outside of a '
-                f'bound of {bound:g} rad: choose a wider one, or try again with a smaller error'
+                f'barrier.bound: {joint} is {error:.6g} {unit} from its reference now, outside of '
+                f'a bound of {bound:g} {unit}: choose a wider one, or try again with a smaller '
+                'error'
             )
 
 
@@ -95,13 +98,13 @@ def _above_torque_limit(
 ) -> Iterator[str]:
     """Yield which joints are held by more than their limit."""
     torques = np.abs(controller.sample.torque)
-    for joint, torque, limit in zip(
-        config.joints, torques, config.torque.limit, strict=True
+    for joint, (_, unit), torque, limit in zip(
+        config.joints, config.units, torques, config.torque.limit, strict=True
     ):
         if torque > limit:
             yield (
-                f'torque.limit: {joint} is held with {torque:.4g} N m now, more than a limit of '
-                f'{limit:g} N m: choose a higher one'
+                f'torque.limit: {joint} is held with {torque:.4g} {unit} now, more than a limit of '
+                f'{limit:g} {unit}: choose a higher one'
             )
 
 

@@ -52,6 +52,7 @@ class SampleCheck:
         controller.checks.sample_time[0] = config.sample_time
         self._has_torques = config.robot.effort in ('whole', 'commanded')
         self._joints = config.joints
+        self._units = config.units
         self._tool = tool_of(config)
         self._controller = controller
         self._cause = StopCause(config.joints, controller, calming)
@@ -207,10 +208,11 @@ class SampleCheck:
             return None
         if (unreached := self._check_reach()) is not None:
             return unreached
+        unit = self._units[worst].position
         share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
         text = (
-            f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} rad from its reference: '
-            f'past {share}its bound of {bound[worst]:.6g} rad'
+            f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} {unit} from its reference: '
+            f'past {share}its bound of {bound[worst]:.6g} {unit}'
         )
         if (at_tool := self.tool_errors) is not None:
             text += f'; {in_words(at_tool)}'
@@ -284,9 +286,10 @@ class SampleCheck:
         self._saturation += _RELIEF * round(dt * 1e9)
         if self.saturated_time <= self._safety.saturation_time:
             return None
+        unit = self._units[worst].torque
         text = (
-            f'joint {self._joints[worst]!r} needs {needed[worst]:.4g} N m and has been at '
-            f'its limit of {limit[worst]:g} N m for {self.saturated_time:.4g} s (less a quarter '
+            f'joint {self._joints[worst]!r} needs {needed[worst]:.4g} {unit} and has been at '
+            f'its limit of {limit[worst]:g} {unit} for {self.saturated_time:.4g} s (less a quarter '
             'of the time below it)'
         )
         return Fault(

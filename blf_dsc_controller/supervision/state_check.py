@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller_groups import Safety
-from blf_dsc_controller.run import NANOSECOND
+from blf_dsc_controller.run import NANOSECOND, JointUnits
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
@@ -56,9 +56,12 @@ class StateCheck:
             stamps, so a slow computer in lock-step misses none.
     """
 
-    def __init__(self, joints: Sequence[str], sample_time: float) -> None:
+    def __init__(
+        self, joints: Sequence[str], units: Sequence[JointUnits], sample_time: float
+    ) -> None:
         """`sample_time` is T [s]."""
         self._joints = tuple(joints)
+        self._units = tuple(units)
         self._sample_time = sample_time
         self.repeated = 0
         self.restart()
@@ -143,9 +146,10 @@ class StateCheck:
     def contradicted(self, derived: Vector, measured: Vector) -> Fault:
         """Return the fault of velocities (n,) [rad/s] that contradict the positions."""
         worst = int(np.argmax(np.abs(derived - measured)))
+        unit = self._units[worst].of('rad/s')
         text = (
-            f'the velocity of joint {self._joints[worst]!r} is {measured[worst]:+.3g} rad/s, but '
-            f'its positions change by {derived[worst]:+.3g} rad/s: a sensor is stuck or has the '
+            f'the velocity of joint {self._joints[worst]!r} is {measured[worst]:+.3g} {unit}, but '
+            f'its positions change by {derived[worst]:+.3g} {unit}: a sensor is stuck or has the '
             'wrong sign, or the velocities are those of other joints; they are differenced from '
             'the positions from now on'
         )
@@ -181,8 +185,9 @@ class StateCheck:
             text = f'velocities are missing or not finite: {dq}'
             return Fault(Reason.NOT_FINITE, f'{text}; {_NO_VELOCITY}')
         worst = int(np.argmax(np.abs(dq)))
+        unit = self._units[worst].of('rad/s')
         text = (
-            f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} rad/s: more '
-            f'than safety.velocity_limit, {safety.velocity_limit:g} rad/s'
+            f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} {unit}: more '
+            f'than safety.velocity_limit, {safety.velocity_limit:g} {unit}'
         )
         return Fault(Reason.VELOCITY, text)
