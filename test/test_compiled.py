@@ -575,13 +575,9 @@ print(*(sum(twice.stats[k].values()) for k in (1, 2)))
 """
 
 
-@compiling
-@pytest.mark.parametrize(
-    'content',
-    [pickle.dumps(numba.__version__) + b'cblf_dsc_controller.errors\nGone\n.', b''],
-    ids=['type of another release', 'cut'],
-)
-def test_index_that_cannot_be_read_is_replaced(tmp_path, content):
+@pytest.fixture
+def found_and_compiled(tmp_path):
+    """Run a kernel, cached in `tmp_path`; return how often it is found and compiled."""
     script = tmp_path / 'shared.py'
     script.write_text(SHARED)
     paths = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
@@ -592,6 +588,16 @@ def test_index_that_cannot_be_read_is_replaced(tmp_path, content):
         assert run.returncode == 0, run.stderr
         return run.stdout.split()
 
+    return found_and_compiled
+
+
+@compiling
+@pytest.mark.parametrize(
+    'content',
+    [pickle.dumps(numba.__version__) + b'cblf_dsc_controller.errors\nGone\n.', b''],
+    ids=['type of another release', 'cut'],
+)
+def test_index_that_cannot_be_read_is_replaced(tmp_path, found_and_compiled, content):
     assert found_and_compiled() == ['0', '1']
     (index,) = tmp_path.glob('cache/*/*twice*.nbi')
     index.write_bytes(content)
@@ -600,17 +606,9 @@ def test_index_that_cannot_be_read_is_replaced(tmp_path, content):
 
 
 @compiling
-def test_machine_code_that_others_could_write_is_not_read_but_replaced(tmp_path):
-    script = tmp_path / 'shared.py'
-    script.write_text(SHARED)
-    paths = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
-    environment = os.environ | paths | {'PYTHONPATH': str(PACKAGE.parent)}
-
-    def found_and_compiled():
-        run = finished(sys.executable, script, env=environment)
-        assert run.returncode == 0, run.stderr
-        return run.stdout.split()
-
+def test_machine_code_that_others_could_write_is_not_read_but_replaced(
+    tmp_path, found_and_compiled
+):
     assert found_and_compiled() == ['0', '1']
     (index,) = tmp_path.glob('cache/*/*twice*.nbi')
     assert index.parent.stat().st_mode & 0o777 == 0o700
