@@ -404,14 +404,18 @@ def test_page_that_is_opened_late_draws_what_it_receives_and_says_from_when(ros)
     view.close()
 
 
+def first_warning(statuses):
+    return [each.level for each in statuses].index(DiagnosticStatus.WARN)
+
+
 def test_contact_is_on_the_page_and_in_diagnostics(ros):
     """4 N at 8 s, once the arm has been learned."""
     view = ros.add(ViewNode, port=18280)
     said = ros.listen(topics.DIAGNOSTICS)
 
-    def contact_status():
+    def contact_statuses():
         found = [each for message in said for each in message.status]
-        return [each for each in found if each.name.endswith('/contact')][-1]
+        return [each for each in found if each.name.endswith('/contact')]
 
     push = {'events.begin': [8.0], 'events.duration': [60.0], 'events.payload': [0.0]}
     force = {'events.force': [4.0, 0.0, 0.0]}
@@ -421,19 +425,21 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     ros.until(lambda: view.config)
     assert configure(ros, arm)
     assert activate(ros, arm)
-    ros.until(lambda: view.past and view.past[-1].time > 7.5)
-    assert view.past[-1].felt_at is None
-    assert np.isfinite(view.past[-1].external).all()
-    assert len(events_with(view, 'latched')) == 1
-    assert not events_with(view, 'restarts')
-    assert contact_status().message == 'nothing touches the arm'
-    assert values(contact_status())['contacts'] == '0'
-    ros.until(lambda: view.past[-1].touched)
+    ros.until(lambda: view.past and view.past[-1].touched)
     now = view.past[-1]
     assert now.felt_at == 0
     assert abs(now.external[0]) > now.interval[0]
-    ros.until(lambda: contact_status().level == DiagnosticStatus.WARN)
-    status = contact_status()
+    # the loop does not wait for the page: what it showed before the push
+    *_, before = (each for each in view.past if 7.0 < each.time < 8.0)
+    assert before.felt_at is None
+    assert np.isfinite(before.external).all()
+    (latched,) = events_with(view, 'latched')
+    assert latched[0] < 8.0
+    assert all(event[0] > 8.0 for event in events_with(view, 'restarts'))
+    ros.until(lambda: contact_statuses()[-1].level == DiagnosticStatus.WARN)
+    *_, quiet, status = contact_statuses()[: 1 + first_warning(contact_statuses())]
+    assert quiet.message == 'nothing touches the arm'
+    assert values(quiet)['contacts'] == '0'
     assert 'something touches the arm' in status.message
     details = values(status)
     assert details['contacts'] == '1'
