@@ -471,7 +471,7 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
 def test_page_replays_a_run_until_the_user_goes_on(tmp_path):
     """With a terminal; the results follow."""
     out = tmp_path / 'run'
-    words = ('--view', '--mode', 'lockstep', '--duration', '3', '--out', str(out))
+    words = ('--view', '--mode', 'lockstep', '--duration', '30', '--out', str(out))
     ours, theirs = pty.openpty()
     command, env = (*COMMAND, *words), os.environ | NO_PICTURES
     with subprocess.Popen(command, stdout=PIPE, stderr=theirs, env=env) as process:
@@ -479,8 +479,10 @@ def test_page_replays_a_run_until_the_user_goes_on(tmp_path):
         said = b''
         expected = rb'(?s)(?=.*the run has ended).*open (http://127.0.0.1:\d+)\s'
         while not (found := re.match(expected, said)):
-            assert process.poll() is None, said
-            said += os.read(ours, 1000)
+            try:
+                said += os.read(ours, 1000)
+            except OSError:  # it has ended, and closed its terminal
+                pytest.fail(said.decode())
         address = found[1].decode()
         with urlopen(address) as served:  # noqa: S310 - an address of our own
             assert b'<html' in served.read()
