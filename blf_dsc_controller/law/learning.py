@@ -263,7 +263,8 @@ def detect_change(
 ) -> None:
     """Forget the window if the arm has changed: its rows contradict each other, or the solution.
 
-    If the window was latched before it was full, the estimate returns to the one before.
+    If the window was latched before it was full, the estimate returns to the one before;
+    of friction, only what reversals have shown of late is taken back.
     """
     of, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.window)
