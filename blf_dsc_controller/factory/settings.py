@@ -134,6 +134,7 @@ def _parts_of_learning(
         'excitation': _excitation(config),
         'adaptation': _adaptation(config, p, learned, covariance),
         'absorbed': absorbed_friction.Settings(
+            size=p + len(config.joints) * (int(_columns(config, p).bias) + int(_columns(config, p).viscous)),
             filter_pole=row.filter_pole,
             length=sliding.length,
             period=sliding.row_interval * config.sample_time,

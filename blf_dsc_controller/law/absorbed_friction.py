@@ -35,6 +35,7 @@ _NOTHING = 0.1  # of that: rows of zeros before the first
 class Settings(NamedTuple):
     """The rows that it uses, and the least weight of its prior."""
 
+    size: int  # entries of theta that are found: P, and d but for Coulomb friction and ripple
     filter_pole: float  # of both poles of a row, rad/s
     length: int  # rows in a window
     period: float  # T, s
@@ -47,18 +48,18 @@ class State(NamedTuple):
     sensed1: Annotated[Array, 'n * observer.enabled']  # tau_J behind one pole, N m
     sensed2: Annotated[Array, 'n * observer.enabled']  # and behind both, N m
     rows: Cell  # of motion so far
-    Phi: Annotated[Array, 'p * observer.enabled', 'p']  # of X^T X, upper triangle
-    b: Annotated[Array, 'p * observer.enabled']  # of X^T g
+    Phi: Annotated[Array, 'absorbed.size * observer.enabled', 'absorbed.size']  # of X^T X, upper triangle
+    b: Annotated[Array, 'absorbed.size * observer.enabled']  # of X^T g
     square: Cell  # of |g|^2, (N m)^2
     residual: Cell  # s^2, of |g - X P_f|^2, (N m)^2
-    solution: Annotated[Array, 'p * observer.enabled']
+    solution: Annotated[Array, 'absorbed.size * observer.enabled']
     absorbed: Annotated[Array, 'p * observer.enabled']  # P_f, which follows it
 
 
 class Work(NamedTuple):
     """Scratch of one sample."""
 
-    factor: Annotated[Array, 'p * observer.enabled', 'p']
+    factor: Annotated[Array, 'absorbed.size * observer.enabled', 'absorbed.size']
     before: Annotated[Array, 'p * observer.enabled']  # P_f of the last sample
 
 
@@ -91,7 +92,13 @@ def fade(settings: Settings, state: State, moving: float) -> float:
 
 @inner
 def unexplained(
-    state: State, row: Array, weight: float, i: int, rotors: Array, estimate: Array
+    state: State,
+    row: Array,
+    weight: float,
+    i: int,
+    rotors: Array,
+    initial: Array,
+    estimate: Array,
 ) -> float:
     """Return g of joint i [N m] by its `weight`, for a `row` [X | D | u] (n, m + 1)."""
     m = estimate.size
@@ -99,7 +106,7 @@ def unexplained(
     for j in range(rotors.size):
         g -= row[i, j] * rotors[j]
     for j in range(rotors.size, m):
-        g -= row[i, j] * estimate[j]
+        g -= row[i, j] * (initial[j] if j < state.b.size else estimate[j])
     return float(g)
 
 
@@ -152,3 +159,13 @@ def follow(state: State, work: Work, weight: float, gain: Array, dt: float) -> N
         work.before[j] = state.absorbed[j]
         missing = state.solution[j] - state.absorbed[j]
         state.absorbed[j] += dt * weight * gain[j] * missing
+
+
+@inner
+def follow_columns(
+    state: State, initial: Array, active: Array, estimate: Array, rate: Array
+) -> None:
+    """Write d - d^ of the columns that are found by sensors to `rate` (m,), if `active` (m,)."""
+    for j in range(state.absorbed.size, state.solution.size):
+        if active[j] == 1.0:
+            rate[j] = initial[j] + state.solution[j] - estimate[j]

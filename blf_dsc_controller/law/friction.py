@@ -279,13 +279,14 @@ def measure_reversals(
         e_h = high_pass(state.torque_lags, i, gain, e, begins)
         is_new = reversals.add_row(
             settings.reversals,
-            state.reversals.shown,
+            state.reversals,
             i,
             s_h,
             b_h,
             e_h,
             weight,
             state.breakaway[i],
+            dt,
         )
         if is_new:
             state.drift_extremes[0, i] = 0.0
@@ -310,7 +311,7 @@ def return_estimate(
     for i in range(of.initial.size):
         j = settings.first_coulomb + i
         if active[j] == 1.0 and settings.gain[i] > 0.0:
-            coulomb, state.breakaway[i] = reversals.learned(of, shown, i)
+            coulomb, state.breakaway[i] = reversals.learned(of, shown, i, state.breakaway[i])
             estimate[j] = clip(coulomb, of.least[i], of.most[i])
 
 
@@ -335,7 +336,7 @@ def follow_reversals(
         work.breakaway_error[i] = 0.0
         if active[j] == 0.0:
             continue
-        coulomb, stribeck = reversals.learned(of, shown, i)
+        coulomb, stribeck = reversals.learned(of, shown, i, state.breakaway[i])
         rate[j] = coulomb - estimate[j]
         work.breakaway_error[i] = stribeck - state.breakaway[i]
 

@@ -85,7 +85,13 @@ def add_absorbed(settings: Settings, state: State, signals: Signals) -> None:
     for i in range(settings.n):
         weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
         g = absorbed_friction.unexplained(
-            now, row, weight, i, settings.observer.rotors, state.estimate
+            now,
+            row,
+            weight,
+            i,
+            settings.observer.rotors,
+            settings.initial_estimate,
+            state.estimate,
         )
         absorbed_friction.add_row(now, row, i, g, share)
 
@@ -307,7 +313,9 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
     before = signals.adaptation.tracked  # scratch here
     for j in range(settings.m):
         before[j] = state.estimate[j]
-        if not friction.is_coulomb(settings.friction, j):
+        if not friction.is_coulomb(settings.friction, j) and not (
+            settings.observer.enabled == 1 and settings.p <= j < settings.absorbed.size
+        ):
             state.estimate[j] = state.latch.anchor[j]
     if settings.disturbance.bumpless == 1:
         transfer_learned(settings, state, signals, before)
@@ -328,6 +336,14 @@ def transfer_learned(
             before,
             state.absorbed.absorbed,
             state.absorbed.absorbed,
+        )
+        load_observer.hand_over(
+            settings.observer,
+            state.observer,
+            state.disturbance,
+            signals.H,
+            state.estimate,
+            before,
         )
 
 
@@ -379,6 +395,14 @@ def adapt(
             estimate,
             work.rate,
         )
+        if settings.observer.enabled == 1 and state.observer.faded[0] == 0.0:
+            absorbed_friction.follow_columns(
+                state.absorbed,
+                settings.initial_estimate,
+                latch.active,
+                estimate,
+                work.rate,
+            )
     unexcited = (
         settings.excitation.change_detection == 1
         and window.is_full(settings.window, state.window)

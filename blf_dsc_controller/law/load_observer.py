@@ -73,6 +73,8 @@ class State(NamedTuple):
     keeps_bias: Annotated[Array, 'n * observer.enabled']
     faded: Cell  # share of r that is left out, as the sensors are in doubt
     elapsed: Cell  # s, since the first interval
+    # what r lacks of a changed estimate, since it is late; it fades, N m
+    handover: Annotated[Array, 'n * observer.enabled']
 
 
 class Work(NamedTuple):
@@ -162,8 +164,11 @@ def update(
     if before < settling <= state.elapsed[0]:
         find_bias(settings, state, work, estimate, absorbed, information)
     release_bias(settings, state, dt)
+    passed = filter_gain(1.0 / settings.observer_bandwidth, dt)
     for i in range(state.torque.size):
-        state.torque[i] = load_torque(settings, state, i, estimate, absorbed)
+        state.handover[i] -= passed * state.handover[i]
+        r = load_torque(settings, state, i, estimate, absorbed)
+        state.torque[i] = r + state.handover[i]
 
 
 @inner
@@ -229,3 +234,29 @@ def transfer_learned(
     for i in range(state.torque.size):
         disturbance[i] += load_torque(settings, state, i, before, absorbed_before)
         disturbance[i] -= load_torque(settings, state, i, theta, absorbed)
+
+
+@inner
+def hand_over(
+    settings: Settings,
+    state: State,
+    disturbance: Array,
+    H: Array,
+    theta: Array,
+    before: Array,
+) -> None:
+    """Take from d^3, the `disturbance` (n,) [N m], what it has given up only since r is late.
+
+    By a change of theta (m,) since `before`, d^3 has given up (H - X_L) (theta - before), H (n, m)
+    being at the reference and now.  It is not the arm's and fades as r catches up.
+    """
+    if not has_settled(settings, state):
+        return
+    p = state.filtered.shape[1] - 1
+    for i in range(state.torque.size):
+        late = 0.0
+        for j in range(p):
+            late += (H[i, j] - state.filtered[i, j]) * (theta[j] - before[j])
+        late *= 1.0 - state.faded[0]
+        disturbance[i] += late
+        state.handover[i] -= late

@@ -13,10 +13,19 @@ with s the direction of the motion and b what breakaway has in excess.  The sums
 contain `_ENERGY`, some eight reversals.  If the last two reversals both contradict them by
 more than the unmodelled torque f, they overrule what is older.
 
+What pushes the arm as a joint reverses, or a load that comes on, leaves steps of its own in e_h,
+earlier or later than that of friction.  So a reversal counts by
+
+    1 / (1 + (d / a)^2),    d^2 p int (g s)_h^2 dt = p int (e_h - c_1 (g s)_h)^2 dt
+
+where d is the friction whose step would be as large as what the friction c_1 of this reversal
+leaves of the torque around it, and a what the shape g s is wrong by: a part of f, and of c.
+
 If the arm has changed, what reversals have shown since some 0.2 s before that was found
 is taken back: a load that comes on in a reversal looks like the step of friction.
 """
 
+from math import exp
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
@@ -24,11 +33,14 @@ from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
 
 _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
-_SHOWN = 0.06  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
+_SHOWN = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
 _PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _LATE = 0.15  # s, by which a change of the arm is found
+_NEAR = 0.1  # s around a reversal in which its torque is compared with friction's
+_TOUCHED = 0.004  # of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
+_ALLOWED_F, _ALLOWED_C = 0.5, 0.8  # a over f, and over c
 
 # Rows of the sums over products of s_h, b_h and e_h
 _SE, _BE, _SS, _SB, _BB = range(5)
@@ -50,6 +62,7 @@ class Shown(NamedTuple):
     # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
     past: Annotated[Array, 5, 'n']
     present: Annotated[Array, 5, 'n']  # likewise, over the present one
+    torque: Annotated[Array, 'n']  # p int e_h^2 dt around the present one, (N m)^2
     # Coulomb friction by the last reversal and the one before, N m
     coulomb: Annotated[Array, 2, 'n']
 
@@ -61,6 +74,8 @@ class State(NamedTuple):
     earlier: Shown  # some `_LATE` ago or less
     earliest: Shown  # one to two times as long ago
     since_kept: Cell  # s
+    # p int of s_h^2 and e_h^2 dt [(N m)^2], faded by `_NEAR`
+    recent: Annotated[Array, 2, 'n']
 
 
 @inner
@@ -82,26 +97,40 @@ def beyond(x: float, band: float) -> float:
 @inner
 def add_row(
     settings: Settings,
-    shown: Shown,
+    state: State,
     i: int,
     s: float,
     b: float,
     e: float,
     weight: float,
     k: float,
+    dt: float,
 ) -> bool:
     """Add s_h, b_h and e_h of a row of joint i to its present reversal, by their weight p dt.
 
-    Return whether that shows its friction since this row.  k is k^.
+    Return whether that shows its friction since this row, `dt` [s] after the last.  k is k^.
     """
-    now = shown.present
-    before = energy(shown, i, k)
+    shown, now = state.shown, state.shown.present
+    before = shown_energy(settings, shown, i, k)
     now[_SE, i] += weight * s * e
     now[_BE, i] += weight * b * e
     now[_SS, i] += weight * s * s
     now[_SB, i] += weight * s * b
     now[_BB, i] += weight * b * b
+    add_torque(state, i, weight * s * s, weight * e * e, dt)
     return find_last(settings, shown, i, k, before)
+
+
+@inner
+def add_torque(state: State, i: int, ss: float, ee: float, dt: float) -> None:
+    """Add p e_h^2 dt of joint i to that of its reversal, from `_NEAR` before to as long after it."""
+    recent = state.recent
+    reversed_before = recent[0, i] > _TOUCHED
+    kept = exp(-dt / _NEAR)
+    recent[0, i] = kept * recent[0, i] + ss
+    recent[1, i] = kept * recent[1, i] + ee
+    if recent[0, i] > _TOUCHED:
+        state.shown.torque[i] += ee if reversed_before else recent[1, i]
 
 
 @inner
@@ -112,7 +141,7 @@ def find_last(
 
     `before` is the energy of the reversal a row ago.
     """
-    if energy(shown, i, k) <= _SHOWN:
+    if shown_energy(settings, shown, i, k) <= _SHOWN:
         return False
     is_first = before <= _SHOWN
     if is_first:
@@ -132,25 +161,52 @@ def energy(shown: Shown, i: int, k: float) -> float:
 
 
 @inner
+def trust(settings: Settings, shown: Shown, i: int, k: float) -> float:
+    """Return how much the present reversal of joint i counts: 1 where e_h is that of friction."""
+    of_friction = energy(shown, i, k)
+    if of_friction <= 0.0:
+        return 0.0
+    torque = shown.present[_SE, i] + k * shown.present[_BE, i]
+    misfit = max(0.0, shown.torque[i] - torque * torque / of_friction)
+    f = settings.unmodelled[i]
+    pull = _PRIOR * f * f / settings.variance[i]
+    c = shown.past[_SE, i] + pull * settings.initial[i]
+    c /= shown.past[_SS, i] + pull
+    allowed = (_ALLOWED_F * f) ** 2 + (_ALLOWED_C * c) ** 2
+    return float(allowed * of_friction / (allowed * of_friction + misfit))
+
+
+@inner
+def shown_energy(settings: Settings, shown: Shown, i: int, k: float) -> float:
+    """Return p int (g s)_h^2 dt of the present reversal of joint i, as far as it counts."""
+    return trust(settings, shown, i, k) * energy(shown, i, k)
+
+
+@inner
 def close(settings: Settings, shown: Shown, i: int, k: float) -> None:
-    """Add the sums of the present reversal of joint i to those of all; begin new ones."""
+    """Add the sums of the present reversal of joint i to those of all, if it shows its friction.
+
+    Otherwise they are the beginning of the next.
+    """
     latest, sums = shown.present, shown.past
-    is_shown = energy(shown, i, k) > _SHOWN
-    excess = sums[_SS, i] + latest[_SS, i] - _ENERGY
+    if shown_energy(settings, shown, i, k) <= _SHOWN:
+        return
+    share = trust(settings, shown, i, k)
+    excess = sums[_SS, i] + share * latest[_SS, i] - _ENERGY
     keep = 1.0
     if excess > 0.0:
         keep = max(0.0, 1.0 - excess / sums[_SS, i])
     for row in range(5):
-        sums[row, i] = keep * sums[row, i] + latest[row, i]
+        sums[row, i] = keep * sums[row, i] + share * latest[row, i]
         latest[row, i] = 0.0
-    if is_shown:
-        overrule(settings, shown, i)
+    shown.torque[i] = 0.0
+    overrule(settings, shown, i)
 
 
 @inner
 def overrule(settings: Settings, shown: Shown, i: int) -> None:
     """Give the sums of joint i the friction of the last two reversals if both contradict them."""
-    coulomb, stribeck = learned(settings, shown, i)
+    coulomb, stribeck = learned(settings, shown, i, 0.0)
     found = shown.coulomb
     band = settings.unmodelled[i]
     last = beyond(found[0, i] - coulomb, band)
@@ -165,17 +221,22 @@ def overrule(settings: Settings, shown: Shown, i: int) -> None:
 
 
 @inner
-def learned(settings: Settings, shown: Shown, i: int) -> tuple[float, float]:
-    """Return c [N m] and k of joint i by all sums, k within its limits."""
+def learned(
+    settings: Settings, shown: Shown, i: int, k_now: float
+) -> tuple[float, float]:
+    """Return c [N m] and k of joint i by all sums, k within its limits; `k_now` is k^."""
     f = settings.unmodelled[i]
     pull = _PRIOR * f * f / settings.variance[i]
     sums = shown.past
     latest = shown.present
-    se = sums[_SE, i] + latest[_SE, i] + pull * settings.initial[i]
-    be = sums[_BE, i] + latest[_BE, i]
-    ss = sums[_SS, i] + latest[_SS, i] + pull
-    sb = sums[_SB, i] + latest[_SB, i]
-    bb = sums[_BB, i] + latest[_BB, i] + _STRIBECK_PRIOR * pull
+    share = 0.0
+    if shown_energy(settings, shown, i, k_now) > _SHOWN:
+        share = trust(settings, shown, i, k_now)
+    se = sums[_SE, i] + share * latest[_SE, i] + pull * settings.initial[i]
+    be = sums[_BE, i] + share * latest[_BE, i]
+    ss = sums[_SS, i] + share * latest[_SS, i] + pull
+    sb = sums[_SB, i] + share * latest[_SB, i]
+    bb = sums[_BB, i] + share * latest[_BB, i] + _STRIBECK_PRIOR * pull
     determinant = ss * bb - sb * sb
     k = 0.0
     if determinant > 0.0:
@@ -213,6 +274,7 @@ def take_back(state: State, breakaway: Array) -> None:
         if energy(shown, i, breakaway[i]) <= _SHOWN:
             for row in range(5):
                 shown.present[row, i] = 0.0
+            shown.torque[i] = 0.0
     copy(shown, state.earliest)
     copy(shown, state.earlier)
 
@@ -226,3 +288,4 @@ def copy(source: Shown, out: Shown) -> None:
             out.present[row, i] = source.present[row, i]
         for row in range(2):
             out.coulomb[row, i] = source.coulomb[row, i]
+        out.torque[i] = source.torque[i]
