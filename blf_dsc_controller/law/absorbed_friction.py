@@ -169,3 +169,18 @@ def follow_columns(
     for j in range(state.absorbed.size, state.solution.size):
         if active[j] == 1.0:
             rate[j] = initial[j] + state.solution[j] - estimate[j]
+
+
+@inner
+def unexplained_friction(
+    state: State, row: Array, i: int, rotors: Array, estimate: Array, own: int
+) -> float:
+    """Return what P_f and theta^, but for its entry `own`, leave of the motor's friction [N m]."""
+    m = estimate.size
+    e = row[m] - state.sensed2[i]
+    for j in range(rotors.size):
+        e -= row[j] * (rotors[j] + state.absorbed[j])
+    for j in range(rotors.size, m):
+        if j != own:
+            e -= row[j] * estimate[j]
+    return float(e)

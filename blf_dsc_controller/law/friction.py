@@ -88,6 +88,7 @@ class Work(NamedTuple):
     stribeck: Annotated[Array, 'n']  # exp(-(v / v_s)^2)
     torque: Annotated[Array, 'n']  # C(v) s(v), N m
     breakaway_error: Annotated[Array, 'n']  # k - k^
+    unexplained: Annotated[Array, 'n']  # e, N m
 
 
 @inner
@@ -258,8 +259,7 @@ def unexplained(row: Array, estimate: Array, own: int) -> float:
 def measure_reversals(
     settings: Settings,
     state: State,
-    rows: Array,
-    estimate: Array,
+    unexplained: Array,
     begins: bool,
     dt: float,
 ) -> None:
@@ -272,8 +272,8 @@ def measure_reversals(
     weight = settings.pole * dt
     lags = state.column_lags
     reversals.keep(state.reversals, dt)
-    for i in range(rows.shape[0]):
-        e = unexplained(rows[i], estimate, settings.first_coulomb + i)
+    for i in range(unexplained.size):
+        e = unexplained[i]
         s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
         b_h = high_pass(lags[1], i, gain, state.shape_lags[1, 2, i], begins)
         e_h = high_pass(state.torque_lags, i, gain, e, begins)

@@ -67,7 +67,7 @@ def observe(
         if settings.observer.enabled == 1:
             add_absorbed(settings, state, signals)
         window.push_row(state.window, signals.row.Xu)
-        measure_reversals(settings, state, settings.window.row_interval * dt)
+        measure_reversals(settings, state, signals, settings.window.row_interval * dt)
     if settings.excitation.change_detection == 1:
         detect_change(settings, state, signals, dt)
     if samples % settings.window.interval == 0:
@@ -235,7 +235,9 @@ def check_sensors(
 
 
 @inner
-def measure_reversals(settings: Settings, state: State, period: float) -> None:
+def measure_reversals(
+    settings: Settings, state: State, signals: Signals, period: float
+) -> None:
     """Let `friction` measure reversals, with a row each `period` [s].
 
     It begins T_a after the latch, when the other columns are those of the window, and
@@ -253,11 +255,21 @@ def measure_reversals(settings: Settings, state: State, period: float) -> None:
         or latch.least_residual[0] > 0.0
         or state.window.rows[0] >= 0.5 * length
     )
+    for i in range(settings.n):
+        own = settings.friction.first_coulomb + i
+        row = state.row.filter2[i]
+        if settings.observer.enabled == 1 and state.observer.faded[0] == 0.0:
+            signals.friction.unexplained[i] = absorbed_friction.unexplained_friction(
+                state.absorbed, row, i, settings.observer.rotors, state.estimate, own
+            )
+        else:
+            signals.friction.unexplained[i] = friction.unexplained(
+                row, state.estimate, own
+            )
     friction.measure_reversals(
         settings.friction,
         state.friction,
-        state.row.filter2,
-        state.estimate,
+        signals.friction.unexplained,
         since_latch <= settling_time or not is_known,
         period,
     )
