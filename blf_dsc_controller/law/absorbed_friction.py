@@ -73,6 +73,14 @@ def pass_poles(settings: Settings, state: State, sensed: Array, dt: float) -> No
 
 
 @inner
+def forget(state: State) -> None:
+    """Empty both poles of tau_J, as those of the rows are."""
+    for i in range(state.sensed1.size):
+        state.sensed1[i] = 0.0
+        state.sensed2[i] = 0.0
+
+
+@inner
 def fade(settings: Settings, state: State, moving: float) -> float:
     """Let the means fade by one row, whose joints have the mean square weight `moving`.
 

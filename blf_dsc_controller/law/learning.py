@@ -270,7 +270,7 @@ def measure_reversals(
         settings.friction,
         state.friction,
         signals.friction.unexplained,
-        since_latch <= settling_time or not is_known,
+        state.window.rows[0] * period * settings.friction.pole < prediction.SETTLED if (settings.observer.enabled == 1 and state.observer.faded[0] == 0.0) else (since_latch <= settling_time or not is_known),
         period,
     )
 
@@ -314,6 +314,7 @@ def detect_change(
             take_back(settings, state, signals)
     change.count_change(state.change, latch, sliding, prior, state.estimate, dt)
     prediction.forget(state.row)
+    absorbed_friction.forget(state.absorbed)
 
 
 @inner
