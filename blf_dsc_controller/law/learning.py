@@ -232,6 +232,7 @@ def check_sensors(
         now, work, limit, signals.dq, signals.dqr, dt
     )
     torque_sensors.fade(now, of.faded, is_off, dt)
+    torque_sensors.calm(now, of.calmed, dt)
 
 
 @inner

@@ -43,6 +43,7 @@ _SETTLING = 4.0  # 1/L, until r is that of the arm
 _RELEASED = 10.0  # 1/L, in which a plausible bias fades
 _SIGMAS = 3.0  # of what the prior explains
 _MOST = 0.5  # of the torque limit
+_SLOW = 0.1  # s, lag of what is slow in r
 
 
 def most_load(limit: Array) -> Array:
@@ -72,6 +73,9 @@ class State(NamedTuple):
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
     faded: Cell  # share of r that is left out, as the sensors are in doubt
+    # share of what changes fast in r that is left out, since it shakes
+    calmed: Annotated[Array, 'n * observer.enabled']
+    slow: Annotated[Array, 'n * observer.enabled']  # r behind a slow lag, N m
     elapsed: Cell  # s, since the first interval
     # what r lacks of a changed estimate, since it is late; it fades, N m
     handover: Annotated[Array, 'n * observer.enabled']
@@ -165,10 +169,13 @@ def update(
         find_bias(settings, state, work, estimate, absorbed, information)
     release_bias(settings, state, dt)
     passed = filter_gain(1.0 / settings.observer_bandwidth, dt)
+    slowly = filter_gain(_SLOW, dt)
     for i in range(state.torque.size):
         state.handover[i] -= passed * state.handover[i]
         r = load_torque(settings, state, i, estimate, absorbed)
-        state.torque[i] = r + state.handover[i]
+        state.slow[i] += slowly * (r - state.slow[i])
+        fast = r - state.slow[i]
+        state.torque[i] = r - state.calmed[i] * fast + state.handover[i]
 
 
 @inner
@@ -232,8 +239,10 @@ def transfer_learned(
     That is by a change of theta (m,), and of what it has `absorbed` (p,).
     """
     for i in range(state.torque.size):
-        disturbance[i] += load_torque(settings, state, i, before, absorbed_before)
-        disturbance[i] -= load_torque(settings, state, i, theta, absorbed)
+        given_up = load_torque(settings, state, i, before, absorbed_before)
+        given_up -= load_torque(settings, state, i, theta, absorbed)
+        disturbance[i] += given_up
+        state.slow[i] -= given_up
 
 
 @inner

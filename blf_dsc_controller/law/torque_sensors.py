@@ -39,8 +39,8 @@ from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.lag import filter_gain
 
-NONE, SHAKES, COMMANDS, OFF = range(4)
-"""What is wrong with the efforts, if anything."""
+NONE, SHAKES, STILL_SHAKES, COMMANDS, OFF = range(5)
+"""What is wrong with the efforts, if anything: the larger, the worse."""
 
 _FADE = 0.02  # s, time constant with which r is left out or comes back
 _SHAKEN = 0.005  # s, likewise of one that shakes: it may grow threefold in 10 ms
@@ -72,6 +72,7 @@ class State(NamedTuple):
     square: Annotated[Array, '2 * observer.enabled', 'n']
     lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
     shaking: oscillation.State  # of r
+    shaken: Annotated[Array, 'n * observer.enabled']  # 1: r of this joint has shaken
 
 
 class Work(NamedTuple):
@@ -102,8 +103,8 @@ def follow_applied(
 
 @inner
 def note_fault(state: State, fault: float, i: int) -> None:
-    """Keep the first `fault` that is found, which joint i shows."""
-    if state.fault[0] == NONE:
+    """Keep the `fault` that joint i shows, unless r is left out already."""
+    if state.fault[0] <= SHAKES:
         state.fault[0] = fault
         state.joint[0] = i
 
@@ -121,7 +122,17 @@ def watch_shaking(
     )
     for i in range(torque.size):
         if oscillation.oscillates(state.shaking, i):
-            note_fault(state, SHAKES, i)
+            note_fault(state, STILL_SHAKES if state.shaken[i] == 1.0 else SHAKES, i)
+            note_shaken(state)
+            oscillation.forget_all(state.shaking)
+
+
+@inner
+def note_shaken(state: State) -> None:
+    """Note all joints whose r shakes."""
+    for i in range(state.shaken.size):
+        if state.shaking.waves[i] >= oscillation.SOME:
+            state.shaken[i] = 1.0
 
 
 @inner
@@ -165,7 +176,7 @@ def decide(state: State) -> None:
             nearest = i
     if product < equal:
         note_fault(state, COMMANDS, nearest)
-    if product > distinct or state.fault[0] != NONE:
+    if product > distinct or state.fault[0] > SHAKES:
         state.is_distinct[0] = 1.0
 
 
@@ -203,13 +214,21 @@ def follow_commands(
 @inner
 def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
     """Leave more of r out where the efforts are in doubt, or less; zero stays zero."""
-    is_doubted = is_off or state.fault[0] != NONE
+    is_doubted = is_off or state.fault[0] > SHAKES
     aim = 1.0 if is_doubted else 0.0
-    time_constant = _SHAKEN if state.fault[0] == SHAKES else _FADE
+    time_constant = _SHAKEN if state.fault[0] == STILL_SHAKES else _FADE
     if faded[0] != aim:
         faded[0] += filter_gain(time_constant, dt) * (aim - faded[0])
         if abs(faded[0] - aim) < _NOTHING:
             faded[0] = aim
+
+
+@inner
+def calm(state: State, calmed: Array, dt: float) -> None:
+    """Leave what changes fast in r out, for good, where it has shaken."""
+    share = filter_gain(_SHAKEN, dt)
+    for i in range(calmed.size):
+        calmed[i] += share * (state.shaken[i] - calmed[i])
 
 
 @inner

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
+from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES, STILL_SHAKES
 
 _ALONE = 'the load observer is off, and the law goes on without it'
 _DRIVER = (
@@ -15,6 +15,11 @@ _DRIVER = (
 )
 _TEXTS = {
     SHAKES: (
+        'joint {joint!r} shakes by the load observer, which follows loads slowly from now on: '
+        'the gear is softer than robot.stiffness, or its efforts are not those of joint '
+        'torque sensors. Commission the arm; or set disturbance.observer_bandwidth to 0'
+    ),
+    STILL_SHAKES: (
         'joint {joint!r} shakes by the load observer: efforts are not those of joint torque '
         f'sensors, or positions are those of the motors; {_ALONE}. If so, set robot.effort to '
         'unknown and robot.torque_loop to false; else disturbance.observer_bandwidth to 0'
