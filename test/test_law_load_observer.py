@@ -21,10 +21,10 @@ from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import (
-    absorbed_friction,
     disturbance,
     learning,
     load_observer,
+    motor_friction,
 )
 from blf_dsc_controller.law.load_observer import Settings, State, Work
 from blf_dsc_controller.simulation.loop import simulate
@@ -265,8 +265,8 @@ def test_torque_is_the_same_while_the_law_lets_what_is_absorbed_follow():
     sensed = X[:, :P] @ LINKS + [1.0, 0.5]
     before = run(state, work, sensed, 1.0)
     sizes = {'n': N, 'p': P, 'm': M, 'observer': SETTINGS}
-    absorbed = part(absorbed_friction.State, **sizes)
-    scratch = part(absorbed_friction.Work, **sizes)
+    absorbed = part(motor_friction.State, **sizes)
+    scratch = part(motor_friction.Work, **sizes)
     absorbed.solution[:] = 0.05, 0.1, 0.0
     gains = SimpleNamespace(weight=2.0, adaptation_gain=np.full(M, 0.5 / DT))
     now = SimpleNamespace(

@@ -33,7 +33,6 @@ from blf_dsc_controller.factory.estimate import (
 from blf_dsc_controller.factory.inertia import joint_inertia
 from blf_dsc_controller.factory.laws import law_of, of_law
 from blf_dsc_controller.law import (
-    absorbed_friction,
     adaptation,
     apparent_inertia,
     barrier,
@@ -44,6 +43,7 @@ from blf_dsc_controller.law import (
     feedback,
     friction,
     load_observer,
+    motor_friction,
     prediction,
     reversals,
     surface,
@@ -124,17 +124,18 @@ def _parts_of_learning(
     initial = (column.initial for column in learned)
     covariance = prior_covariance(config)
     sliding = _window(config)
+    of = _columns(config, p)
     return {
         'initial_estimate': np.array((*config.learning.initial_estimate, *initial)),
         'information': inverse(covariance),
         'row_information': inverse(doubting_covariance(config)),
-        'columns': _columns(config, p),
+        'columns': of,
         'row': row,
         'window': sliding,
         'excitation': _excitation(config),
         'adaptation': _adaptation(config, p, learned, covariance),
-        'absorbed': absorbed_friction.Settings(
-            size=p + len(config.joints) * (int(_columns(config, p).bias) + int(_columns(config, p).viscous)),
+        'motors': motor_friction.Settings(
+            size=p + len(config.joints) * (of.bias + of.viscous),
             filter_pole=row.filter_pole,
             length=sliding.length,
             period=sliding.row_interval * config.sample_time,

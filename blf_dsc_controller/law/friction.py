@@ -257,38 +257,26 @@ def unexplained(row: Array, estimate: Array, own: int) -> float:
 
 @inner
 def measure_reversals(
-    settings: Settings,
-    state: State,
-    unexplained: Array,
-    begins: bool,
-    dt: float,
+    settings: Settings, state: State, work: Work, begins: bool, dt: float
 ) -> None:
     """Add the last row, `dt` [s] after the one before it, to the sums of the present reversal.
 
-    `rows` [X | u] (n, m + 1) are those behind both poles, unweighted, `estimate` (m,) is
-    theta^.  What the high pass leaves is zero where it `begins`.
+    e (n,) [N m] is `work.unexplained`, of the row behind both poles, unweighted.  What the
+    high pass leaves is zero where it `begins`.
     """
     gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
     lags = state.column_lags
     reversals.keep(state.reversals, dt)
-    for i in range(unexplained.size):
-        e = unexplained[i]
+    for i in range(work.unexplained.size):
+        e = work.unexplained[i]
         s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
         b_h = high_pass(lags[1], i, gain, state.shape_lags[1, 2, i], begins)
         e_h = high_pass(state.torque_lags, i, gain, e, begins)
-        is_new = reversals.add_row(
-            settings.reversals,
-            state.reversals,
-            i,
-            s_h,
-            b_h,
-            e_h,
-            weight,
-            state.breakaway[i],
-            dt,
-        )
-        if is_new:
+        k = state.breakaway[i]
+        if reversals.add_row(
+            settings.reversals, state.reversals, i, s_h, b_h, e_h, weight, k, dt
+        ):
             state.drift_extremes[0, i] = 0.0
             state.drift_extremes[1, i] = 0.0
 
@@ -311,7 +299,9 @@ def return_estimate(
     for i in range(of.initial.size):
         j = settings.first_coulomb + i
         if active[j] == 1.0 and settings.gain[i] > 0.0:
-            coulomb, state.breakaway[i] = reversals.learned(of, shown, i, state.breakaway[i])
+            coulomb, state.breakaway[i] = reversals.learned(
+                of, shown, i, state.breakaway[i]
+            )
             estimate[j] = clip(coulomb, of.least[i], of.most[i])
 
 

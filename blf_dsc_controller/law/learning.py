@@ -7,7 +7,7 @@ columns, ripple   the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
 load_observer     the torque that joint torque sensors show beyond the model's
 torque_sensors    whether they are such sensors, and alive
-absorbed_friction what P^ has taken of the friction of the motors, by these sensors
+motor_friction    friction of the motors, by these sensors
 window            sums of the rows over tau_d
 change            whether the arm has changed, so that the window must be forgotten
 excitation        whether a window is excited, consistent, and latched
@@ -24,7 +24,6 @@ from __future__ import annotations
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import (
-    absorbed_friction,
     adaptation,
     change,
     columns,
@@ -33,6 +32,7 @@ from blf_dsc_controller.law import (
     external_torque,
     friction,
     load_observer,
+    motor_friction,
     prediction,
     reversals,
     ripple,
@@ -65,7 +65,7 @@ def observe(
     samples = int(state.samples[0])
     if samples % settings.window.row_interval == 0:
         if settings.observer.enabled == 1:
-            add_absorbed(settings, state, signals)
+            add_friction_row(settings, state, signals)
         window.push_row(state.window, signals.row.Xu)
         measure_reversals(settings, state, signals, settings.window.row_interval * dt)
     if settings.excitation.change_detection == 1:
@@ -75,16 +75,16 @@ def observe(
 
 
 @inner
-def add_absorbed(settings: Settings, state: State, signals: Signals) -> None:
-    """Add the row to those of the friction that P^ absorbs, unless a sensor is silent."""
-    of, now, row = settings.absorbed, state.absorbed, signals.row.Xu
+def add_friction_row(settings: Settings, state: State, signals: Signals) -> None:
+    """Add the row to those that show the friction of the motors, unless a sensor is silent."""
+    of, now, row = settings.motors, state.motors, signals.row.Xu
     if load_observer.is_missing(signals.effort):
         return
     moving = prediction.moving_share(signals.dqr, settings.row.motion_scale)
-    share = absorbed_friction.fade(of, now, moving)
+    share = motor_friction.fade(of, now, moving)
     for i in range(settings.n):
         weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        g = absorbed_friction.unexplained(
+        g = motor_friction.friction_of_row(
             now,
             row,
             weight,
@@ -93,7 +93,7 @@ def add_absorbed(settings: Settings, state: State, signals: Signals) -> None:
             settings.initial_estimate,
             state.estimate,
         )
-        absorbed_friction.add_row(now, row, i, g, share)
+        motor_friction.add_row(now, row, i, g, share)
 
 
 @inner
@@ -116,8 +116,8 @@ def check_excitation(
     )
     is_new = state.latch.latched[0] == 1.0 and state.latch.latch_time[0] == t
     if is_new and settings.observer.enabled == 1:
-        absorbed_friction.solve(
-            settings.absorbed, state.absorbed, signals.absorbed, settings.information
+        motor_friction.solve(
+            settings.motors, state.motors, signals.motors, settings.information
         )
 
 
@@ -198,11 +198,11 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
         now,
         signals.observer,
         state.estimate,
-        state.absorbed.absorbed,
+        state.motors.absorbed,
         settings.information,
         dt,
     )
-    absorbed_friction.pass_poles(settings.absorbed, state.absorbed, now.late, dt)
+    motor_friction.pass_poles(settings.motors, state.motors, now.late, dt)
     torque_sensors.follow_applied(
         state.sensors, row, settings.m, of.observer_bandwidth, dt
     )
@@ -221,7 +221,7 @@ def check_sensors(
         work.differences[0, i] = of.filtered[i, settings.p] - now.command[i]
         if now.is_distinct[0] == 0.0:
             work.differences[1, i] = load_observer.residual(
-                settings.observer, of, i, state.estimate, state.absorbed.absorbed
+                settings.observer, of, i, state.estimate, state.motors.absorbed
             )
     if begins:
         torque_sensors.begin(now, of.torque)
@@ -241,39 +241,47 @@ def measure_reversals(
 ) -> None:
     """Let `friction` measure reversals, with a row each `period` [s].
 
-    It begins T_a after the latch, when the other columns are those of the window, and
-    once a full window is known to be of one arm or this one is half full: with fewer
-    rows they are too uncertain.
+    Torque sensors show the friction alone, from the first row that is not of an arm before.
+    Without them, what the other columns leave of the torque shows it: from T_a after the latch on,
+    when these are those of the window, and once a full window is known to be of one arm or
+    this one is half full; with fewer rows they are too uncertain.
     """
     if settings.friction.learns == 0:
         return
+    latch, rows = state.latch, state.window.rows[0]
     length = settings.window.length
-    latch = state.latch
-    settling_time = settings.excitation.learning_start - length * period
     since_latch = friction.update_since_latch(state.friction, latch.latched[0], period)
-    is_known = (
-        settings.excitation.change_detection == 0
-        or latch.least_residual[0] > 0.0
-        or state.window.rows[0] >= 0.5 * length
+    if load_observer.is_trusted(settings.observer, state.observer):
+        settled = rows * period * settings.row.filter_pole >= prediction.SETTLED
+        begins = not settled or load_observer.is_missing(signals.effort)
+    else:
+        settling_time = settings.excitation.learning_start - length * period
+        is_known = (
+            settings.excitation.change_detection == 0
+            or latch.least_residual[0] > 0.0
+            or rows >= 0.5 * length
+        )
+        begins = since_latch <= settling_time or not is_known
+    fill_unexplained(settings, state, signals)
+    friction.measure_reversals(
+        settings.friction, state.friction, signals.friction, begins, period
     )
+
+
+@inner
+def fill_unexplained(settings: Settings, state: State, signals: Signals) -> None:
+    """Write e, what all but Coulomb friction leaves of the torque, where `friction` reads it."""
+    senses = load_observer.is_trusted(settings.observer, state.observer)
+    rotors = settings.observer.rotors
     for i in range(settings.n):
-        own = settings.friction.first_coulomb + i
-        row = state.row.filter2[i]
-        if settings.observer.enabled == 1 and state.observer.faded[0] == 0.0:
-            signals.friction.unexplained[i] = absorbed_friction.unexplained_friction(
-                state.absorbed, row, i, settings.observer.rotors, state.estimate, own
+        row, own = state.row.filter2[i], settings.friction.first_coulomb + i
+        if senses:
+            e = motor_friction.unexplained(
+                state.motors, row, i, rotors, state.estimate, own
             )
         else:
-            signals.friction.unexplained[i] = friction.unexplained(
-                row, state.estimate, own
-            )
-    friction.measure_reversals(
-        settings.friction,
-        state.friction,
-        signals.friction.unexplained,
-        state.window.rows[0] * period * settings.friction.pole < prediction.SETTLED if (settings.observer.enabled == 1 and state.observer.faded[0] == 0.0) else (since_latch <= settling_time or not is_known),
-        period,
-    )
+            e = friction.unexplained(row, state.estimate, own)
+        signals.friction.unexplained[i] = e
 
 
 @inner
@@ -315,21 +323,22 @@ def detect_change(
             take_back(settings, state, signals)
     change.count_change(state.change, latch, sliding, prior, state.estimate, dt)
     prediction.forget(state.row)
-    absorbed_friction.forget(state.absorbed)
+    motor_friction.forget(state.motors)
 
 
 @inner
 def take_back(settings: Settings, state: State, signals: Signals) -> None:
     """Return to the estimate before the window; the torque stays the same, if configured.
 
-    Coulomb friction is not of the window but of reversals, and stays.
+    What is not learned from the window stays: Coulomb friction is of reversals, and the other
+    friction of the sensors, if there are any.
     """
+    senses = load_observer.is_trusted(settings.observer, state.observer)
     before = signals.adaptation.tracked  # scratch here
     for j in range(settings.m):
         before[j] = state.estimate[j]
-        if not friction.is_coulomb(settings.friction, j) and not (
-            settings.observer.enabled == 1 and settings.p <= j < settings.absorbed.size
-        ):
+        is_sensed = senses and settings.p <= j < settings.motors.size
+        if not (is_sensed or friction.is_coulomb(settings.friction, j)):
             state.estimate[j] = state.latch.anchor[j]
     if settings.disturbance.bumpless == 1:
         transfer_learned(settings, state, signals, before)
@@ -348,8 +357,8 @@ def transfer_learned(
             state.disturbance,
             state.estimate,
             before,
-            state.absorbed.absorbed,
-            state.absorbed.absorbed,
+            state.motors.absorbed,
+            state.motors.absorbed,
         )
         load_observer.hand_over(
             settings.observer,
@@ -366,9 +375,9 @@ def follow_absorbed(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Let P_f follow, as P^ does; d^3 takes what r loses."""
-    now, work = state.absorbed, signals.absorbed
+    now, work = state.motors, signals.motors
     of = settings.adaptation
-    absorbed_friction.follow(now, work, of.weight, of.adaptation_gain, dt)
+    motor_friction.follow(now, work, of.weight, of.adaptation_gain, dt)
     load_observer.transfer_learned(
         settings.observer,
         state.observer,
@@ -409,9 +418,9 @@ def adapt(
             estimate,
             work.rate,
         )
-        if settings.observer.enabled == 1 and state.observer.faded[0] == 0.0:
-            absorbed_friction.follow_columns(
-                state.absorbed,
+        if load_observer.is_trusted(settings.observer, state.observer):
+            motor_friction.follow_columns(
+                state.motors,
                 settings.initial_estimate,
                 latch.active,
                 estimate,

@@ -26,8 +26,14 @@ within 10 / L if the prior explains it.  A joint whose sensor shows more than `_
 deviations keeps it: it has an offset, or the arm holds something.  It is also kept if the
 law continues with a d^3 of its own, which may have that already.
 
+*Late.*  r passes L, so that after a change of P^ it gives up X_L (P^ - P^_before), and d^3 would
+have to give up the rest of H (P^ - P^_before): the torque of a load that has just gone, of an
+inertia that accelerates.  That is not of the arm, and fades with L (`hand_over`).
+
+*Shaking.*  Where r shakes (`torque_sensors`), only what changes slowly of it is added.
+
 *Friction.*  What is learned describes the torque of the motors, with all their friction.  P_l
-is without what P^ has absorbed of that (`absorbed_friction`), or else r would take it back.
+is without what P^ has absorbed of that (`motor_friction`), or else r would take it back.
 """
 
 from math import isfinite, sqrt
@@ -101,6 +107,12 @@ def is_missing(effort: Array) -> bool:
     for i in range(effort.size):
         missing = missing or not isfinite(effort[i])
     return missing
+
+
+@inner
+def is_trusted(settings: Settings, state: State) -> bool:
+    """Whether there are joint torque sensors, and nothing speaks against them."""
+    return bool(settings.enabled == 1 and state.faded[0] == 0.0)
 
 
 @inner

@@ -25,12 +25,12 @@ If the arm has changed, what reversals have shown since some 0.2 s before that w
 is taken back: a load that comes on in a reversal looks like the step of friction.
 """
 
-from math import exp
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
+from blf_dsc_controller.law.lag import filter_gain
 
 _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
 _SHOWN = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
@@ -39,7 +39,9 @@ _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _LATE = 0.15  # s, by which a change of the arm is found
 _NEAR = 0.1  # s around a reversal in which its torque is compared with friction's
-_TOUCHED = 0.004  # of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
+_TOUCHED = (
+    0.004  # of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
+)
 _ALLOWED_F, _ALLOWED_C = 0.5, 0.8  # a over f, and over c
 
 # Rows of the sums over products of s_h, b_h and e_h
@@ -123,10 +125,10 @@ def add_row(
 
 @inner
 def add_torque(state: State, i: int, ss: float, ee: float, dt: float) -> None:
-    """Add p e_h^2 dt of joint i to that of its reversal, from `_NEAR` before to as long after it."""
+    """Add p e_h^2 dt of joint i to that of its reversal, from `_NEAR` before it to after it."""
     recent = state.recent
     reversed_before = recent[0, i] > _TOUCHED
-    kept = exp(-dt / _NEAR)
+    kept = 1.0 - filter_gain(_NEAR, dt)
     recent[0, i] = kept * recent[0, i] + ss
     recent[1, i] = kept * recent[1, i] + ee
     if recent[0, i] > _TOUCHED:

@@ -17,7 +17,6 @@ from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, Passed, size_of, view_of
 from blf_dsc_controller.law import (
-    absorbed_friction,
     adaptation,
     apparent_inertia,
     barrier,
@@ -29,6 +28,7 @@ from blf_dsc_controller.law import (
     feedback,
     friction,
     load_observer,
+    motor_friction,
     prediction,
     surface,
     torque,
@@ -69,7 +69,7 @@ class Settings(NamedTuple):
     feedback: feedback.Settings
     disturbance: disturbance.Settings
     observer: load_observer.Settings
-    absorbed: absorbed_friction.Settings
+    motors: motor_friction.Settings
     torque: torque.Settings
     columns: columns.Settings
     row: prediction.Settings
@@ -95,7 +95,7 @@ class State(NamedTuple):
     saturation: torque.State
     row: prediction.State
     observer: load_observer.State
-    absorbed: absorbed_friction.State
+    motors: motor_friction.State
     sensors: torque_sensors.State
     latch: excitation.State
     change: change.State
@@ -144,7 +144,7 @@ class Signals(NamedTuple):
     saturation: torque.Work
     row: prediction.Work
     observer: load_observer.Work
-    absorbed: absorbed_friction.Work
+    motors: motor_friction.Work
     sensors: torque_sensors.Work
     window: window.Work
     latch: excitation.Work

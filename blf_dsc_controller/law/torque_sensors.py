@@ -14,9 +14,12 @@ and k and D those of a gear,
     y is of the motor:     tau_J = M_l s^2 y (D s + k) / (M_l s^2 + D s + k)
                                              the gear's resonance, with M_l behind it
 
-are stable only with an L of some rad/s, where r is of no use.  So r fades out for good where
+are stable only with an L of some rad/s.  So is a true sensor, where a gear is softer than is
+known, and a load heavier.  So r fades out for good where
 
-- *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).
+- *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).  First only
+  what changes fast of it is left out, and only in the joints that shake: loads, which stay,
+  are then found slowly.  If r of one of these shakes again, all of r is left out.
 - *efforts are commands*: in the first motion, efforts behind the filter L are within a
   `_EQUAL` share of the torque that is commanded, as seen against what they are away from
   that of the links, in the geometric mean of the joints.  The mean squares are those of

@@ -6,7 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES, STILL_SHAKES
+from blf_dsc_controller.law.torque_sensors import (
+    COMMANDS,
+    NONE,
+    OFF,
+    SHAKES,
+    STILL_SHAKES,
+)
 
 _ALONE = 'the load observer is off, and the law goes on without it'
 _DRIVER = (

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from law_part import part
 
-from blf_dsc_controller.law import absorbed_friction
-from blf_dsc_controller.law.absorbed_friction import Settings, State, Work
+from blf_dsc_controller.law import motor_friction
+from blf_dsc_controller.law.motor_friction import Settings, State, Work
 
 N, P, M = 2, 3, 4  # joints, parameters, entries of theta: the last is friction
 SETTINGS = Settings(filter_pole=30.0, length=200, period=0.01, least_weight=1e-9)
@@ -43,16 +43,16 @@ def add(state, X, friction, load=0.0, *, moving=1.0):
     u = X[:, :P] @ ROTORS + links + X[:, P:] @ THETA[P:] + friction
     state.sensed2[:] = links
     row = np.column_stack((X, u))
-    share = absorbed_friction.fade(SETTINGS, state, moving)
+    share = motor_friction.fade(SETTINGS, state, moving)
     for i in range(N):
-        g = absorbed_friction.unexplained(state, row, 1.0, i, ROTORS, THETA)
-        absorbed_friction.add_row(state, row, i, g, share)
+        g = motor_friction.unexplained(state, row, 1.0, i, ROTORS, THETA)
+        motor_friction.add_row(state, row, i, g, share)
 
 
 def solved(state, work):
     """P_f, whose s^2 has come to rest."""
     for _ in range(50):
-        absorbed_friction.solve(SETTINGS, state, work, R)
+        motor_friction.solve(SETTINGS, state, work, R)
     return state.solution.copy()
 
 
@@ -126,7 +126,7 @@ def test_it_follows_its_solution_at_the_rate_of_the_learning():
     state.solution[:] = SHARE
     gain = np.array([0.5, 0.5, 0.25, 9.0])
     for _ in range(1000):
-        absorbed_friction.follow(state, work, 2.0, gain, 1e-3)
+        motor_friction.follow(state, work, 2.0, gain, 1e-3)
     left = 1.0 - np.exp([-1.0, -1.0, -0.5])
     np.testing.assert_allclose(state.absorbed, SHARE * left, rtol=1e-3)
     last = 1e-3 * 2.0 * gain[:P] * (SHARE - work.before)
@@ -137,7 +137,7 @@ def test_sensors_pass_the_poles_of_a_row():
     state, _ = new()
     sensed = np.array([3.0, -1.0])
     for _ in range(1000):
-        absorbed_friction.pass_poles(SETTINGS, state, sensed, 1e-4)
+        motor_friction.pass_poles(SETTINGS, state, sensed, 1e-4)
     t = 30.0 * 0.1
     np.testing.assert_allclose(
         state.sensed2, sensed * (1.0 - (1.0 + t) * np.exp(-t)), rtol=5e-3

@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What P^ has absorbed of the friction of the motors, by joint torque sensors.
+"""Friction of the motors, as joint torque sensors show it: its columns d, and what P^ absorbs.
 
 P^ is learned from the torque u of the motors.  It takes all of it that X can describe: the
-torque of the links, and what friction has that is not in its columns D.  With the torque
-tau_J that sensors behind the gears show, and P_r of the assumed rotors,
+torque of the links, and what friction has that is not in its columns D.  What pushes the arm
+it takes for either.  With the torque tau_J that sensors behind the gears show, P_r of the
+assumed rotors, and D_c d_c of Coulomb friction and ripple,
 
-    g = u - X P_r - D d^ - tau_J
+    g = u - X P_r - D_c d_c - tau_J
 
-is that friction alone, whatever the links carry and whatever pushes them.  What X
-describes of it is the share of P^:
+is friction alone, whatever the links carry and whatever pushes them.  The other columns D of
+friction, and what X describes of it, are
 
-    P_f = argmin sum |g - X P_f|^2 + a P_f^T R P_f,      a = s^2 CORRELATION / T
+    P_f, d = argmin sum |g - X P_f - D d|^2 + a |P_f, d - d_0|^2_R,      a = s^2 CORRELATION / T
 
-as for the rows of `innovation`, one each T, with s^2 the mean square of g - X P_f: a torque that X
-does not describe, as of a motor that drags, makes P_f small.  The rows are those of the
-window, but fade over `_WINDOWS` of it in motion, as friction outlasts what is carried.
+as for the rows of `innovation`, one each T, with s^2 the mean square of what they leave of g: a
+torque that they do not describe, as of a motor that drags, makes P_f small.  The rows are
+those of the window, but fade over `_WINDOWS` of it in motion, as friction outlasts what is carried.
 
-P^ - P_f - P_r describes the links: by it `load_observer` sees what acts on them.  P_f follows
-while P^ learns, at the same rate.
+P^ - P_f - P_r describes the links: by it `load_observer` sees what acts on them.  d^ is this d,
+in place of that of the window, and outlasts changes of the arm; P_f and d^ follow while P^
+learns, at the same rate.  What is left of g is also what reversals show of Coulomb friction.
 """
 
 from typing import Annotated, NamedTuple
@@ -35,7 +37,7 @@ _NOTHING = 0.1  # of that: rows of zeros before the first
 class Settings(NamedTuple):
     """The rows that it uses, and the least weight of its prior."""
 
-    size: int  # entries of theta that are found: P, and d but for Coulomb friction and ripple
+    size: int  # entries of theta that are found: P, and columns before those of Coulomb friction
     filter_pole: float  # of both poles of a row, rad/s
     length: int  # rows in a window
     period: float  # T, s
@@ -48,18 +50,20 @@ class State(NamedTuple):
     sensed1: Annotated[Array, 'n * observer.enabled']  # tau_J behind one pole, N m
     sensed2: Annotated[Array, 'n * observer.enabled']  # and behind both, N m
     rows: Cell  # of motion so far
-    Phi: Annotated[Array, 'absorbed.size * observer.enabled', 'absorbed.size']  # of X^T X, upper triangle
-    b: Annotated[Array, 'absorbed.size * observer.enabled']  # of X^T g
-    square: Cell  # of |g|^2, (N m)^2
-    residual: Cell  # s^2, of |g - X P_f|^2, (N m)^2
-    solution: Annotated[Array, 'absorbed.size * observer.enabled']
+    Phi: Annotated[
+        Array, 'motors.size * observer.enabled', 'motors.size'
+    ]  # of [X | D]^T [X | D], upper triangle
+    b: Annotated[Array, 'motors.size * observer.enabled']  # of [X | D]^T (g - D d_0)
+    square: Cell  # of |g - D d_0|^2, (N m)^2
+    residual: Cell  # s^2, (N m)^2
+    solution: Annotated[Array, 'motors.size * observer.enabled']  # [P_f; d - d_0]
     absorbed: Annotated[Array, 'p * observer.enabled']  # P_f, which follows it
 
 
 class Work(NamedTuple):
     """Scratch of one sample."""
 
-    factor: Annotated[Array, 'absorbed.size * observer.enabled', 'absorbed.size']
+    factor: Annotated[Array, 'motors.size * observer.enabled', 'motors.size']
     before: Annotated[Array, 'p * observer.enabled']  # P_f of the last sample
 
 
@@ -99,7 +103,7 @@ def fade(settings: Settings, state: State, moving: float) -> float:
 
 
 @inner
-def unexplained(
+def friction_of_row(
     state: State,
     row: Array,
     weight: float,
@@ -108,7 +112,10 @@ def unexplained(
     initial: Array,
     estimate: Array,
 ) -> float:
-    """Return g of joint i [N m] by its `weight`, for a `row` [X | D | u] (n, m + 1)."""
+    """Return g - D d_0 of joint i [N m] by its `weight`, for a `row` [X | D | u] (n, m + 1).
+
+    d_0 is of the `initial` theta (m,), d_c of the `estimate` (m,), P_r are `rotors` (p,).
+    """
     m = estimate.size
     g = row[i, m] - weight * state.sensed2[i]
     for j in range(rotors.size):
@@ -119,20 +126,38 @@ def unexplained(
 
 
 @inner
+def unexplained(
+    state: State, row: Array, i: int, rotors: Array, estimate: Array, own: int
+) -> float:
+    """Return e of joint i [N m], what P_f and d^, but for entry `own` of theta^, leave of g.
+
+    `row` [X | D | u] (m + 1,) is unweighted, theta^ the `estimate` (m,), P_r are `rotors` (p,).
+    """
+    m = estimate.size
+    e = row[m] - state.sensed2[i]
+    for j in range(rotors.size):
+        e -= row[j] * (rotors[j] + state.absorbed[j])
+    for j in range(rotors.size, m):
+        if j != own:
+            e -= row[j] * estimate[j]
+    return float(e)
+
+
+@inner
 def add_row(state: State, row: Array, i: int, g: float, share: float) -> None:
-    """Add the row of joint i with its g [N m] to the means."""
-    p = state.b.size
+    """Add the row of joint i with its g - D d_0 [N m] to the means."""
+    size = state.b.size
     state.square[0] += share * g * g
-    for a in range(p):
+    for a in range(size):
         scaled = share * row[i, a]
         state.b[a] += scaled * g
-        for b in range(a, p):
+        for b in range(a, size):
             state.Phi[a, b] += scaled * row[i, b]
 
 
 @inner
 def solve(settings: Settings, state: State, work: Work, information: Array) -> None:
-    """Solve for P_f; the `information` (m, m) is R.  s^2 is that of the last solution."""
+    """Solve for P_f and d; the `information` (m, m) is R.  s^2 is that of the last solution."""
     duration = max(state.rows[0], 1.0) * settings.period
     weight = max(settings.least_weight, state.residual[0] * CORRELATION / duration)
     for a in range(state.b.size):
@@ -146,14 +171,14 @@ def solve(settings: Settings, state: State, work: Work, information: Array) -> N
 
 @inner
 def mean_residual(state: State) -> float:
-    """Return the mean of |g - X P_f|^2 [(N m)^2] for the solution."""
-    P_f = state.solution
+    """Return the mean of |g - X P_f - D d|^2 [(N m)^2] for the solution."""
+    x = state.solution
     residual = state.square[0]
-    for a in range(P_f.size):
-        product = state.Phi[a, a] * P_f[a] - 2.0 * state.b[a]
-        for b in range(a + 1, P_f.size):
-            product += 2.0 * state.Phi[a, b] * P_f[b]
-        residual += product * P_f[a]
+    for a in range(x.size):
+        product = state.Phi[a, a] * x[a] - 2.0 * state.b[a]
+        for b in range(a + 1, x.size):
+            product += 2.0 * state.Phi[a, b] * x[b]
+        residual += product * x[a]
     return max(0.0, float(residual))
 
 
@@ -173,22 +198,10 @@ def follow(state: State, work: Work, weight: float, gain: Array, dt: float) -> N
 def follow_columns(
     state: State, initial: Array, active: Array, estimate: Array, rate: Array
 ) -> None:
-    """Write d - d^ of the columns that are found by sensors to `rate` (m,), if `active` (m,)."""
+    """Write d - d^ of the columns that it finds to `rate` (m,); those not `active` (m,) stay.
+
+    d_0 is of the `initial` theta (m,), d^ of the `estimate` (m,).
+    """
     for j in range(state.absorbed.size, state.solution.size):
         if active[j] == 1.0:
             rate[j] = initial[j] + state.solution[j] - estimate[j]
-
-
-@inner
-def unexplained_friction(
-    state: State, row: Array, i: int, rotors: Array, estimate: Array, own: int
-) -> float:
-    """Return what P_f and theta^, but for its entry `own`, leave of the motor's friction [N m]."""
-    m = estimate.size
-    e = row[m] - state.sensed2[i]
-    for j in range(rotors.size):
-        e -= row[j] * (rotors[j] + state.absorbed[j])
-    for j in range(rotors.size, m):
-        if j != own:
-            e -= row[j] * estimate[j]
-    return float(e)
