@@ -42,7 +42,7 @@ _NEAR = 0.1  # s around a reversal in which its torque is compared with friction
 _TOUCHED = (
     0.004  # of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
 )
-_ALLOWED_F, _ALLOWED_C = 0.5, 0.8  # a over f, and over c
+_ALLOWED_F, _ALLOWED_C = 0.5, 2.0  # a over f, and over c
 
 # Rows of the sums over products of s_h, b_h and e_h
 _SE, _BE, _SS, _SB, _BB = range(5)
