@@ -106,13 +106,13 @@ def test_breakaway_is_relative_to_the_learned_friction():
 
 def after_a_reversal(seconds, friction_of):
     """The state so long after a joint has reversed whose friction [N m] is that of a time [s]."""
-    state, estimate, dt = part(State), np.array([0.0, 3.0]), 0.01
+    state, work, dt = part(State), part(Work), 0.01
     friction.begin(SETTINGS, state)
     state.drift_extremes[:, 0] = -1.0, 1.0
     for k in range(round(seconds / dt)):
         s = state.shape_lags[0, 2, 0] = 1.0 if k else -1.0
-        row = np.array([[0.0, s, s * friction_of(k * dt)]])
-        friction.measure_reversals(SETTINGS, state, row, estimate, k == 0, dt)
+        work.unexplained[:] = s * friction_of(k * dt)
+        friction.measure_reversals(SETTINGS, state, work, k == 0, dt)
     return state
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What P^ absorbs of friction: found whatever is carried, small where X does not describe it."""
+"""Friction of the motors by their sensors: found whatever is carried or pushes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from law_part import part
 from blf_dsc_controller.law import motor_friction
 from blf_dsc_controller.law.motor_friction import Settings, State, Work
 
-N, P, M = 2, 3, 4  # joints, parameters, entries of theta: the last is friction
-SETTINGS = Settings(filter_pole=30.0, length=200, period=0.01, least_weight=1e-9)
+# joints, parameters, entries of theta: the last is Coulomb friction
+N, P, M = 2, 3, 4
+SETTINGS = Settings(
+    size=P, filter_pole=30.0, length=200, period=0.01, least_weight=1e-9
+)
 ROTORS = np.array([0.0, 0.0, 0.25])
 THETA = np.array([1.0, -2.0, 0.75, 5.0])
+INITIAL = np.array([0.9, -2.5, 0.75, 4.0])
 SHARE = np.array([0.3, -0.2, 0.1])  # P_f
 R = np.eye(M)
 
@@ -24,9 +28,9 @@ class Observer:
     enabled = 1
 
 
-def new():
+def new(settings=SETTINGS):
     """An empty state, and scratch."""
-    sizes = {'n': N, 'p': P, 'm': M, 'observer': Observer()}
+    sizes = {'n': N, 'p': P, 'm': M, 'observer': Observer(), 'motors': settings}
     return part(State, **sizes), part(Work, **sizes)
 
 
@@ -45,7 +49,7 @@ def add(state, X, friction, load=0.0, *, moving=1.0):
     row = np.column_stack((X, u))
     share = motor_friction.fade(SETTINGS, state, moving)
     for i in range(N):
-        g = motor_friction.unexplained(state, row, 1.0, i, ROTORS, THETA)
+        g = motor_friction.friction_of_row(state, row, 1.0, i, ROTORS, INITIAL, THETA)
         motor_friction.add_row(state, row, i, g, share)
 
 
@@ -131,6 +135,62 @@ def test_it_follows_its_solution_at_the_rate_of_the_learning():
     np.testing.assert_allclose(state.absorbed, SHARE * left, rtol=1e-3)
     last = 1e-3 * 2.0 * gain[:P] * (SHARE - work.before)
     np.testing.assert_allclose(state.absorbed - work.before, last, rtol=1e-9)
+
+
+COLUMN = Settings(size=M, filter_pole=30.0, length=200, period=0.01, least_weight=1e-9)
+"""That of a law whose last column is viscous friction."""
+
+
+def followed(state, active=1.0):
+    """Return the rate of theta^ by the columns that the sensors show."""
+    rate = np.full(M, 9.0)
+    shown = np.array([1.0] * P + [active])
+    motor_friction.follow_columns(state, INITIAL, shown, THETA, rate)
+    return rate
+
+
+def test_columns_of_friction_are_found_whatever_pushes_the_arm():
+    """6 N m s/rad; the estimate is 5, the initial one 4.  The sensors show the pushes, too."""
+    state, work = new(COLUMN)
+    for k, X in enumerate(rows(4.0)):
+        push = np.array([30.0, -9.0]) * (k > 200)
+        add(state, X, X[:, :P] @ SHARE + X[:, P:] @ [1.0], load=push)
+    np.testing.assert_allclose(solved(state, work), [*SHARE, 2.0], atol=1e-6)
+    np.testing.assert_allclose(followed(state), [9.0, 9.0, 9.0, 1.0], atol=1e-6)
+
+
+def test_rejected_column_stays():
+    state, _ = new(COLUMN)
+    state.solution[P] = 2.0
+    assert followed(state, active=0.0).tolist() == [9.0, 9.0, 9.0, 9.0]
+
+
+def test_without_rows_columns_are_as_before_the_start():
+    state, _ = new(COLUMN)
+    assert followed(state).tolist() == [9.0, 9.0, 9.0, INITIAL[P] - THETA[P]]
+
+
+def test_what_else_is_known_of_friction_leaves_that_of_its_own_column():
+    state, _ = new()
+    state.absorbed[:] = SHARE
+    X = next(rows(0.01))
+    links = X[:, :P] @ (THETA[:P] - ROTORS)
+    state.sensed2[:] = links
+    friction = X[:, :P] @ SHARE + X[:, P:] @ [7.0]
+    row = np.column_stack((X, X[:, :P] @ ROTORS + links + friction))
+    for i in range(N):
+        e = motor_friction.unexplained(state, row[i], i, ROTORS, THETA, P)
+        assert e == pytest.approx(7.0 * X[i, P])
+        e = motor_friction.unexplained(state, row[i], i, ROTORS, THETA, -1)
+        assert e == pytest.approx(2.0 * X[i, P])
+
+
+def test_poles_of_the_sensors_are_emptied_with_those_of_the_rows():
+    state, _ = new()
+    motor_friction.pass_poles(SETTINGS, state, np.array([3.0, -1.0]), 0.1)
+    motor_friction.forget(state)
+    assert not state.sensed1.any()
+    assert not state.sensed2.any()
 
 
 def test_sensors_pass_the_poles_of_a_row():

@@ -50,26 +50,87 @@ def test_two_reversals_overrule_the_sums_if_both_contradict_them(
     shown.past[[SE, SS, BB], 0] = 3.0, 1.0, 1.0
     shown.coulomb[:, 0] = last, before
     reversals.overrule(SETTINGS, shown, 0)
-    coulomb, stribeck = reversals.learned(SETTINGS, shown, 0)
+    coulomb, stribeck = reversals.learned(SETTINGS, shown, 0, 0.0)
     assert coulomb == pytest.approx(expected, abs=1e-3)
     assert stribeck == 0.0
 
 
-def test_reversal_shows_its_friction_once_and_within_limits():
-    """Once p int s_h^2 dt is 0.06, half a reversal."""
-    shown = begun().shown
+def add(state, energy, friction, push=0.0):
+    """Add a row of a joint without breakaway, 0.01 s after the last, with its p s_h^2 dt.
 
-    def add(energy, friction):
-        """Add a row without breakaway."""
-        s = np.sqrt(energy)
-        return reversals.add_row(SETTINGS, shown, 0, s, 0.0, friction * s, 1.0, 0.0)
+    A `push` [N m] is as large beside the step of friction.
+    """
+    s = np.sqrt(energy)
+    return reversals.add_row(
+        SETTINGS, state, 0, s, 0.0, friction * s + push, 1.0, 0.0, 0.01
+    )
 
-    assert not add(0.05, 4.0)
+
+def test_reversal_shows_its_friction_once():
+    """Once p int s_h^2 dt is 0.05, half a reversal."""
+    state = begun()
+    shown = state.shown
+    assert not add(state, 0.045, 4.0)
     assert shown.coulomb[:, 0].tolist() == [3.0, 3.0]
-    assert add(0.02, 4.0)
+    assert add(state, 0.02, 4.0)
     np.testing.assert_allclose(shown.coulomb[:, 0], [4.0, 3.0])
-    assert not add(0.01, 400.0)
-    assert shown.coulomb[:, 0].tolist() == [9.0, 3.0]  # the most
+    assert not add(state, 0.01, 4.0)
+    np.testing.assert_allclose(shown.coulomb[:, 0], [4.0, 3.0])
+
+
+@pytest.mark.parametrize(('friction', 'shown'), [(40.0, 9.0), (-2.0, 1.0)])
+def test_reversal_shows_friction_within_its_limits(friction, shown):
+    state = begun()
+    assert add(state, 0.06, friction)
+    assert state.shown.coulomb[:, 0].tolist() == [shown, 3.0]
+
+
+@pytest.mark.parametrize(('first', 'last'), [(0, 3.0), (8, 3.0), (15, 4.0)])
+def test_reversal_in_which_something_pushes_is_not_learned(first, last):
+    """40 N m in 3 rows before it, in it, and after it, where it has shown 4 N m already.
+
+    Friction, assumed to be 3 N m, may be 6 N m off in its shape.
+    """
+    state = begun()
+    for k in range(20):
+        reverses = 0.008 if 5 <= k < 15 else 0.0
+        add(state, reverses, 4.0, push=40.0 if first <= k < first + 3 else 0.0)
+    assert reversals.energy(state.shown, 0, 0.0) == pytest.approx(0.08)
+    assert reversals.trust(SETTINGS, state.shown, 0, 0.0) < 0.01
+    np.testing.assert_allclose(state.shown.coulomb[:, 0], [last, 3.0])
+    assert reversals.learned(SETTINGS, state.shown, 0, 0.0) == (pytest.approx(3.0), 0.0)
+    reversals.close(SETTINGS, state.shown, 0, 0.0)
+    assert not state.shown.past.any()
+
+
+def test_push_long_before_a_reversal_or_after_it_is_not_of_it():
+    """1 s away: ten times what is compared around it."""
+    state = begun()
+    for k in range(230):
+        reverses = 0.008 if 100 <= k < 110 else 0.0
+        add(state, reverses, 4.0, push=0.0 if 3 <= k < 220 else 40.0)
+    assert reversals.trust(SETTINGS, state.shown, 0, 0.0) > 0.9
+    assert state.shown.coulomb[0, 0] == pytest.approx(4.0, abs=0.1)
+    found, _ = reversals.learned(SETTINGS, state.shown, 0, 0.0)
+    assert found == pytest.approx(4.0, abs=0.1)
+
+
+def test_friction_whose_shape_is_another_still_counts():
+    """Where breakaway, say, adds half of c to every other row."""
+    state = begun()
+    for k in range(10):
+        add(state, 0.008, 4.0 if k % 2 else 2.0)
+    assert reversals.trust(SETTINGS, state.shown, 0, 0.0) > 0.9
+
+
+def test_beginning_of_a_reversal_shows_nothing_and_is_kept_for_it():
+    """Its sums are too small to tell friction from breakaway, or from anything else."""
+    state = begun()
+    add(state, 0.01, 8.0)
+    assert reversals.learned(SETTINGS, state.shown, 0, 0.0) == (pytest.approx(3.0), 0.0)
+    reversals.close(SETTINGS, state.shown, 0, 0.0)
+    assert not state.shown.past.any()
+    assert reversals.energy(state.shown, 0, 0.0) == pytest.approx(0.01)
 
 
 def test_sums_of_past_reversals_forget_what_is_older_than_eight():
@@ -82,7 +143,7 @@ def test_sums_of_past_reversals_forget_what_is_older_than_eight():
             reversals.close(SETTINGS, shown, 0, 0.0)
             assert not shown.present.any()
             assert shown.past[SS, 0] <= 1.0 + 1e-12
-        found, _ = reversals.learned(SETTINGS, shown, 0)
+        found, _ = reversals.learned(SETTINGS, shown, 0, 0.0)
         assert found == pytest.approx(expected, abs=0.005)
 
 
@@ -101,6 +162,6 @@ def test_reversal_that_ended_as_the_arm_changed_is_taken_back(ago, coulomb, last
     for _ in range(round(100 * ago)):
         reversals.keep(state, 0.01)
     reversals.take_back(state, np.zeros(1))
-    found, _ = reversals.learned(SETTINGS, state.shown, 0)
+    found, _ = reversals.learned(SETTINGS, state.shown, 0, 0.0)
     assert found == pytest.approx(coulomb, abs=0.01)
     assert state.shown.coulomb[0, 0] == last

@@ -12,7 +12,13 @@ from law_part import part
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law import torque_sensors
-from blf_dsc_controller.law.torque_sensors import COMMANDS, NONE, OFF, SHAKES
+from blf_dsc_controller.law.torque_sensors import (
+    COMMANDS,
+    NONE,
+    OFF,
+    SHAKES,
+    STILL_SHAKES,
+)
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.run import FIRST_STAMP
@@ -95,11 +101,50 @@ def watched(torque, seconds=0.3):
 @pytest.mark.parametrize('joint', [0, 1])
 def test_r_that_shakes_is_found_and_one_that_takes_a_load_or_is_small_is_not(joint):
     share = np.eye(2)[joint] * LIMIT / 80.0
-    shakes = watched(lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * share)
+    shakes = watched(lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * share, 0.15)
     assert (shakes.fault[0], shakes.joint[0]) == (SHAKES, joint)
     small = watched(lambda t: 0.5 * np.sin(2.0 * np.pi * 30.0 * t) * share)
     load = watched(lambda t: 20.0 * (1.0 - np.exp(-60.0 * t)) * np.array([1.0, 0.1]))
     assert (small.fault[0], load.fault[0]) == (NONE, NONE)
+
+
+def shaking(seconds, *joints):
+    """Return what is found where r of some joints shakes at 30 Hz."""
+    share = np.isin(np.arange(2), joints) * LIMIT / 80.0
+    return watched(lambda t: 3.0 * np.sin(2.0 * np.pi * 30.0 * t) * share, seconds)
+
+
+def test_r_is_calmed_where_it_shakes_and_left_out_if_it_shakes_again():
+    """Six half waves take 0.1 s at 30 Hz."""
+    once, again = shaking(0.15, 1), shaking(0.3, 1)
+    assert (once.fault[0], once.shaken.tolist()) == (SHAKES, [0.0, 1.0])
+    assert (again.fault[0], again.shaken.tolist()) == (STILL_SHAKES, [0.0, 1.0])
+    assert shaking(0.15, 0, 1).shaken.tolist() == [1.0, 1.0]
+    faded, calmed = np.zeros(1), np.zeros(2)
+    for _ in range(100):
+        torque_sensors.fade(once, faded, is_off=False, dt=DT)
+        torque_sensors.calm(once, calmed, DT)
+    assert faded[0] == 0.0
+    np.testing.assert_allclose(calmed, [0.0, 1.0], atol=1e-6)
+
+
+def test_joint_that_begins_to_shake_later_is_calmed_as_well():
+    state, work = new()
+    for k in range(300):
+        joint = k // 150
+        r = 3.0 * np.sin(2.0 * np.pi * 30.0 * k * DT) * np.eye(2)[joint] * LIMIT / 80.0
+        torque_sensors.watch_shaking(state, work, LIMIT, r, DT)
+    assert (state.fault[0], state.shaken.tolist()) == (SHAKES, [1.0, 1.0])
+
+
+def test_efforts_that_are_off_are_found_after_r_has_shaken():
+    """Whether they are commands is not asked: what shakes says nothing about that."""
+    state = shaking(0.15, 1)
+    assert state.is_distinct[0] == 1.0
+    torque_sensors.note_fault(state, OFF, 0)
+    assert (state.fault[0], state.joint[0]) == (OFF, 0)
+    torque_sensors.note_fault(state, STILL_SHAKES, 1)
+    assert (state.fault[0], state.joint[0]) == (OFF, 0)
 
 
 def off(difference, speed, seconds):
@@ -130,11 +175,14 @@ def test_r_fades_out_and_comes_back_smoothly_and_stays_whole_without_doubt():
     assert faded[0] == 0.0
     torque_sensors.fade(state, faded, is_off=True, dt=0.02)
     assert faded[0] == pytest.approx(1.0 - np.exp(-1.0))
-    assert torque_sensors.is_fading(faded)
+    still = np.zeros(2)
+    assert torque_sensors.is_fading(faded, still)
+    assert not torque_sensors.is_fading(np.ones(1), still)
+    assert torque_sensors.is_fading(np.ones(1), np.array([0.0, 0.5]))
     for _ in range(500):
         torque_sensors.fade(state, faded, is_off=False, dt=DT)
     assert faded[0] == 0.0
-    state.fault[0] = SHAKES
+    state.fault[0] = STILL_SHAKES
     torque_sensors.fade(state, faded, is_off=False, dt=0.005)
     assert faded[0] == pytest.approx(1.0 - np.exp(-1.0))
 

@@ -210,7 +210,8 @@ def step(
     if state.sensors.fault[0] != fault:
         oscillation.forget_all(checks.oscillation)  # r may have been the cause
         return flags | NOT_SENSORS
-    if oscillates and not torque_sensors.is_fading(state.observer.faded):
+    r = state.observer
+    if oscillates and not torque_sensors.is_fading(r.faded, r.calmed):
         return flags | OSCILLATES
     return flags
 

@@ -25,7 +25,7 @@ known, and a load heavier.  So r fades out for good where
   that of the links, in the geometric mean of the joints.  The mean squares are those of
   what changes faster than `_SLOWEST`.  Between sensor and command are motor and friction,
   also those that a torque loop leaves: they are known to be there as soon as the mean
-  exceeds `_DISTINCT`, and then this question is not asked again.
+  exceeds `_DISTINCT`, and then this question is not asked again, nor once r has shaken.
 - *efforts do not follow*: drives with a loop around sensors make of them what is commanded,
   whatever load or contact is behind.  An effort that is off by `_OFF` of the torque limit
   leaves r out while that lasts, and if it lasts while the arm follows its reference, for
@@ -127,6 +127,7 @@ def watch_shaking(
         if oscillation.oscillates(state.shaking, i):
             note_fault(state, STILL_SHAKES if state.shaken[i] == 1.0 else SHAKES, i)
             note_shaken(state)
+            state.is_distinct[0] = 1.0  # what shakes says nothing about commands
             oscillation.forget_all(state.shaking)
 
 
@@ -179,7 +180,7 @@ def decide(state: State) -> None:
             nearest = i
     if product < equal:
         note_fault(state, COMMANDS, nearest)
-    if product > distinct or state.fault[0] > SHAKES:
+    if product > distinct or state.fault[0] != NONE:
         state.is_distinct[0] = 1.0
 
 
@@ -231,10 +232,16 @@ def calm(state: State, calmed: Array, dt: float) -> None:
     """Leave what changes fast in r out, for good, where it has shaken."""
     share = filter_gain(_SHAKEN, dt)
     for i in range(calmed.size):
-        calmed[i] += share * (state.shaken[i] - calmed[i])
+        if state.shaken[i] == 1.0 and calmed[i] < 1.0:
+            calmed[i] += share * (1.0 - calmed[i])
+            if 1.0 - calmed[i] < _NOTHING:
+                calmed[i] = 1.0
 
 
 @inner
-def is_fading(faded: Array) -> bool:
-    """Whether some of r is left out, and not all yet."""
-    return bool(0.0 < faded[0] < 1.0)
+def is_fading(faded: Array, calmed: Array) -> bool:
+    """Whether more of r is being left out, or comes back; `calmed` (n,) is of each joint."""
+    fades = 0.0 < faded[0] < 1.0
+    for i in range(calmed.size):
+        fades = fades or 0.0 < calmed[i] < 1.0
+    return bool(fades)

@@ -19,18 +19,16 @@ _DRIVER = (
     '. A driver of `blf_dsc drive` knows robot.effort of its robot, and takes no other: with one, '
     'set disturbance.observer_bandwidth to 0'
 )
+_SHAKES = (
+    'joint {joint!r} %s by the load observer: a gear is softer than is known, efforts are not '
+    'those of joint torque sensors, or positions are those of the motors; %s. If there are no '
+    'such sensors, set robot.effort to unknown and robot.torque_loop to false; else commission '
+    f'the arm, or set disturbance.observer_bandwidth to 0{_DRIVER}'
+)
 _TEXTS = {
-    SHAKES: (
-        'joint {joint!r} shakes by the load observer, which follows loads slowly from now on: '
-        'the gear is softer than robot.stiffness, or its efforts are not those of joint '
-        'torque sensors. Commission the arm; or set disturbance.observer_bandwidth to 0'
-    ),
-    STILL_SHAKES: (
-        'joint {joint!r} shakes by the load observer: efforts are not those of joint torque '
-        f'sensors, or positions are those of the motors; {_ALONE}. If so, set robot.effort to '
-        'unknown and robot.torque_loop to false; else disturbance.observer_bandwidth to 0'
-        f'{_DRIVER}'
-    ),
+    SHAKES: _SHAKES
+    % ('shakes', 'it follows loads slowly from now on, where it shakes'),
+    STILL_SHAKES: _SHAKES % ('shakes again', _ALONE),
     COMMANDS: (
         'the efforts are what is commanded, most of all that of joint {joint!r}, and not those '
         f'of joint torque sensors: {_ALONE}. Set robot.effort to commanded if they are commands '
