@@ -39,9 +39,8 @@ _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _LATE = 0.15  # s, by which a change of the arm is found
 _NEAR = 0.1  # s around a reversal in which its torque is compared with friction's
-_TOUCHED = (
-    0.004  # of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
-)
+# of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
+_TOUCHED = 0.004
 _ALLOWED_F, _ALLOWED_C = 0.5, 2.0  # a over f, and over c
 
 # Rows of the sums over products of s_h, b_h and e_h
@@ -113,14 +112,14 @@ def add_row(
     Return whether that shows its friction since this row, `dt` [s] after the last.  k is k^.
     """
     shown, now = state.shown, state.shown.present
-    before = shown_energy(settings, shown, i, k)
+    was_shown = counted(settings, shown, i, k) > 0.0
     now[_SE, i] += weight * s * e
     now[_BE, i] += weight * b * e
     now[_SS, i] += weight * s * s
     now[_SB, i] += weight * s * b
     now[_BB, i] += weight * b * b
     add_torque(state, i, weight * s * s, weight * e * e, dt)
-    return find_last(settings, shown, i, k, before)
+    return find_last(settings, shown, i, k, was_shown)
 
 
 @inner
@@ -137,15 +136,15 @@ def add_torque(state: State, i: int, ss: float, ee: float, dt: float) -> None:
 
 @inner
 def find_last(
-    settings: Settings, shown: Shown, i: int, k: float, before: float
+    settings: Settings, shown: Shown, i: int, k: float, was_shown: bool
 ) -> bool:
-    """Compute c_1 of joint i once its reversal shows it; return whether this is the first time.
+    """Compute c_1 of joint i while its reversal shows it; return whether this is the first time.
 
-    `before` is the energy of the reversal a row ago.
+    `was_shown` is whether it did so a row ago.
     """
-    if shown_energy(settings, shown, i, k) <= _SHOWN:
+    if counted(settings, shown, i, k) == 0.0:
         return False
-    is_first = before <= _SHOWN
+    is_first = not was_shown
     if is_first:
         shown.coulomb[1, i] = shown.coulomb[0, i]
     torque = shown.present[_SE, i] + k * shown.present[_BE, i]
@@ -179,9 +178,10 @@ def trust(settings: Settings, shown: Shown, i: int, k: float) -> float:
 
 
 @inner
-def shown_energy(settings: Settings, shown: Shown, i: int, k: float) -> float:
-    """Return p int (g s)_h^2 dt of the present reversal of joint i, as far as it counts."""
-    return trust(settings, shown, i, k) * energy(shown, i, k)
+def counted(settings: Settings, shown: Shown, i: int, k: float) -> float:
+    """Return how much the present reversal of joint i counts; 0 until it shows its friction."""
+    share = trust(settings, shown, i, k)
+    return share if share * energy(shown, i, k) > _SHOWN else 0.0
 
 
 @inner
@@ -191,9 +191,9 @@ def close(settings: Settings, shown: Shown, i: int, k: float) -> None:
     Otherwise they are the beginning of the next.
     """
     latest, sums = shown.present, shown.past
-    if shown_energy(settings, shown, i, k) <= _SHOWN:
+    share = counted(settings, shown, i, k)
+    if share == 0.0:
         return
-    share = trust(settings, shown, i, k)
     excess = sums[_SS, i] + share * latest[_SS, i] - _ENERGY
     keep = 1.0
     if excess > 0.0:
@@ -231,9 +231,7 @@ def learned(
     pull = _PRIOR * f * f / settings.variance[i]
     sums = shown.past
     latest = shown.present
-    share = 0.0
-    if shown_energy(settings, shown, i, k_now) > _SHOWN:
-        share = trust(settings, shown, i, k_now)
+    share = counted(settings, shown, i, k_now)
     se = sums[_SE, i] + share * latest[_SE, i] + pull * settings.initial[i]
     be = sums[_BE, i] + share * latest[_BE, i]
     ss = sums[_SS, i] + share * latest[_SS, i] + pull

@@ -43,7 +43,7 @@ from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.lag import filter_gain
 
 NONE, SHAKES, STILL_SHAKES, COMMANDS, OFF = range(5)
-"""What is wrong with the efforts, if anything: the larger, the worse."""
+"""What is wrong with the efforts, if anything; beyond SHAKES all of r is left out."""
 
 _FADE = 0.02  # s, time constant with which r is left out or comes back
 _SHAKEN = 0.005  # s, likewise of one that shakes: it may grow threefold in 10 ms

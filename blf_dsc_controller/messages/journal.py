@@ -48,7 +48,9 @@ class EventType(str, Enum):
     TARE = 'tare'  # the external torque of the arm at rest is taken for zero
     CONTACT = 'contact'  # something touches the arm
     OSCILLATION = 'oscillation'  # the arm oscillates
-    TORQUE_SENSORS = 'torque sensors'  # efforts are not those of sensors, or shake the arm
+    TORQUE_SENSORS = (
+        'torque sensors'  # efforts are not those of sensors, or shake the arm
+    )
     STOP = 'stop'
     SILENCE = 'silence'  # of the joint states, in which the watchdog commanded
     DEACTIVATE = 'deactivate'
