@@ -100,6 +100,9 @@ class Reversals:
         self.k = np.zeros(n)
         self.past = np.zeros((n, 2, 3))  # of [[ss, sb, se], [sb, bb, be]]
         self.latest = np.zeros((n, 2, 3))
+        self.recent = np.zeros((n, 3))  # p int s_h^2, e_h^2 and 1, faded in 0.1 s
+        self.usual = np.zeros((n, 2))  # p int e_h^2 and 1 away from reversals, in 4 s
+        self.around = np.zeros((n, 2))  # and around the present reversal
         self.c1 = self.c0.copy()
         self.c2 = self.c0.copy()
         self.delta = np.zeros(n)
@@ -148,27 +151,52 @@ class Reversals:
         weights = np.array([1.0, self.k[i]])
         return weights @ self.latest[i, :, :2] @ weights
 
+    def counted(self, i):
+        """Return how much the present reversal counts: 0 until it shows its friction."""
+        energy = self.energy(i)
+        if energy <= 0.0:
+            return 0.0
+        torque = np.array([1.0, self.k[i]]) @ self.latest[i, :, 2]
+        misfit = self.around[i, 0] - torque**2 / energy
+        if self.usual[i, 1] > 0.0:
+            misfit -= 2.0 * self.around[i, 1] * self.usual[i, 0] / self.usual[i, 1]
+        pull = 0.015 * self.f[i] ** 2 / self.gains.variance[self.of][i]
+        c = (self.past[i, 0, 2] + pull * self.c0[i]) / (self.past[i, 0, 0] + pull)
+        allowed = (0.5 * self.f[i]) ** 2 + (2.0 * c) ** 2
+        share = allowed / (allowed + max(0.0, misfit) / energy)
+        return share if share * energy > 0.05 else 0.0
+
     def close(self, i):
-        """Add the present reversal to the past ones."""
-        is_shown = self.energy(i) > 0.06
-        total = self.past[i, 0, 0] + self.latest[i, 0, 0]
+        """Add the present reversal to the past ones, if it has shown its friction."""
+        share = self.counted(i)
+        if share == 0.0:
+            return
+        total = self.past[i, 0, 0] + share * self.latest[i, 0, 0]
         if total > 1.0:
             self.past[i] *= max(0.0, 1.0 - (total - 1.0) / self.past[i, 0, 0])
-        self.past[i] += self.latest[i]
+        self.past[i] += share * self.latest[i]
         self.latest[i] = 0.0
-        if not is_shown:
-            return
+        self.around[i] = 0.0
         c, k = self.solution(i)
         apart = dead_zone(np.array([self.c1[i], self.c2[i]]) - c, self.f[i])
         if apart[0] * apart[1] > 0.0:
             level = 0.5 * (self.c1[i] + self.c2[i])
             self.past[i, :, 2] = self.past[i, :, :2] @ [level, level * k]
 
+    def add_around(self, i, products, dt):
+        """Add p (s_h^2, e_h^2, 1) dt to what is around the reversal, or else to the usual."""
+        was_near = self.recent[i, 0] > 0.004
+        self.recent[i] = exp(-dt / 0.1) * self.recent[i] + products
+        if self.recent[i, 0] <= 0.004:
+            self.usual[i] = exp(-dt / 4.0) * self.usual[i] + products[1:]
+        else:
+            self.around[i] += products[1:] if was_near else self.recent[i, 1:]
+
     def solution(self, i):
         """Return c and k by all sums."""
         g = self.gains
         pull = 0.015 * self.f[i] ** 2 / g.variance[self.of][i]
-        sums = self.past[i] + self.latest[i]
+        sums = self.past[i] + self.counted(i) * self.latest[i]
         A = sums[:, :2] + np.diag([pull, 0.1 * pull])
         B = sums[:, 2] + np.array([pull * self.c0[i], 0.0])
         c, extra = np.linalg.solve(A, B)
@@ -199,19 +227,23 @@ class Reversals:
         if self.age <= g.learning_start - g.window * dt:
             self.high[0] = x
             self.high[1] = 0.0
+            return
         for k in range(2):
             self.high[k] = lag(self.high[k], x, gain)
             x = x - self.high[k]
         for i in range(g.n):
-            before = self.energy(i)
+            was_shown = self.counted(i) > 0.0
             self.latest[i] += g.pole * dt * np.outer(x[i, :2], x[i])
-            energy = self.energy(i)
-            if energy <= 0.06:
+            self.add_around(
+                i, g.pole * dt * np.array([x[i, 0] ** 2, x[i, 2] ** 2, 1.0]), dt
+            )
+            if self.counted(i) == 0.0:
                 continue
-            if before <= 0.06:
+            if not was_shown:
                 self.c2[i] = self.c1[i]
                 self.least[i] = 0.0
                 self.most[i] = 0.0
+            energy = self.energy(i)
             c = np.array([1.0, self.k[i]]) @ self.latest[i, :, 2] / energy
             self.c1[i] = np.clip(c, g.least[self.of][i], g.most[self.of][i])
 

@@ -260,14 +260,14 @@ def reversing_law():
 
 def close_reversal(law):
     settings, state = law.settings.friction, law.state.friction
-    shown = state.reversals.shown
-    reversals.close(settings.reversals, shown, 0, state.breakaway[0])
+    reversals.close(settings.reversals, state.reversals, 0, state.breakaway[0])
 
 
 def learned_friction(law):
     """Return the Coulomb friction of its first joint [N m], and what breakaway adds to that."""
-    shown = law.state.friction.reversals.shown
-    return reversals.learned(law.settings.friction.reversals, shown, 0)
+    settings, state = law.settings.friction, law.state.friction
+    k = state.breakaway[0]
+    return reversals.learned(settings.reversals, state.reversals, 0, k)
 
 
 def reverse(law, coulomb, number):
@@ -279,7 +279,7 @@ def reverse(law, coulomb, number):
         for _ in range(300):
             state.friction.shape_lags[0, 2, 0] = sign
             state.row.filter2[0, -1] = coulomb * sign
-            measure_reversals(settings, state, 0.001)
+            measure_reversals(settings, state, law.signals, 0.001)
 
 
 @pytest.mark.parametrize(
@@ -312,10 +312,10 @@ def test_friction_is_not_forgotten_at_rest():
     before = learned_friction(law)
     assert before[0] == pytest.approx(0.4, abs=0.02)
     for _ in range(3_000):
-        measure_reversals(settings, state, 0.001)
+        measure_reversals(settings, state, law.signals, 0.001)
     assert learned_friction(law) == before
     state.latch.latched[0] = 0.0
-    measure_reversals(settings, state, 0.001)
+    measure_reversals(settings, state, law.signals, 0.001)
     assert state.friction.since_latch[0] == 0.0
 
 

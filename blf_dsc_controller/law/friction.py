@@ -199,8 +199,7 @@ def follow_motion(settings: Settings, state: State, work: Work) -> None:
             extremes[1, i] = max(extremes[1, i], drift[i])
             drift[i] = 0.0
         if not moves and state.moves[i] == 1.0:
-            shown = state.reversals.shown
-            reversals.close(settings.reversals, shown, i, state.breakaway[i])
+            reversals.close(settings.reversals, state.reversals, i, state.breakaway[i])
         state.moves[i] = 1.0 if moves else 0.0
 
 
@@ -273,6 +272,8 @@ def measure_reversals(
         s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
         b_h = high_pass(lags[1], i, gain, state.shape_lags[1, 2, i], begins)
         e_h = high_pass(state.torque_lags, i, gain, e, begins)
+        if begins:
+            continue
         k = state.breakaway[i]
         if reversals.add_row(
             settings.reversals, state.reversals, i, s_h, b_h, e_h, weight, k, dt
@@ -295,12 +296,12 @@ def return_estimate(
     """Set c^, in theta^ (m,), and k^ to what reversals show, if it is learned and `active` (m,)."""
     if settings.learns == 0:
         return
-    of, shown = settings.reversals, state.reversals.shown
+    of = settings.reversals
     for i in range(of.initial.size):
         j = settings.first_coulomb + i
         if active[j] == 1.0 and settings.gain[i] > 0.0:
             coulomb, state.breakaway[i] = reversals.learned(
-                of, shown, i, state.breakaway[i]
+                of, state.reversals, i, state.breakaway[i]
             )
             estimate[j] = clip(coulomb, of.least[i], of.most[i])
 
@@ -320,13 +321,15 @@ def follow_reversals(
     """
     if settings.learns == 0:
         return
-    of, shown = settings.reversals, state.reversals.shown
+    of = settings.reversals
     for i in range(of.initial.size):
         j = settings.first_coulomb + i
         work.breakaway_error[i] = 0.0
         if active[j] == 0.0:
             continue
-        coulomb, stribeck = reversals.learned(of, shown, i, state.breakaway[i])
+        coulomb, stribeck = reversals.learned(
+            of, state.reversals, i, state.breakaway[i]
+        )
         rate[j] = coulomb - estimate[j]
         work.breakaway_error[i] = stribeck - state.breakaway[i]
 

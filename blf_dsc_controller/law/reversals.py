@@ -16,10 +16,11 @@ more than the unmodelled torque f, they overrule what is older.
 What pushes the arm as a joint reverses, or a load that comes on, leaves steps of its own in e_h,
 earlier or later than that of friction.  So a reversal counts by
 
-    1 / (1 + (d / a)^2),    d^2 p int (g s)_h^2 dt = p int (e_h - c_1 (g s)_h)^2 dt
+    1 / (1 + (d / a)^2),    d^2 p int (g s)_h^2 dt = p int (e_h - c_1 (g s)_h)^2 - `_CHANCE` n^2 dt
 
 where d is the friction whose step would be as large as what the friction c_1 of this reversal
-leaves of the torque around it, and a what the shape g s is wrong by: a part of f, and of c.
+leaves of the torque around it, n the rms of e_h away from reversals, its noise, and a what the
+shape g s is wrong by: a part of f, and of c.
 
 If the arm has changed, what reversals have shown since some 0.2 s before that was found
 is taken back: a load that comes on in a reversal looks like the step of friction.
@@ -39,6 +40,8 @@ _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _LATE = 0.15  # s, by which a change of the arm is found
 _NEAR = 0.1  # s around a reversal in which its torque is compared with friction's
+_USUAL = 4.0  # s, of what is away from reversals: its noise
+_CHANCE = 2.0  # times its mean square
 # of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
 _TOUCHED = 0.004
 _ALLOWED_F, _ALLOWED_C = 0.5, 2.0  # a over f, and over c
@@ -63,7 +66,9 @@ class Shown(NamedTuple):
     # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
     past: Annotated[Array, 5, 'n']
     present: Annotated[Array, 5, 'n']  # likewise, over the present one
-    torque: Annotated[Array, 'n']  # p int e_h^2 dt around the present one, (N m)^2
+    # p int of e_h^2 dt [(N m)^2] and of dt, around the present one
+    torque: Annotated[Array, 'n']
+    span: Annotated[Array, 'n']
     # Coulomb friction by the last reversal and the one before, N m
     coulomb: Annotated[Array, 2, 'n']
 
@@ -75,8 +80,10 @@ class State(NamedTuple):
     earlier: Shown  # some `_LATE` ago or less
     earliest: Shown  # one to two times as long ago
     since_kept: Cell  # s
-    # p int of s_h^2 and e_h^2 dt [(N m)^2], faded by `_NEAR`
-    recent: Annotated[Array, 2, 'n']
+    # p int of s_h^2, e_h^2 [(N m)^2] and 1 dt, faded by `_NEAR`
+    recent: Annotated[Array, 3, 'n']
+    # p int of e_h^2 dt and dt away from reversals, faded by `_USUAL`
+    usual: Annotated[Array, 2, 'n']
 
 
 @inner
@@ -111,39 +118,62 @@ def add_row(
 
     Return whether that shows its friction since this row, `dt` [s] after the last.  k is k^.
     """
-    shown, now = state.shown, state.shown.present
-    was_shown = counted(settings, shown, i, k) > 0.0
+    now = state.shown.present
+    was_shown = counted(settings, state, i, k) > 0.0
     now[_SE, i] += weight * s * e
     now[_BE, i] += weight * b * e
     now[_SS, i] += weight * s * s
     now[_SB, i] += weight * s * b
     now[_BB, i] += weight * b * b
-    add_torque(state, i, weight * s * s, weight * e * e, dt)
-    return find_last(settings, shown, i, k, was_shown)
+    add_torque(state, i, s * s, e * e, weight, dt)
+    return find_last(settings, state, i, k, was_shown)
 
 
 @inner
-def add_torque(state: State, i: int, ss: float, ee: float, dt: float) -> None:
-    """Add p e_h^2 dt of joint i to that of its reversal, from `_NEAR` before it to after it."""
-    recent = state.recent
+def add_torque(
+    state: State, i: int, ss: float, ee: float, weight: float, dt: float
+) -> None:
+    """Add e_h^2 of joint i to the torque around its reversal, from `_NEAR` before it to after it.
+
+    The row's `weight` is p dt, with `dt` [s]; away from reversals e_h is noise.
+    """
+    recent, usual, shown = state.recent, state.usual, state.shown
     reversed_before = recent[0, i] > _TOUCHED
-    kept = 1.0 - filter_gain(_NEAR, dt)
-    recent[0, i] = kept * recent[0, i] + ss
-    recent[1, i] = kept * recent[1, i] + ee
-    if recent[0, i] > _TOUCHED:
-        state.shown.torque[i] += ee if reversed_before else recent[1, i]
+    fade(recent, i, _NEAR, dt)
+    recent[0, i] += weight * ss
+    recent[1, i] += weight * ee
+    recent[2, i] += weight
+    if recent[0, i] <= _TOUCHED:
+        fade(usual, i, _USUAL, dt)
+        usual[0, i] += weight * ee
+        usual[1, i] += weight
+    elif reversed_before:
+        shown.torque[i] += weight * ee
+        shown.span[i] += weight
+    else:
+        shown.torque[i] += recent[1, i]
+        shown.span[i] += recent[2, i]
+
+
+@inner
+def fade(sums: Array, i: int, time_constant: float, dt: float) -> None:
+    """Let the sums of joint i fade for `dt` [s]."""
+    kept = 1.0 - filter_gain(time_constant, dt)
+    for row in range(sums.shape[0]):
+        sums[row, i] *= kept
 
 
 @inner
 def find_last(
-    settings: Settings, shown: Shown, i: int, k: float, was_shown: bool
+    settings: Settings, state: State, i: int, k: float, was_shown: bool
 ) -> bool:
     """Compute c_1 of joint i while its reversal shows it; return whether this is the first time.
 
     `was_shown` is whether it did so a row ago.
     """
-    if counted(settings, shown, i, k) == 0.0:
+    if counted(settings, state, i, k) == 0.0:
         return False
+    shown = state.shown
     is_first = not was_shown
     if is_first:
         shown.coulomb[1, i] = shown.coulomb[0, i]
@@ -162,36 +192,40 @@ def energy(shown: Shown, i: int, k: float) -> float:
 
 
 @inner
-def trust(settings: Settings, shown: Shown, i: int, k: float) -> float:
+def trust(settings: Settings, state: State, i: int, k: float) -> float:
     """Return how much the present reversal of joint i counts: 1 where e_h is that of friction."""
+    shown, usual = state.shown, state.usual
     of_friction = energy(shown, i, k)
     if of_friction <= 0.0:
         return 0.0
     torque = shown.present[_SE, i] + k * shown.present[_BE, i]
-    misfit = max(0.0, shown.torque[i] - torque * torque / of_friction)
+    misfit = shown.torque[i] - torque * torque / of_friction
+    if usual[1, i] > 0.0:
+        misfit -= _CHANCE * shown.span[i] * usual[0, i] / usual[1, i]
     f = settings.unmodelled[i]
     pull = _PRIOR * f * f / settings.variance[i]
     c = shown.past[_SE, i] + pull * settings.initial[i]
     c /= shown.past[_SS, i] + pull
     allowed = (_ALLOWED_F * f) ** 2 + (_ALLOWED_C * c) ** 2
-    return float(allowed * of_friction / (allowed * of_friction + misfit))
+    return float(allowed * of_friction / (allowed * of_friction + max(0.0, misfit)))
 
 
 @inner
-def counted(settings: Settings, shown: Shown, i: int, k: float) -> float:
+def counted(settings: Settings, state: State, i: int, k: float) -> float:
     """Return how much the present reversal of joint i counts; 0 until it shows its friction."""
-    share = trust(settings, shown, i, k)
-    return share if share * energy(shown, i, k) > _SHOWN else 0.0
+    share = trust(settings, state, i, k)
+    return share if share * energy(state.shown, i, k) > _SHOWN else 0.0
 
 
 @inner
-def close(settings: Settings, shown: Shown, i: int, k: float) -> None:
+def close(settings: Settings, state: State, i: int, k: float) -> None:
     """Add the sums of the present reversal of joint i to those of all, if it shows its friction.
 
     Otherwise they are the beginning of the next.
     """
+    shown = state.shown
     latest, sums = shown.present, shown.past
-    share = counted(settings, shown, i, k)
+    share = counted(settings, state, i, k)
     if share == 0.0:
         return
     excess = sums[_SS, i] + share * latest[_SS, i] - _ENERGY
@@ -201,14 +235,15 @@ def close(settings: Settings, shown: Shown, i: int, k: float) -> None:
     for row in range(5):
         sums[row, i] = keep * sums[row, i] + share * latest[row, i]
         latest[row, i] = 0.0
-    shown.torque[i] = 0.0
-    overrule(settings, shown, i)
+    shown.torque[i] = shown.span[i] = 0.0
+    overrule(settings, state, i)
 
 
 @inner
-def overrule(settings: Settings, shown: Shown, i: int) -> None:
+def overrule(settings: Settings, state: State, i: int) -> None:
     """Give the sums of joint i the friction of the last two reversals if both contradict them."""
-    coulomb, stribeck = learned(settings, shown, i, 0.0)
+    coulomb, stribeck = learned(settings, state, i, 0.0)
+    shown = state.shown
     found = shown.coulomb
     band = settings.unmodelled[i]
     last = beyond(found[0, i] - coulomb, band)
@@ -224,14 +259,14 @@ def overrule(settings: Settings, shown: Shown, i: int) -> None:
 
 @inner
 def learned(
-    settings: Settings, shown: Shown, i: int, k_now: float
+    settings: Settings, state: State, i: int, k_now: float
 ) -> tuple[float, float]:
     """Return c [N m] and k of joint i by all sums, k within its limits; `k_now` is k^."""
     f = settings.unmodelled[i]
     pull = _PRIOR * f * f / settings.variance[i]
-    sums = shown.past
-    latest = shown.present
-    share = counted(settings, shown, i, k_now)
+    sums = state.shown.past
+    latest = state.shown.present
+    share = counted(settings, state, i, k_now)
     se = sums[_SE, i] + share * latest[_SE, i] + pull * settings.initial[i]
     be = sums[_BE, i] + share * latest[_BE, i]
     ss = sums[_SS, i] + share * latest[_SS, i] + pull
@@ -274,7 +309,7 @@ def take_back(state: State, breakaway: Array) -> None:
         if energy(shown, i, breakaway[i]) <= _SHOWN:
             for row in range(5):
                 shown.present[row, i] = 0.0
-            shown.torque[i] = 0.0
+            shown.torque[i] = shown.span[i] = 0.0
     copy(shown, state.earliest)
     copy(shown, state.earlier)
 
@@ -289,3 +324,4 @@ def copy(source: Shown, out: Shown) -> None:
         for row in range(2):
             out.coulomb[row, i] = source.coulomb[row, i]
         out.torque[i] = source.torque[i]
+        out.span[i] = source.span[i]
