@@ -226,12 +226,24 @@ def test_calmed_r_gives_up_at_once_what_is_learned():
     np.testing.assert_allclose(d3, 0.0, atol=1e-6)
 
 
-def test_sensors_are_trusted_unless_something_speaks_against_them():
+@pytest.mark.parametrize(
+    ('enabled', 'rows', 'faded', 'senses'),
+    [
+        (1, 1.0, 0.0, True),
+        (0, 1.0, 0.0, False),
+        (1, 0.0, 0.0, False),
+        (1, 1.0, 0.1, False),
+    ],
+)
+def test_friction_is_sensed_once_sensors_are_read_and_while_they_are_trusted(
+    enabled, rows, faded, senses
+):
+    settings = SimpleNamespace(observer=SETTINGS._replace(enabled=enabled))
     state, _ = new()
-    assert load_observer.is_trusted(SETTINGS, state)
-    assert not load_observer.is_trusted(SETTINGS._replace(enabled=0), state)
-    state.faded[0] = 0.1
-    assert not load_observer.is_trusted(SETTINGS, state)
+    state.faded[0] = faded
+    motors = SimpleNamespace(rows=np.array([rows]))
+    given = SimpleNamespace(observer=state, motors=motors)
+    assert learning.senses_friction(settings, given) == senses
 
 
 def test_readings_are_missing_if_one_is():

@@ -75,6 +75,16 @@ def observe(
 
 
 @inner
+def senses_friction(settings: Settings, state: State) -> bool:
+    """Whether joint torque sensors have shown friction, and nothing speaks against them."""
+    return bool(
+        settings.observer.enabled == 1
+        and state.motors.rows[0] > 0.0
+        and state.observer.faded[0] == 0.0
+    )
+
+
+@inner
 def add_friction_row(settings: Settings, state: State, signals: Signals) -> None:
     """Add the row to those that show the friction of the motors, unless a sensor is silent."""
     of, now, row = settings.motors, state.motors, signals.row.Xu
@@ -251,7 +261,7 @@ def measure_reversals(
     latch, rows = state.latch, state.window.rows[0]
     length = settings.window.length
     since_latch = friction.update_since_latch(state.friction, latch.latched[0], period)
-    if load_observer.is_trusted(settings.observer, state.observer):
+    if senses_friction(settings, state):
         settled = rows * period * settings.row.filter_pole >= prediction.SETTLED
         begins = not settled or load_observer.is_missing(signals.effort)
     else:
@@ -271,7 +281,7 @@ def measure_reversals(
 @inner
 def fill_unexplained(settings: Settings, state: State, signals: Signals) -> None:
     """Write e, what all but Coulomb friction leaves of the torque, where `friction` reads it."""
-    senses = load_observer.is_trusted(settings.observer, state.observer)
+    senses = senses_friction(settings, state)
     rotors = settings.observer.rotors
     for i in range(settings.n):
         row, own = state.row.filter2[i], settings.friction.first_coulomb + i
@@ -333,7 +343,7 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
     What is not learned from the window stays: Coulomb friction is of reversals, and the other
     friction of the sensors, if there are any.
     """
-    senses = load_observer.is_trusted(settings.observer, state.observer)
+    senses = senses_friction(settings, state)
     before = signals.adaptation.tracked  # scratch here
     for j in range(settings.m):
         before[j] = state.estimate[j]
@@ -418,7 +428,7 @@ def adapt(
             estimate,
             work.rate,
         )
-        if load_observer.is_trusted(settings.observer, state.observer):
+        if senses_friction(settings, state):
             motor_friction.follow_columns(
                 state.motors,
                 settings.initial_estimate,

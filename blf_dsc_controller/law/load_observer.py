@@ -110,12 +110,6 @@ def is_missing(effort: Array) -> bool:
 
 
 @inner
-def is_trusted(settings: Settings, state: State) -> bool:
-    """Whether there are joint torque sensors, and nothing speaks against them."""
-    return bool(settings.enabled == 1 and state.faded[0] == 0.0)
-
-
-@inner
 def filter_interval(
     settings: Settings, state: State, i: int, row: Array, effort: float, dt: float
 ) -> None:
