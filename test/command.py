@@ -35,6 +35,11 @@ NO_PICTURES = {'PYTHONPATH': os.pathsep.join(filter(None, _PLACES))}
 """Variable by which commands write empty pictures."""
 
 
+def own_address():
+    """Return an address of this computer, drawn from 16 million: no other test is at it."""
+    return f'127.{".".join(str(1 + byte % 254) for byte in os.urandom(3))}'
+
+
 def closed_loop(*arguments, pictures=False):
     """Run the command to completion."""
     environment = os.environ | ({} if pictures else NO_PICTURES)
@@ -60,6 +65,19 @@ def wait_for(condition, patience=PATIENCE):
         time.sleep(0.02)
 
 
+def children_of(pid):
+    """Return the ids of the processes that a process has started."""
+    text = Path(f'/proc/{pid}/task/{pid}/children').read_text()
+    return [int(child) for child in text.split()]
+
+
+def child_of(pid, module):
+    """Return the id of the one that runs a module."""
+    children = children_of(pid)
+    (found,) = (c for c in children if module in Path(f'/proc/{c}/cmdline').read_text())
+    return found
+
+
 class Running:
     """An endless run, until the test ends it."""
 
@@ -75,24 +93,12 @@ class Running:
         bag = out / 'bag' / 'bag_0.mcap'
         # 500 kB: some 200 samples have been recorded, each about 2 kB with all topics.
         wait_for(lambda: bag.exists() and bag.stat().st_size > 500_000, COMPILED)
-        self.children = [
-            int(child)
-            for child in Path(
-                f'/proc/{self.process.pid}/task/{self.process.pid}/children'
-            )
-            .read_text()
-            .split()
-        ]
+        self.children = children_of(self.process.pid)
         assert len(self.children) == 2  # recorder and loop
 
     def child(self, module):
         """Return the process id of the child that runs a module."""
-        (found,) = (
-            child
-            for child in self.children
-            if module in Path(f'/proc/{child}/cmdline').read_text()
-        )
-        return found
+        return child_of(self.process.pid, module)
 
     def end(self):
         """Wait for the end; return exit code, output and errors."""

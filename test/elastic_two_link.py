@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A parameter file of two links with elastic joints, postures of it, and shorter motions."""
 
-from blf_dsc_controller.commissioning import motion, response
+from blf_dsc_controller.commissioning import motion, postures, response
 
 BEGIN = (0.1, 0.8)  # rad, where the arm rests
 NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
@@ -32,3 +32,9 @@ def shorten_motions(monkeypatch):
     for module in (motion, response):
         monkeypatch.setattr(module, 'SETTLING', 2.0)
     monkeypatch.setattr(motion, '_SECONDS', 2.0)
+
+
+def shorten_moves(monkeypatch):
+    """Let moves to a posture take as little time as they may, in place of 1 to 2 s more."""
+    monkeypatch.setattr(postures, 'SPEED', 2.0)
+    monkeypatch.setattr(postures, '_ACCELERATION', 8.0)

@@ -73,6 +73,8 @@ class Rig:
         self.guard = self.controller()
         self.plant = plant_of(build(PlantConfig, plant or {}))
         self.input = TorqueInput(len(JOINTS))
+        self._encoder = Float64MultiArrayEncoder(len(JOINTS))
+        self._received = Float64MultiArrayDecoder(len(JOINTS))
         self.commands = []  # all torques commanded
         self.push = np.zeros(2)
         self.sense = lambda state: [state.raw()]  # messages sent for a state
@@ -112,10 +114,9 @@ class Rig:
         if torque is None:
             return
         self.commands.append(torque.copy())
-        for raw in self.actuate(Float64MultiArrayEncoder(2).encode(torque)):
-            decoder = Float64MultiArrayDecoder(2)
-            size = decoder.decode(raw)
-            self.input.take(size, decoder.values, self.plant.sample)
+        for raw in self.actuate(self._encoder.encode(torque)):
+            size = self._received.decode(raw)
+            self.input.take(size, self._received.values, self.plant.sample)
 
     def step(self, count=1):
         """Advance by `count` milliseconds: measure, deliver, run the watchdog if due, move."""

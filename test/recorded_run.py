@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import resource
 import subprocess
+import sys
 from collections import Counter, defaultdict
 from contextlib import contextmanager, suppress
 
@@ -157,14 +158,19 @@ def small_disk(path, megabytes):
 
 @contextmanager
 def limited_files(path, size):
-    """Let no file grow beyond a size [bytes], as anybody may; return a new folder."""
+    """Let no file grow beyond a size [bytes], as anybody may; return a new folder.
+
+    Python would keep what it has written of the bytecode of a module that is imported meanwhile.
+    """
     path.mkdir()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    writing, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
         yield path
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        sys.dont_write_bytecode = writing
 
 
 # A made-up run, in which every number is known in advance.

@@ -17,7 +17,7 @@ from runpy import run_path
 
 import numpy as np
 import pytest
-from command import finished, wait_for
+from command import children_of, finished, wait_for
 from recorded_run import limited_files
 
 from blf_dsc_controller.cli.parser import make_parser
@@ -284,10 +284,6 @@ def test_ctrl_c_ends_the_processes_that_precompile_in_one_line(tmp_path, moment)
     assert said == ['blf_dsc precompile: interrupted']
     wait_for(lambda: not any(Path(f'/proc/{each}').exists() for each in children))
     assert not [*tmp_path.rglob('*.tmp.*')]
-
-
-def children_of(pid):
-    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
 
 
 @pytest.mark.parametrize('name', ['monte-carlo', 'run over ROS'])

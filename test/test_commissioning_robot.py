@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from elastic_two_link import ARM, BEGIN, FAR, NEAR, shorten_motions
+from elastic_two_link import ARM, BEGIN, FAR, NEAR, shorten_motions, shorten_moves
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
@@ -56,6 +56,7 @@ def whole(tmp_path, monkeypatch):
 def arm(whole, monkeypatch):
     """Return that of an arm which is measured in less time."""
     shorten_motions(monkeypatch)
+    shorten_moves(monkeypatch)
     return whole
 
 
@@ -132,9 +133,9 @@ def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(whole, 
     ('address', 'code', 'printed'),
     [
         ('interrupt@300', 130, 'move 1: ended on request. No gains were chosen'),
-        ('interrupt@7000', 130, 'posture 1: ended on request. No gains were chosen'),
-        ('late@7000', 5, 'posture 1: the controller stopped: the stamp of a joint'),
-        ('reflex@7000', 5, 'posture 1: the robot stopped by itself: joint_reflex; it'),
+        ('interrupt@6000', 130, 'posture 1: ended on request. No gains were chosen'),
+        ('late@6000', 5, 'posture 1: the controller stopped: the stamp of a joint'),
+        ('reflex@6000', 5, 'posture 1: the robot stopped by itself: joint_reflex; it'),
         ('silent@300', 5, 'move 1: the connection was lost: no state for 1 s'),
         ('absent', 1, 'there is no robot: switch it on'),
     ],
@@ -142,7 +143,7 @@ def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(whole, 
 def test_end_before_its_time_is_calm_and_writes_nothing_that_looks_whole(
     address, code, printed, arm, capsys
 ):
-    """The move takes 3.5 s: state 7000 is in the motion, before its period is over."""
+    """The move takes 2.5 s: state 6000 is in the motion, before its period is over."""
     assert commission(arm, address, '--yes') == code
     assert printed in capsys.readouterr().err
     assert nothing_looks_whole(arm)
@@ -242,8 +243,8 @@ def test_request_between_two_runs_starts_no_other(arm):
     assert PlantDriver.last.calls == ['connect']
 
 
-def test_move_is_slow_straight_and_at_rest_at_both_ends(arm):
-    config = blf.load_loop(arm).controller
+def test_move_is_slow_straight_and_at_rest_at_both_ends(whole):
+    config = blf.load_loop(whole).controller
     here, there = np.array(BEGIN), np.array([-2.0, 0.9])
     made = move(config, here, there)
     times = np.linspace(0.0, made.duration, 2001)
@@ -397,15 +398,19 @@ def test_arm_of_which_little_is_known_is_measured_anew_and_its_bag_gives_the_sam
     assert measured.robot.coulomb != ()
 
 
-def test_motion_that_stays_hidden_is_told_after_its_posture(arm, capsys):
-    """Not once all postures have been measured."""
-    coarsen(arm, '5.0e-3')
+def test_motion_that_stays_hidden_is_told_after_its_posture(whole, capsys, monkeypatch):
+    """Not once all postures have been measured.
+
+    An arm that swings after a quick move would show it, over the steps of its encoders.
+    """
+    shorten_motions(monkeypatch)
+    coarsen(whole, '5.0e-3')
     options = ('--yes', '--torque', '0.01', '--travel', '1e-5')
-    assert commission(arm, 'plant', *options, postures=(FAR, NEAR)) == 1
+    assert commission(whole, 'plant', *options, postures=(FAR, NEAR)) == 1
     told = capsys.readouterr().err
     assert 'posture 1: the positions do not show the motion' in told
     assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
-    assert nothing_looks_whole(arm)
+    assert nothing_looks_whole(whole)
 
 
 PROVEN = """
@@ -485,8 +490,8 @@ def test_gains_that_are_not_proven_are_told(
         assert each in told
 
 
-def test_move_takes_half_of_slower_limits(arm):
-    slow = change(blf.load_loop(arm).controller, {'limits.velocity': [0.2, 0.4]})
+def test_move_takes_half_of_slower_limits(whole):
+    slow = change(blf.load_loop(whole).controller, {'limits.velocity': [0.2, 0.4]})
     made = move(slow, np.array(BEGIN), np.array([-2.0, 0.9]))
     times = np.linspace(0.0, made.duration, 2001)
     _, dq, _ = sampled(reference_of(made.config), times).transpose(1, 0, 2)

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
-from elastic_two_link import ARM, NEAR, shorten_motions
+from elastic_two_link import ARM, NEAR, shorten_motions, shorten_moves
 from rclpy.parameter import Parameter
 from ros_rig import PATIENCE, FakeClock
 
@@ -107,6 +107,7 @@ def rig(ros, tmp_path):
 
 def test_arm_is_measured_and_its_bags_give_gains_with_the_margin(rig, monkeypatch):
     shorten_motions(monkeypatch)
+    shorten_moves(monkeypatch)
     found = rig.measured(NEAR)
     assert [name for name, _ in found] == ['posture 1']
     (bag,) = (bag for _, bag in found)
@@ -141,6 +142,7 @@ def test_log_has_oscillations_of_moves_but_not_of_motions_which_shake_the_arm(
 ):
     """Nor an empty warning, where a run begins with fewer than the one before has had."""
     shorten_motions(monkeypatch)
+    shorten_moves(monkeypatch)
     said = []
     silent = SimpleNamespace(warning=said.append, info=str, fatal=str)
     monkeypatch.setattr(rig.node.log, '_log', silent)

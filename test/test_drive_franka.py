@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from command import COMPILED, PATIENCE
+from command import COMPILED, PATIENCE, own_address
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
@@ -48,7 +48,7 @@ BOUND = 0.04  # rad, of the preset
 
 
 class Wire:
-    """Simulators and commands of a test; each simulator has an address of its own.
+    """Simulator and commands of a test, at an address of its own.
 
     Every process is killed when the patience with it ends.
     """
@@ -57,6 +57,7 @@ class Wire:
 
     def __init__(self, folder):
         self.folder = folder
+        self.address = own_address()
         self.processes = []
         self.timers = []
 
@@ -72,14 +73,14 @@ class Wire:
         self.timers[-1].start()
         return process
 
-    def simulate(self, address, *events):
+    def simulate(self, *events):
         """Start a simulator, and wait until it accepts connections."""
-        process = self.start(SIMULATOR, address, *events)
+        process = self.start(SIMULATOR, self.address, *events)
         assert process.stdout.readline().strip() == 'ready'
         return process
 
-    def drive(self, address, duration, *options):
-        words = ['--robot', address, '--duration', duration, *options]
+    def drive(self, duration, *options):
+        words = ['--robot', self.address, '--duration', duration, *options]
         out = ['--out', self.folder / 'bag']
         return self.start('-m', 'blf_dsc_controller', 'drive', *words, *out)
 
@@ -120,9 +121,9 @@ def assert_replays(folder):
 
 def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
     """With topics beside it, where there is ROS."""
-    wire.simulate('127.0.0.11', 'load=2@500', 'load=0@1000')
+    wire.simulate('load=2@500', 'load=0@1000')
     topics = ['--ros'] if importlib.util.find_spec('rclpy') else []
-    code, output = ended(wire.drive('127.0.0.11', 1.5, *topics))
+    code, output = ended(wire.drive(1.5, *topics))
     assert code == 0, output
     assert not any(line.startswith('topics') for line in output.splitlines()), output
     assert 'end effector of 0.73 kg' in output
@@ -140,8 +141,8 @@ def message_counts(wire):
 
 def test_positions_of_motors_are_recorded_and_identification_reads_them(wire):
     """The wire carries them as float32."""
-    wire.simulate('127.0.0.22', 'gears=10000@1')
-    code, output = ended(wire.drive('127.0.0.22', 0.6))
+    wire.simulate('gears=10000@1')
+    code, output = ended(wire.drive(0.6))
     assert code == 0, output
     counts = message_counts(wire)
     # the first state may come before the first torque, with which the cycles begin
@@ -179,9 +180,9 @@ def test_load_that_is_declared_and_not_there_makes_no_step(wire, tmp_path):
     untold = re.sub(r'joint_stiffness: .*', 'inertia: whole', untold)
     untold = re.sub(r' *joint_damping: .*\n', '', untold)
     (tmp_path / 'my.yaml').write_text(untold)
-    wire.simulate('127.0.0.18')
-    assert ended(wire.start('-c', DECLARED, '127.0.0.18'))[0] == 0
-    code, output = ended(wire.drive('127.0.0.18', 1, '--config', tmp_path / 'my.yaml'))
+    wire.simulate()
+    assert ended(wire.start('-c', DECLARED, wire.address))[0] == 0
+    code, output = ended(wire.drive(1, '--config', tmp_path / 'my.yaml'))
     refused = 'more than the 1 N m that its drive tolerates'
     held = 'end           the duration is over'
     assert (held if code == 0 else refused) in output
@@ -201,10 +202,8 @@ def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):
     Steps are those of the motion before the pick-up, and 0.5 % of the torque limit.
     """
     (tmp_path / 'my.yaml').write_text(told_config())
-    wire.simulate('127.0.0.17', 'load=2@2500')
-    code, output = ended(
-        wire.drive('127.0.0.17', 5.5, '--config', tmp_path / 'my.yaml')
-    )
+    wire.simulate('load=2@2500')
+    code, output = ended(wire.drive(5.5, '--config', tmp_path / 'my.yaml'))
     assert code == 0, output
     assert 'no longer declared' not in output
     events = blf.verify(wire.folder / 'bag').events
@@ -226,20 +225,19 @@ def test_weighed_load_is_told_in_motion_and_no_torque_steps(wire, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('address', 'event', 'texts'),
+    ('event', 'texts'),
     [
-        ('127.0.0.12', 'reflex@500', ['the robot stopped by itself', 'recovered']),
+        ('reflex@500', ['the robot stopped by itself', 'recovered']),
         (
-            '127.0.0.13',
             'lose=100@500',
             ['the controller stopped', 'after the last one'],
         ),
-        ('127.0.0.14', 'die@500', ['the connection was lost', 'check its computer']),
+        ('die@500', ['the connection was lost', 'check its computer']),
     ],
 )
-def test_faults_on_the_wire_end_the_run_with_a_reason(wire, address, event, texts):
-    wire.simulate(address, event)
-    code, output = ended(wire.drive(address, 60))
+def test_faults_on_the_wire_end_the_run_with_a_reason(wire, event, texts):
+    wire.simulate(event)
+    code, output = ended(wire.drive(60))
     assert code == 5, output
     assert all(text in output for text in texts), output
     assert_replays(wire.folder / 'bag')
@@ -249,9 +247,9 @@ def test_commissioning_starts_torques_again_for_the_motion_and_ends_with_a_refle
     wire, tmp_path
 ):
     """The move, of 2500 states, is over by then: the reflex is in the motion."""
-    wire.simulate('127.0.0.19', 'reflex@3000')
+    wire.simulate('reflex@3000')
     rest = [0.0, 0.0, 0.0, -1.57, 0.0, 1.57, 0.785]  # rad, where the simulator begins
-    words = ['commission', '--config', 'fr3_direct', '--robot', '127.0.0.19', '--yes']
+    words = ['commission', '--config', 'fr3_direct', '--robot', wire.address, '--yes']
     out = ['--out', tmp_path / 'out.yaml', '--posture', *rest]
     code, output = ended(wire.start('-m', 'blf_dsc_controller', *words, *out))
     assert code == 5, output
@@ -265,12 +263,12 @@ def test_commissioning_starts_torques_again_for_the_motion_and_ends_with_a_refle
 def test_sigterm_ends_at_rest_and_a_killed_command_leaves_a_robot_that_can_be_used(
     wire,
 ):
-    wire.simulate('127.0.0.15')
-    killed = wire.start('-m', 'blf_dsc_controller', 'drive', '--robot', '127.0.0.15')
+    wire.simulate()
+    killed = wire.start('-m', 'blf_dsc_controller', 'drive', '--robot', wire.address)
     wire.until(killed, 'controlling')
     killed.kill()
     killed.wait()
-    process = wire.drive('127.0.0.15', 60)
+    process = wire.drive(60)
     wire.until(process, 'controlling')
     process.send_signal(signal.SIGTERM)
     code, output = ended(process)
@@ -280,9 +278,9 @@ def test_sigterm_ends_at_rest_and_a_killed_command_leaves_a_robot_that_can_be_us
 
 def test_a_script_moves_it_and_takes_command_again_after_a_reflex(wire):
     """The reflex comes in the second motion."""
-    wire.simulate('127.0.0.20', 'reflex@2500')
+    wire.simulate('reflex@2500')
     bag = wire.folder / 'bag'
-    with blf.Drive('fr3_direct', robot='127.0.0.20', record=bag) as arm:
+    with blf.Drive('fr3_direct', robot=wire.address, record=bag) as arm:
         start = arm.state.q
         arm.move_to(start + 0.1)
         np.testing.assert_allclose(arm.state.q, start + 0.1, atol=0.5 * BOUND)
@@ -423,6 +421,6 @@ def test_what_libfranka_raises_in_motion_is_an_error_of_a_driver(
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):
-    code, output = ended(wire.drive('127.0.0.16', 1))
+    code, output = ended(wire.drive(1))
     assert code == 1
     assert 'activate the FCI in Desk' in output

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import COMPILED
+from command import COMPILED, own_address
 
 import blf_dsc_controller as blf
 
@@ -35,16 +35,18 @@ BOUND = 0.04  # rad, of the preset
 
 @pytest.fixture
 def simulate():
-    """Start a simulator, and wait until it accepts connections."""
+    """Start a simulator at an address of its own, which it accepts connections at."""
     started = []
 
-    def start(*words):
-        words = [PYTHON, SERVER, *words]
+    def start(*events):
+        address = own_address()
+        words = [PYTHON, SERVER, address, *events]
         process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         timer = threading.Timer(COMPILED, process.kill)
         timer.start()
         started.append((process, timer))
         assert process.stdout.readline().strip() == 'ready'
+        return address
 
     yield start
     for process, timer in started:
@@ -66,8 +68,8 @@ def drive(address, duration, *options):
 
 def test_two_kilograms_come_and_go_and_no_torque_steps_too_far(simulate, tmp_path):
     """Rotors and friction are not those that the law assumes."""
-    simulate('127.0.0.41', 'load=2@500', 'load=0@1000')
-    code, output = drive('127.0.0.41', 1.5, '--out', tmp_path / 'bag')
+    address = simulate('load=2@500', 'load=0@1000')
+    code, output = drive(address, 1.5, '--out', tmp_path / 'bag')
     assert code == 0, output
     recorded = blf.read_run(tmp_path / 'bag')
     assert set(np.diff(recorded.stamp)) == {1_000_000}  # ns: no state was missed
@@ -76,21 +78,21 @@ def test_two_kilograms_come_and_go_and_no_torque_steps_too_far(simulate, tmp_pat
 
 
 def test_robot_that_hears_nothing_stops_by_itself_and_is_started_again(simulate):
-    simulate('127.0.0.42', 'deaf@300')
-    code, output = drive('127.0.0.42', 60)
+    address = simulate('deaf@300')
+    code, output = drive(address, 60)
     assert code == 5, output
     assert 'the robot stopped by itself' in output
     assert 'communication_constraints_violation' in output
     assert 'it has recovered' in output
-    code, output = drive('127.0.0.42', 0.1)
+    code, output = drive(address, 0.1)
     assert code == 0, output
 
 
 def test_what_it_says_of_a_tau_j_that_is_the_command_ends_with_an_arm_that_moves(
     simulate, tmp_path
 ):
-    simulate('127.0.0.43', 'published')
-    code, output = drive('127.0.0.43', 1)
+    address = simulate('published')
+    code, output = drive(address, 1)
     assert code == 5, output
     advice = 'safety.first_torque: send and disturbance.observer_bandwidth: 0.0'
     assert advice in re.sub(r'\s+', ' ', output)
@@ -100,6 +102,6 @@ def test_what_it_says_of_a_tau_j_that_is_the_command_ends_with_an_arm_that_moves
     preset = preset.replace(section, advised)
     preset = preset.replace('    safety:\n', '    safety:\n      first_torque: send\n')
     (tmp_path / 'my.yaml').write_text(preset)
-    code, output = drive('127.0.0.43', 1, '--config', tmp_path / 'my.yaml')
+    code, output = drive(address, 1, '--config', tmp_path / 'my.yaml')
     assert code == 0, output
     assert 'sensors ' not in output

@@ -174,23 +174,28 @@ def test_status_is_told_every_second_and_as_soon_as_the_state_changes(monkeypatc
     assert told == [(100.6, 4), (101.7, 4)]
 
 
-def test_stop_without_an_answer_of_the_loop_says_so(ros, beside, tmp_path):
+def test_stop_that_a_silent_loop_has_not_confirmed_fails_and_brakes_when_it_goes_on(
+    ros, beside, tmp_path
+):
     """The robot has fallen silent; in a namespace."""
     client = ros.tester.create_client(Trigger, '/left/blf_dsc_controller/stop')
     answers = []
 
-    def between(count, loop, _):
+    def between(count, *_):
         time.sleep(0.001)
-        if count != 50:
-            return
-        ros.until(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        ros.until(future.done)
-        answers.append(future.result().message)
-        loop.request_end()
+        if count == 50:
+            ros.until(client.service_is_ready)
+            future = client.call_async(Trigger.Request())
+            ros.until(future.done)
+            answers.append(future.result())
 
-    beside(between, tmp_path, namespace='left')
-    assert answers == ['no answer from the loop: use the emergency stop']
+    beside(between, tmp_path, duration=0.3, namespace='left')
+    journal = messages_of(tmp_path / 'bag')[topics.JOURNAL.resolved]
+    braked = [each for each in map(decode, journal) if each.type is EventType.BRAKE]
+    (answer,) = answers
+    assert not answer.success
+    assert 'not confirmed: the loop has not answered for 1 s' in answer.message
+    assert [each.messages for each in braked] == [51]  # the first after the silence
 
 
 @pytest.mark.parametrize(
@@ -268,13 +273,14 @@ def test_late_answer_to_a_stop_is_none_to_the_next(loop_topics, monkeypatch):
     """Else a loop that hangs since then would seem to brake."""
     beside, loop = loop_topics
     monkeypatch.setattr(topics_process, '_PATIENCE', 0.05)
-    silent = 'no answer from the loop: use the emergency stop'
-    assert beside._stop() == silent
+    with pytest.raises(BlfDscError, match='not confirmed'):
+        beside._stop()
     loop.put(STOP, topic_link.encode('braking for 1 s'))
     loop.flush()
     for kind, content in beside._link.messages():
         beside.take(kind, content)
-    assert beside._stop() == silent
+    with pytest.raises(BlfDscError, match='not confirmed'):
+        beside._stop()
 
 
 def linked(most=1 << 20):

@@ -54,12 +54,6 @@ def drive(record=None, **given):
     return blf.Drive('panda', given, robot='simulated', record=record)
 
 
-@pytest.fixture(scope='module')
-def arm():
-    with drive() as found:
-        yield found
-
-
 def rests(arm):
     """The reference does."""
     before = arm.state
@@ -128,88 +122,6 @@ def test_motions_arrive_and_the_bag_replays_bit_equal(tmp_path):
     assert kinds.count(EventType.TARGET) > 2  # the latest wins while one is planned
 
 
-def test_what_cannot_be_done_is_refused_with_the_reason_and_the_arm_holds(arm):
-    before = arm.state.reference
-    with pytest.raises(DriveError, match='7 finite values are needed'):
-        arm.move_to([0.0, 1.0])
-    with pytest.raises(DriveError, match='7 finite values are needed'):
-        arm.stream([np.nan] * 7)
-    with pytest.raises(DriveError, match='speed: got 1'):
-        arm.move_to(before, speed=1.5)
-    for wrong in ('home', [[0.1, 0.2], [0.3]], {'elbow': 0.1}):
-        with pytest.raises(DriveError, match='7 finite values are needed'):
-            arm.move_to(wrong)
-    for wrong in ([1.0, 2.0], [('now', [0.1] * 7)], 1.0):
-        with pytest.raises(DriveError, match='must be a time and positions'):
-            arm.follow(wrong)
-    with pytest.raises(DriveError, match='points: got none'):
-        arm.follow([])
-    with pytest.raises(DriveError, match='the last one is at 0 s'):
-        arm.follow([(0.0, before + 0.1)])
-    with pytest.raises(MotionFailedError, match=r"panda_joint\d' at .* rad, past"):
-        arm.move_to(before + 9.0)
-    with pytest.raises(MotionFailedError, match='elbow'):
-        arm.follow([(1.0, [0.0])], ['elbow'])
-    np.testing.assert_array_equal(arm.state.reference, before)
-    assert not arm.is_moving
-
-
-def test_arguments_that_are_none_are_refused_before_the_arm_moves(arm):
-    before = arm.state.reference
-    there = before + 0.1
-    for wrong in (0.0, 1.5, np.nan, 'fast', [0.1] * 7, None):
-        with pytest.raises(DriveError, match=r'speed: got .* above 0, up to 1'):
-            arm.move_to(there, speed=wrong)
-    for wrong in (-1.0, np.nan, '5', [1.0]):
-        for order in (
-            arm.move_to,
-            lambda q, timeout: arm.follow([(1.0, q)], timeout=timeout),
-        ):
-            with pytest.raises(DriveError, match=r'timeout: got .* or None: for ever'):
-                order(there, timeout=wrong)
-        with pytest.raises(DriveError, match='timeout: got'):
-            arm.stop(timeout=wrong)
-    for wrong in ('panda_joint1', 1, [1, 2]):
-        with pytest.raises(DriveError, match=r'joints: got .*, but a list of names'):
-            arm.follow([(1.0, there)], wrong)
-    for wrong in (
-        ('2 kg',),
-        (1.0, 0.1),
-        (1.0, 'tip'),
-        (np.nan,),
-        (1.0, [0.0, np.inf, 0.0]),
-    ):
-        with pytest.raises(DriveError, match=r'load: got .* three coordinates'):
-            arm.load(*wrong)
-    np.testing.assert_array_equal(arm.state.reference, before)
-    assert not arm.is_moving
-
-
-def test_degrees_are_refused_with_the_hint_that_they_may_be_some(arm):
-    degrees = [0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0]
-    with pytest.raises(
-        MotionFailedError, match=r'past its limit .*give np\.deg2rad of them'
-    ):
-        arm.move_to(degrees)
-    with pytest.raises(MotionFailedError, match='past its limit') as raised:
-        arm.move_to([9.0] * 7)
-    assert 'deg2rad' not in str(raised.value)
-
-
-def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):
-    before = arm.state.reference
-    for _ in range(5):
-        arm.stream(np.rad2deg(before))
-    wait_for(lambda: 'degrees' in caplog.text)
-    assert rests(arm)
-    np.testing.assert_array_equal(arm.state.reference, before)
-    assert re.search(
-        r'panda_joint\d is to be at .* its limits are .*deg2rad', caplog.text
-    )
-    assert caplog.text.count('deg2rad') == 1
-    assert not arm.ended
-
-
 @pytest.mark.parametrize(
     ('positions', 'named'),
     [
@@ -238,16 +150,6 @@ def test_next_loop_answers_no_stop_of_the_one_before():
     script = SimpleNamespace(_braking=[(0.5, 3)])
     Script.begin(script, loop=None)
     assert not script._braking
-
-
-def test_a_pose_that_is_none_is_refused(arm):
-    for wrong in ('home', [0.1, [0.2], 0.3], arm.pose):
-        with pytest.raises(
-            DriveError, match=r'position: got .* such as pose\.position'
-        ):
-            arm.move_to_pose(wrong)
-    with pytest.raises(DriveError, match=r'rotation: got str.* such as pose\.rotation'):
-        arm.move_to_pose(arm.pose.position, 'down')
 
 
 @pytest.mark.parametrize(
@@ -291,71 +193,6 @@ def test_values_of_overrides_may_be_paths_and_arrays():
     assert found == {'drive': {'bound': [0.5, 0.5], 'few': [0.5, True], 'at': 'a'}}
 
 
-def test_a_motion_is_waited_for_stopped_and_given_up(arm):
-    start = arm.state.q
-    arm.move_to(start + STEP, speed=0.02, wait=False)
-    assert arm.is_moving  # for ten seconds
-    arm.stop()
-    assert rests(arm)
-    with pytest.raises(MotionFailedError, match=r'pre-empted by stop\(\)|was stopped'):
-        arm.wait()
-    arm.move_to(start + STEP, speed=0.02, wait=False)
-    with pytest.raises(NotInTimeError, match=r'after 0.1 s: the arm has braked'):
-        arm.wait(timeout=0.1)
-    assert rests(arm)
-    arm.move_to(start + STEP, speed=0.02, wait=False)
-    arm.move_to(start, speed=1.0)
-    np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
-
-
-def test_ctrl_c_in_a_motion_brakes_the_arm_also_where_no_block_ends(arm):
-    """As in a notebook, whose kernel goes on."""
-    start = arm.state.q
-
-    def interrupt():
-        wait_for(lambda: arm.is_moving)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    threading.Thread(target=interrupt).start()
-    with pytest.raises(KeyboardInterrupt):
-        arm.move_to(start + STEP, speed=0.02)
-    wait_for(lambda: rests(arm))
-    assert np.abs(arm.state.reference - start - STEP).max() > 0.1
-    assert not arm.is_moving
-    assert arm.state.phase == 'tracking'
-
-
-def test_a_fork_of_the_script_neither_commands_nor_closes_the_arm(arm):
-    """It would wait for ever, since the thread that listens is not there."""
-    child = os.fork()
-    if not child:
-        arm.close()
-        try:
-            arm.stop()
-        except DriveError as error:
-            os._exit(42 if 'a fork of it: command the arm there' in str(error) else 1)
-        os._exit(1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 42
-    arm.stop()
-    assert arm.state.phase == 'tracking'
-
-
-def test_settings_that_other_packages_have_are_refused(arm):
-    """`robot.relative_dynamics_factor = 0.05` would leave the arm ten times as fast."""
-    for name in ('relative_dynamics_factor', 'speed'):
-        with pytest.raises(DriveError, match=rf'{name}: .*move_to\(q, speed=0\.1\)'):
-            setattr(arm, name, 0.05)
-
-
-def test_a_long_trajectory_is_read_beside_the_loop(arm):
-    """9000 points, 4 MB: reading them takes tens of milliseconds."""
-    start = arm.state.reference
-    times = np.arange(1, 9001) / 5000.0
-    wave = 0.05 * np.sin(np.pi * times / times[-1]) ** 2
-    arm.follow([(t, start + w) for t, w in zip(times, wave, strict=True)])
-    np.testing.assert_allclose(arm.state.reference, start, atol=1e-6)
-
-
 def test_load_is_declared_to_drives_that_compensate_and_no_torque_changes(tmp_path):
     """An arm that holds nothing: what the drives add, the command lacks."""
     with blf.Drive('fr3_direct', robot='simulated', record=tmp_path / 'bag') as arm:
@@ -372,13 +209,6 @@ def test_load_is_declared_to_drives_that_compensate_and_no_torque_changes(tmp_pa
     # rad: friction that holds the arm takes up the steps
     error = blf.read_run(tmp_path / 'bag').error
     assert np.nanmax(np.abs(error)) < 1e-3
-
-
-def test_tare_is_refused_with_the_reason_and_the_arm_holds(arm):
-    """The preset computes no external torque."""
-    with pytest.raises(MotionFailedError, match=r'set contact\.enabled'):
-        arm.tare()
-    assert not arm.ended
 
 
 # a Panda whose efforts are its commands
@@ -413,11 +243,6 @@ def test_command_ends_with_what_is_wrong_with_the_efforts(tmp_path, capsys):
     words = ['--robot', 'simulated', '--config', f'{tmp_path / "my.yaml"}']
     assert main(['drive', *words, '--duration', '0.8']) == 0
     assert re.search('sensors +' + DISTRUSTED, capsys.readouterr().out)
-
-
-def test_load_is_not_declared_to_drives_that_add_nothing(arm):
-    with pytest.raises(MotionFailedError, match='drive_compensates: got none'):
-        arm.load(1.0)
 
 
 def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():
@@ -486,16 +311,6 @@ def test_a_drive_that_was_closed_says_so():
             order()
     arm.wait()
     arm.close()
-
-
-def test_two_threads_that_move_one_arm_both_return(arm):
-    """The result of a motion is kept while another begins: nobody waits for ever."""
-    start = arm.state.q
-    arm.move_to(start, speed=1.0)
-    first = arm._number
-    for _ in range(2):
-        arm.move_to(start, speed=1.0)
-    arm._await_result(first, timeout=1.0)
 
 
 def test_a_process_that_is_killed_is_an_error_and_another_can_be_started(tmp_path):
@@ -610,3 +425,191 @@ def test_a_script_that_ends_in_any_way_leaves_an_arm_at_rest(
     # rad in 1 ms: it moved, also on a slow computer
     assert np.nanmax(np.abs(np.diff(run.reference, axis=0))) > 1e-6
     assert np.abs(run.velocity[-1]).max() < 0.02  # rad/s
+
+
+# Of one arm, last: it moves in real time until the end of the file.
+
+
+@pytest.fixture(scope='module')
+def arm():
+    with drive() as found:
+        yield found
+
+
+def test_what_cannot_be_done_is_refused_with_the_reason_and_the_arm_holds(arm):
+    before = arm.state.reference
+    with pytest.raises(DriveError, match='7 finite values are needed'):
+        arm.move_to([0.0, 1.0])
+    with pytest.raises(DriveError, match='7 finite values are needed'):
+        arm.stream([np.nan] * 7)
+    with pytest.raises(DriveError, match='speed: got 1'):
+        arm.move_to(before, speed=1.5)
+    for wrong in ('home', [[0.1, 0.2], [0.3]], {'elbow': 0.1}):
+        with pytest.raises(DriveError, match='7 finite values are needed'):
+            arm.move_to(wrong)
+    for wrong in ([1.0, 2.0], [('now', [0.1] * 7)], 1.0):
+        with pytest.raises(DriveError, match='must be a time and positions'):
+            arm.follow(wrong)
+    with pytest.raises(DriveError, match='points: got none'):
+        arm.follow([])
+    with pytest.raises(DriveError, match='the last one is at 0 s'):
+        arm.follow([(0.0, before + 0.1)])
+    with pytest.raises(MotionFailedError, match=r"panda_joint\d' at .* rad, past"):
+        arm.move_to(before + 9.0)
+    with pytest.raises(MotionFailedError, match='elbow'):
+        arm.follow([(1.0, [0.0])], ['elbow'])
+    np.testing.assert_array_equal(arm.state.reference, before)
+    assert not arm.is_moving
+
+
+def test_arguments_that_are_none_are_refused_before_the_arm_moves(arm):
+    before = arm.state.reference
+    there = before + 0.1
+    for wrong in (0.0, 1.5, np.nan, 'fast', [0.1] * 7, None):
+        with pytest.raises(DriveError, match=r'speed: got .* above 0, up to 1'):
+            arm.move_to(there, speed=wrong)
+    for wrong in (-1.0, np.nan, '5', [1.0]):
+        for order in (
+            arm.move_to,
+            lambda q, timeout: arm.follow([(1.0, q)], timeout=timeout),
+        ):
+            with pytest.raises(DriveError, match=r'timeout: got .* or None: for ever'):
+                order(there, timeout=wrong)
+        with pytest.raises(DriveError, match='timeout: got'):
+            arm.stop(timeout=wrong)
+    for wrong in ('panda_joint1', 1, [1, 2]):
+        with pytest.raises(DriveError, match=r'joints: got .*, but a list of names'):
+            arm.follow([(1.0, there)], wrong)
+    for wrong in (
+        ('2 kg',),
+        (1.0, 0.1),
+        (1.0, 'tip'),
+        (np.nan,),
+        (1.0, [0.0, np.inf, 0.0]),
+    ):
+        with pytest.raises(DriveError, match=r'load: got .* three coordinates'):
+            arm.load(*wrong)
+    np.testing.assert_array_equal(arm.state.reference, before)
+    assert not arm.is_moving
+
+
+def test_degrees_are_refused_with_the_hint_that_they_may_be_some(arm):
+    degrees = [0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0]
+    with pytest.raises(
+        MotionFailedError, match=r'past its limit .*give np\.deg2rad of them'
+    ):
+        arm.move_to(degrees)
+    with pytest.raises(MotionFailedError, match='past its limit') as raised:
+        arm.move_to([9.0] * 7)
+    assert 'deg2rad' not in str(raised.value)
+
+
+def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):
+    before = arm.state.reference
+    for _ in range(5):
+        arm.stream(np.rad2deg(before))
+    wait_for(lambda: 'degrees' in caplog.text)
+    assert rests(arm)
+    np.testing.assert_array_equal(arm.state.reference, before)
+    assert re.search(
+        r'panda_joint\d is to be at .* its limits are .*deg2rad', caplog.text
+    )
+    assert caplog.text.count('deg2rad') == 1
+    assert not arm.ended
+
+
+def test_a_pose_that_is_none_is_refused(arm):
+    for wrong in ('home', [0.1, [0.2], 0.3], arm.pose):
+        with pytest.raises(
+            DriveError, match=r'position: got .* such as pose\.position'
+        ):
+            arm.move_to_pose(wrong)
+    with pytest.raises(DriveError, match=r'rotation: got str.* such as pose\.rotation'):
+        arm.move_to_pose(arm.pose.position, 'down')
+
+
+def test_a_motion_is_waited_for_stopped_and_given_up(arm):
+    start = arm.state.q
+    arm.move_to(start + STEP, speed=0.02, wait=False)
+    assert arm.is_moving  # for ten seconds
+    arm.stop()
+    assert rests(arm)
+    with pytest.raises(MotionFailedError, match=r'pre-empted by stop\(\)|was stopped'):
+        arm.wait()
+    arm.move_to(start + STEP, speed=0.02, wait=False)
+    with pytest.raises(NotInTimeError, match=r'after 0.1 s: the arm has braked'):
+        arm.wait(timeout=0.1)
+    assert rests(arm)
+    arm.move_to(start + STEP, speed=0.02, wait=False)
+    arm.move_to(start, speed=1.0)
+    np.testing.assert_allclose(arm.state.q, start, atol=NEAR)
+
+
+def test_ctrl_c_in_a_motion_brakes_the_arm_also_where_no_block_ends(arm):
+    """As in a notebook, whose kernel goes on."""
+    start = arm.state.q
+
+    def interrupt():
+        wait_for(lambda: arm.is_moving)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        arm.move_to(start + STEP, speed=0.02)
+    wait_for(lambda: rests(arm))
+    assert np.abs(arm.state.reference - start - STEP).max() > 0.1
+    assert not arm.is_moving
+    assert arm.state.phase == 'tracking'
+
+
+def test_a_fork_of_the_script_neither_commands_nor_closes_the_arm(arm):
+    """It would wait for ever, since the thread that listens is not there."""
+    child = os.fork()
+    if not child:
+        arm.close()
+        try:
+            arm.stop()
+        except DriveError as error:
+            os._exit(42 if 'a fork of it: command the arm there' in str(error) else 1)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 42
+    arm.stop()
+    assert arm.state.phase == 'tracking'
+
+
+def test_settings_that_other_packages_have_are_refused(arm):
+    """`robot.relative_dynamics_factor = 0.05` would leave the arm ten times as fast."""
+    for name in ('relative_dynamics_factor', 'speed'):
+        with pytest.raises(DriveError, match=rf'{name}: .*move_to\(q, speed=0\.1\)'):
+            setattr(arm, name, 0.05)
+
+
+def test_a_long_trajectory_is_read_beside_the_loop(arm):
+    """9000 points, 4 MB: reading them takes tens of milliseconds."""
+    start = arm.state.reference
+    times = np.arange(1, 9001) / 5000.0
+    wave = 0.05 * np.sin(np.pi * times / times[-1]) ** 2
+    arm.follow([(t, start + w) for t, w in zip(times, wave, strict=True)])
+    np.testing.assert_allclose(arm.state.reference, start, atol=1e-6)
+
+
+def test_tare_is_refused_with_the_reason_and_the_arm_holds(arm):
+    """The preset computes no external torque."""
+    with pytest.raises(MotionFailedError, match=r'set contact\.enabled'):
+        arm.tare()
+    assert not arm.ended
+
+
+def test_load_is_not_declared_to_drives_that_add_nothing(arm):
+    with pytest.raises(MotionFailedError, match='drive_compensates: got none'):
+        arm.load(1.0)
+
+
+def test_two_threads_that_move_one_arm_both_return(arm):
+    """The result of a motion is kept while another begins: nobody waits for ever."""
+    start = arm.state.q
+    arm.move_to(start, speed=1.0)
+    first = arm._number
+    for _ in range(2):
+        arm.move_to(start, speed=1.0)
+    arm._await_result(first, timeout=1.0)

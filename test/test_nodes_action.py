@@ -25,7 +25,7 @@ from rclpy.action import ActionClient
 from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
-from ros_rig import JOINTS, START, RosRig, activate, deactivate
+from ros_rig import JOINTS, PATIENCE, START, RosRig, activate, deactivate
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from test_replay_ros import Recording
@@ -45,6 +45,7 @@ from blf_dsc_controller.control.goal_messages import (
 from blf_dsc_controller.control.goals import Goals
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.nodes import action_process
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.supervision.supervisor import Reason
@@ -548,11 +549,12 @@ def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd)
     )
 
 
-def test_process_of_the_action_ends_with_its_node(own_loop, capfd):
+def test_process_of_the_action_ends_with_its_node(own_loop, capfd, monkeypatch):
     """Without a word, and not by a signal that its whole group gets: goals still end.
 
     A terminal sends Ctrl-C to all processes, systemd SIGTERM.
     """
+    monkeypatch.setattr(action_process, '_PATIENCE', PATIENCE)  # on a slow computer
     _, law, client = own_loop
     process = law.action._process._process
     os.kill(process.pid, signal.SIGINT)

@@ -37,7 +37,7 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.endpoints import message_class
+from blf_dsc_controller.nodes.endpoints import RawSubscriptions, message_class
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.approach import reference_of
@@ -390,6 +390,20 @@ def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
     for topic in outputs:
         ros.listen(topic)
     ros.until(lambda: arm.plant.sample > 0)
+
+
+def test_plant_does_not_take_the_page_for_the_controller(ros):
+    """It is there before the loop: see `blf_dsc run --view`."""
+    arm = ros.add(PlantNode, {'wait_for_subscribers': 1, 'mode': 'lockstep'})
+    recorded = [ros.listen(each) for each in (topics.JOINT_STATES, topics.TRUTH)]
+    page = ros.add(partial(Node, 'view'))
+    beside = RawSubscriptions(page)
+    beside.follow(topics.JOINT_STATES, topics.JOINT_STATES.requested)
+    states = next(iter(arm._outputs.values()))
+    ros.until(lambda: states.get_subscription_count() == 2)
+    assert not arm._is_observed()
+    assert not any(recorded)
+    beside.close()
 
 
 def test_transitions_pause_and_restart_the_loop_and_impossible_ones_are_rejected(ros):

@@ -13,8 +13,10 @@ import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from pathlib import Path
 from subprocess import PIPE, STDOUT
-from urllib.error import URLError
+from time import sleep
+from types import SimpleNamespace
 from urllib.request import urlopen
 
 import numpy as np
@@ -24,7 +26,7 @@ from random_arm import random_urdf
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
 
-from command import COMMAND, NO_PICTURES, wait_for
+from command import COMMAND, COMPILED, NO_PICTURES, child_of, wait_for
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
@@ -35,9 +37,11 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli import node_process, session
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
@@ -326,6 +330,14 @@ def events_with(view, word):
     return [event for event in view.page.listed if word in f'{event}']
 
 
+def assert_reset_is_shown(ros, arm, view):
+    before = list(view.past)
+    ros.reset(arm)
+    ros.until(lambda: events_with(view, 'reset'))
+    ros.until(lambda: view.past and view.past[0] is not before[0])
+    assert view.past[0].time < before[-1].time  # counted from the new start
+
+
 def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     view = ros.add(ViewNode, port=18180)
     ros.until(lambda: view.page.shown_state == ('STALE', WAITING))
@@ -366,9 +378,7 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     ros.until(lambda: view.past[-1].loaded)
     arm.set_parameters([Parameter('load.payload', value=0.0)])
     ros.until(lambda: len(events_with(view, 'load.payload')) == 2)
-    ros.reset(arm)
-    ros.until(lambda: events_with(view, 'reset'))
-    ros.until(lambda: 0.1 < view.past[-1].time < 1.0)  # counted from the new start
+    assert_reset_is_shown(ros, arm, view)
 
     learned, initial, true = now.squares
     assert 0.0 < learned < initial < true  # the estimates began at half the parameters
@@ -469,15 +479,18 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
 
 
 def test_page_replays_a_run_until_the_user_goes_on(tmp_path):
-    """With a terminal; the results follow."""
+    """With a terminal; the results follow.
+
+    The page is there before the run, however short that is.
+    """
     out = tmp_path / 'run'
-    words = ('--view', '--mode', 'lockstep', '--duration', '30', '--out', str(out))
+    words = ('--view', '--mode', 'lockstep', '--duration', '0.5', '--out', str(out))
     ours, theirs = pty.openpty()
     command, env = (*COMMAND, *words), os.environ | NO_PICTURES
     with subprocess.Popen(command, stdout=PIPE, stderr=theirs, env=env) as process:
         os.close(theirs)
         said = b''
-        expected = rb'(?s)(?=.*the run has ended).*open (http://127.0.0.1:\d+)\s'
+        expected = rb'(?s).*open (http://127.0.0.1:\d+)\s.*the run has ended'
         while not (found := re.match(expected, said)):
             try:
                 said += os.read(ours, 1000)
@@ -513,13 +526,36 @@ def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
         while not (found := re.search(r'open (http://127.0.0.1:\d+)', output)):
             output += process.stdout.readline()
             assert process.poll() is None, output
-        wait_for(lambda: 'open http' in (out / 'logs' / 'view.log').read_text())
+        server = child_of(process.pid, 'blf_dsc_controller.view.node')
+        bag = out / 'bag' / 'bag_0.mcap'
+        # 5 MB: more than two seconds of the run
+        wait_for(lambda: bag.exists() and bag.stat().st_size > 5_000_000, COMPILED)
         with urlopen(found[1]) as page:  # noqa: S310 - an address of our own
             assert b'<html' in page.read()
         process.send_signal(signal.SIGINT)
         output += process.communicate()[0]
     assert process.returncode == INTERRUPTED, output
     run = read_run(out / 'bag')
-    assert np.isfinite(run.error[0]).all()  # the recorder was running before the page
-    with pytest.raises(URLError):
-        urlopen(found[1])  # noqa: S310
+    assert np.isfinite(run.error[0]).all()  # the recorder was running before the loop
+    # its address may be that of another run by now
+    assert not Path(f'/proc/{server}').exists()
+
+
+def test_page_that_cannot_be_served_ends_a_run_before_it_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(node_process, '_MODULES', {'view': 'no_such_module'})
+    monitor = SimpleNamespace(wait=sleep, start=None)
+    config = load_loop('recommended')
+    with pytest.raises(
+        BlfDscError, match=r'(?s)view exited with code 1:.*no_such_module'
+    ):
+        session._run_nodes(config, monitor, tmp_path / 'none', tmp_path, view=True)
+    assert [path.name for path in tmp_path.iterdir()] == [
+        'view.log'
+    ]  # of no other node
+
+
+def test_page_that_ends_by_itself_is_named_and_the_results_follow(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, 'isatty', lambda: True)
+    page = SimpleNamespace(is_running=False, log='logs/view.log', take_notices=list)
+    session._keep([page], [], SimpleNamespace(wait=sleep), [])
+    assert 'the page has ended by itself: see logs/view.log' in capsys.readouterr().err

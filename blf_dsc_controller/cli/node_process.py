@@ -18,13 +18,14 @@ from blf_dsc_controller.errors import BlfDscError
 LOOP = 'loop'
 """Name of the process of controller and plant, in lock-step."""
 
-# Started in this order and stopped in reverse, so that the recorder gets every message.
+# Stopped in the reverse of the order in which they start, so that the recorder gets every message.
+# The page starts before them.
 _MODULES = {
     RECORDER: 'blf_dsc_controller.nodes.recorder_node',
     CONTROLLER: 'blf_dsc_controller.nodes.controller_node',
     PLANT: 'blf_dsc_controller.nodes.plant_node',
     LOOP: 'blf_dsc_controller.nodes.lockstep_loop',  # both, in lock-step
-    VIEW: 'blf_dsc_controller.view.node',  # only on request, once the loop runs
+    VIEW: 'blf_dsc_controller.view.node',  # only on request
 }
 _ENDING = 20.0  # s that a node may take to exit before it is killed
 _TAIL = 12  # lines of a failed node's log that are shown
@@ -37,6 +38,7 @@ class NodeProcess:
     """A process of nodes, which does not outlive this one.
 
     Attributes:
+        log: file of what it says.
         patience: time [s] that it may take to exit before it is killed.
     """
 
@@ -46,10 +48,10 @@ class NodeProcess:
         self.name = name
         self.patience = _ENDING
         self._noticed = 0
-        self._log = logs / f'{name}.log'
+        self.log = logs / f'{name}.log'
         module = _MODULES.get(name, name)  # of the benchmark, for instance
         command = [*child.running_module(module), '--ros-args', '--params-file']
-        with self._log.open('wb') as output:
+        with self.log.open('wb') as output:
             # In its own session: Ctrl-C reaches only the parent, which stops the nodes
             # in order.
             self._process = subprocess.Popen(
@@ -74,10 +76,16 @@ class NodeProcess:
         """Whether the process is alive."""
         return self._process.poll() is None
 
+    @property
+    def serves(self) -> bool:
+        """Whether the node has said where its page is."""
+        return any(_PAGE in line for line in self._whole_lines())
+
     def take_notices(self) -> list[str]:
         """Return what the node has reported of its kernels or its page since the last call."""
-        lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()
-        found = (re.search(f'({COMPILING}|{_PAGE}).*', line) for line in lines)
+        found = (
+            re.search(f'({COMPILING}|{_PAGE}).*', line) for line in self._whole_lines()
+        )
         notices = [each[0] for each in found if each]
         new = notices[self._noticed :]
         self._noticed = len(notices)
@@ -91,11 +99,15 @@ class NodeProcess:
         end = f'exited with code {code}'
         if code < 0:
             end = f'was terminated by {signal.Signals(-code).name}'
-        lines = self._log.read_text(encoding='utf-8', errors='replace').splitlines()[
-            -_TAIL:
-        ]
-        tail = ''.join(f'\n  {line}' for line in lines)
-        raise BlfDscError(f'{self.name} {end}:{tail}\n(full log: {self._log})')
+        tail = ''.join(f'\n  {line}' for line in self._said().splitlines()[-_TAIL:])
+        raise BlfDscError(f'{self.name} {end}:{tail}\n(full log: {self.log})')
+
+    def _said(self) -> str:
+        return self.log.read_text(encoding='utf-8', errors='replace')
+
+    def _whole_lines(self) -> list[str]:
+        """Return the lines of the log but for one that is being written."""
+        return self._said().rpartition('\n')[0].splitlines()
 
     def stop(self) -> None:
         """Interrupt the node and wait until it exits; kill it if it takes too long."""

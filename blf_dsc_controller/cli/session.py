@@ -36,10 +36,11 @@ _ENDED = 'the run has ended: its page replays it until Ctrl-C, then the results 
 def run_session(config: LoopConfig, out: Path, *, view: bool) -> bool:
     """Run recorder, controller and plant on `out/config.yaml` to the end.
 
-    They run in a ROS domain of their own, and with a page if they should be viewed.
+    They run in a ROS domain of their own, and with a page if they should be viewed, which is
+    served before they start.
     Returns False if a signal to this process, or to another node than the plant, ended
-    the run; raises BlfDscError if a node exited with an error, and KeyboardInterrupt,
-    without a bag, if a signal came before the loop had begun.
+    the run; raises BlfDscError if a node exited with an error, or no page can be served,
+    and KeyboardInterrupt, without a bag, if a signal came before the loop had begun.
     """
     logs = out / 'logs'
     logs.mkdir()
@@ -109,6 +110,9 @@ def _run_nodes(
             ending.callback(node.stop)
             return node
 
+        # First, so that it sees the whole run: that may be over before a page is served.
+        pages = [started(VIEW)] if view else []
+        _wait_for_pages(pages, monitor, interrupts)
         is_lockstep = config.plant.mode == 'lockstep'
         loop = [LOOP] if is_lockstep else [CONTROLLER, PLANT]
         nodes = [started(name) for name in (RECORDER, *loop)]
@@ -117,9 +121,6 @@ def _run_nodes(
             return all(node.is_running for node in nodes) and not interrupts
 
         _wait_while(lambda: is_running() and monitor.start is None, monitor, nodes)
-        # Only now, since the nodes wait for a subscriber, which must be the recorder.
-        begun = view and monitor.start is not None
-        pages = [started(VIEW)] if begun else []
         _wait_while(is_running, monitor, pages)
         if interrupts and monitor.start is None:
             _do_not_wait_for(nodes)  # they import, compile or wait for each other
@@ -132,6 +133,26 @@ def _run_nodes(
     for node in nodes:
         node.check()
     return completed
+
+
+def _wait_for_pages(
+    pages: Sequence[NodeProcess], monitor: ProgressMonitor, interrupts: Sequence[int]
+) -> None:
+    """Wait until pages are served, and say where.
+
+    Raises:
+        BlfDscError: one cannot be.
+        KeyboardInterrupt: a signal came before.
+    """
+    _wait_while(
+        lambda: not interrupts and any(p.is_running and not p.serves for p in pages),
+        monitor,
+        pages,
+    )
+    if interrupts:
+        raise KeyboardInterrupt
+    for page in pages:
+        page.check()
 
 
 def _wait_while(
@@ -176,3 +197,5 @@ def _keep(
         node.stop()  # so that the page says that they have finished
     tqdm.write(_ENDED, file=sys.stderr)
     _wait_while(lambda: pages[0].is_running and not interrupts, monitor, pages)
+    if not interrupts:
+        tqdm.write(f'the page has ended by itself: see {pages[0].log}', file=sys.stderr)

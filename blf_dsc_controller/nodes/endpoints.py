@@ -191,9 +191,9 @@ def is_listener(node_name: str) -> bool:
     return 'record' in node_name or node_name.endswith(_SUBSCRIPTIONS)
 
 
-def subscriptions_of(owner: Node) -> str:
-    """Return the name of the hidden node with the `RawSubscriptions` of a node."""
-    return f'_{owner.get_name()}{_SUBSCRIPTIONS}'
+def subscriptions_of(owner: str) -> str:
+    """Return the name of the hidden node with the `RawSubscriptions` of a node of this name."""
+    return f'_{owner}{_SUBSCRIPTIONS}'
 
 
 _SUBSCRIPTIONS = '_subscriptions'
@@ -218,7 +218,7 @@ class RawSubscriptions:
 
     def __init__(self, owner: Node) -> None:
         self.node = Node(
-            subscriptions_of(owner),
+            subscriptions_of(owner.get_name()),
             context=owner.context,
             use_global_arguments=False,
             enable_rosout=False,

@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import WATCHDOG
+from blf_dsc_controller.configuration.nodes import VIEW, WATCHDOG
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.errors import BlfDscError
@@ -234,7 +234,8 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         publishers = [*self._outputs.values()]
         others = publishers[0].get_subscription_count()
         others -= self._subscribers(publishers[0], WATCHDOG)
-        others -= self._subscribers(publishers[0], subscriptions_of(self))
+        others -= self._subscribers(publishers[0], subscriptions_of(self.get_name()))
+        others -= self._subscribers(publishers[0], subscriptions_of(VIEW))
         recorders = (self._subscribers(each, _RECORDER) for each in publishers)
         return others > wanted and (wanted == 0 or min(recorders) >= wanted)
 

@@ -23,6 +23,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from blf_dsc_controller.configuration.nodes import CONTROLLER
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topic_link, topics
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.topic_link import (
@@ -41,7 +42,10 @@ from blf_dsc_controller.nodes.trajectory_input import connect
 _POLL = 0.1  # s
 _PATIENCE = 1.0  # s, for the loop's answer to ~/stop
 _NICE = 5  # less urgent than the loop
-_SILENT = 'no answer from the loop: use the emergency stop'
+_SILENT = (
+    f'not confirmed: the loop has not answered for {_PATIENCE:g} s. Use the emergency stop. '
+    'If the loop goes on, it still brakes'
+)
 
 
 class LoopTopics:
@@ -107,6 +111,10 @@ class LoopTopics:
         self._link.flush()
 
     def _stop(self) -> str:
+        """Let the loop stop, and return what it says.
+
+        Raises BlfDscError if it says nothing; a stop is never taken back.
+        """
         with suppress(Empty):  # what came too late for an earlier stop
             while True:
                 self._answers.get_nowait()
@@ -115,7 +123,7 @@ class LoopTopics:
         try:
             return self._answers.get(timeout=_PATIENCE)
         except Empty:
-            return _SILENT
+            raise BlfDscError(_SILENT) from None
 
 
 def _listen(link: Link, loop: LoopTopics) -> None:

@@ -12,6 +12,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from blf_dsc_controller.control.motion_input import MotionInput
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOINT_POSITIONS, JOINT_TRAJECTORY
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.run import NANOSECOND
@@ -34,11 +35,17 @@ def connect(
     take_positions: Callable[[bytes], None],
     take_stop: Callable[[], str],
 ) -> None:
-    """Subscribe to both topics, and offer `~/stop`."""
+    """Subscribe to both topics, and offer `~/stop`.
+
+    That fails if `take_stop` raises BlfDscError.
+    """
 
     def stop(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = True
-        response.message = take_stop()
+        try:
+            response.message = take_stop()
+            response.success = True
+        except BlfDscError as error:
+            response.message = str(error)
         return response
 
     for topic, type_, callback in (
