@@ -28,7 +28,7 @@ from blf_dsc_controller.messages.topics import (
     LOAD,
     TOOL,
 )
-from blf_dsc_controller.run import Floats, Run
+from blf_dsc_controller.run import SLIDING, TURNING, Floats, JointUnits, Run
 
 MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
@@ -107,6 +107,10 @@ class Metrics:
     tail_parameter_error: float = math.nan  #: rms over the last ten seconds
     #: s, after which the parameter error stays below 1 %
     time_to_1_percent: float = math.nan
+
+    def units(self, joint: str) -> JointUnits:
+        """Return the units of a joint."""
+        return SLIDING if joint in self.sliding else TURNING
 
     @property
     def left_at_stop(self) -> bool:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from blf_dsc_controller.analysis.metrics import Metrics
 from blf_dsc_controller.messages.topics import LOAD
-from blf_dsc_controller.run import SLIDING, TURNING
 
 GOOD, BAD, UNKNOWN = 'good', 'bad', 'unknown'
 _MASS, _SPREAD = LOAD[0], LOAD[4]
@@ -68,7 +67,7 @@ def _error(of: Metrics) -> Figure:
         return Figure('largest error', '-', 'not recorded')
     worst = max(known, key=lambda i: of.max_error[i])
     joint = of.joints[worst]
-    unit = (SLIDING if joint in of.sliding else TURNING).of('mrad')
+    unit = of.units(joint).of('mrad')
     return Figure('largest error', f'{1e3 * of.max_error[worst]:.3g} {unit}', joint)
 
 

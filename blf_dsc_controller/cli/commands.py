@@ -295,7 +295,7 @@ _COMMISSION = Command(
         ),
         option(
             '--posture',
-            'angles of all joints [rad]; can be repeated (three along the reference)',
+            'positions of all joints [rad, m]; can be repeated (three along the reference)',
             type=float,
             nargs='+',
             action='append',
