@@ -48,7 +48,7 @@ from blf_dsc_controller.commissioning.motion import (
     excitation,
     lines_in,
 )
-from blf_dsc_controller.commissioning.own_loop import REPEATS
+from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.page import errors_table, sentences, table
 from blf_dsc_controller.commissioning.planned import measuring_gains, plan
 from blf_dsc_controller.commissioning.postures import PostureByPosture
@@ -1379,6 +1379,19 @@ def test_period_of_a_run_has_all_of_its_samples(period, T):
     for values in _period(run, period, T):
         assert len(values) == round(period / T) + 1
         np.testing.assert_array_equal(np.diff(values[:, 0]), 1.0)
+
+
+@pytest.mark.parametrize(
+    ('given', 'answer'),
+    [
+        ({'torque': 0.0}, 'torque: got 0, but it must be above 0'),
+        ({'travel': -0.01}, 'travel: got -0.01, but it must be above 0'),
+        ({'travel': np.nan}, 'travel: got nan, but it must be above 0'),
+    ],
+)
+def test_measures_of_a_motion_that_cannot_be_are_refused(given, answer):
+    with pytest.raises(BlfDscError, match=answer):
+        Commissioning(CONFIG, **given)
 
 
 def test_proof_has_the_largest_error_of_its_whole_run_or_the_reason_of_a_stop():

@@ -53,6 +53,30 @@ def _share(text: str) -> float:
     return value
 
 
+def _finite(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f'got {text}: give a number')
+    return value
+
+
+def _magnitude(text: str) -> float:
+    value = _finite(text)
+    if value < 0.0:
+        raise argparse.ArgumentTypeError(f'got {text}: give at least 0')
+    return value
+
+
+def _size(text: str) -> float:
+    value = _finite(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f'got {text}: give a number above 0')
+    return value
+
+
 def _parameter_file(text: str) -> Path:
     path = Path(text)
     if path.suffix not in ('.yaml', '.yml'):
@@ -310,7 +334,7 @@ _COMMISSION = Command(
         option(
             '--travel',
             'farthest that the tool travels from its middle [m] (0.01)',
-            type=float,
+            type=_size,
             default=0.01,
         ),
         option(
@@ -345,13 +369,13 @@ _EXCITE = Command(
         option(
             '--radius',
             'radius of the links, for their clearance [m] (0.07)',
-            type=float,
+            type=_size,
             default=0.07,
         ),
         option(
             '--floor',
             'height of the floor in the base frame [m] (0)',
-            type=float,
+            type=_finite,
             default=0.0,
         ),
     ),
@@ -429,7 +453,7 @@ _IDENTIFY = Command(
         option(
             '--gravity',
             'gravity in the base frame [m/s^2] (0 0 -9.81)',
-            type=float,
+            type=_finite,
             nargs=3,
             default=(0.0, 0.0, -9.81),
             metavar=tuple('XYZ'),
@@ -437,7 +461,7 @@ _IDENTIFY = Command(
         option(
             '--rated-payload',
             'largest mass on the last link that is not in the URDF [kg] (3)',
-            type=float,
+            type=_magnitude,
             default=3.0,
         ),
     ),
