@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ import pytest
 import blf_dsc_controller as blf
 from blf_dsc_controller.analysis.metrics_table import contacts_text
 from blf_dsc_controller.arms.joint_gains import JointGains
+from blf_dsc_controller.bags.table import table
 from blf_dsc_controller.cli.commission_robot import _limits
 from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.own_loop import Commissioning
@@ -24,10 +26,11 @@ from blf_dsc_controller.control.goal_tolerances import tolerances
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError, StartError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.torque_sensors import OFF
+from blf_dsc_controller.messages.named_values import external_names
 from blf_dsc_controller.reference.approach import _braked, check_takeover, hold
 from blf_dsc_controller.reference.retargeting import MotionError, _check_positions
 from blf_dsc_controller.reference.terms import minimum_jerk, pack
-from blf_dsc_controller.run import SLIDING, TURNING
+from blf_dsc_controller.run import SLIDING, TURNING, Series
 from blf_dsc_controller.supervision import first_torque, gain_limits, retuning
 from blf_dsc_controller.supervision.bound_warnings import width_warnings
 from blf_dsc_controller.supervision.calming import Calming
@@ -322,6 +325,28 @@ def test_page_of_a_commissioned_arm():
     assert 'sliding 30 N instead of' in friction
     errors = Errors(np.array([0.01, 0.02]), np.array([0.01, 0.02]))
     assert 'mrad or mm' in page.errors_table(arm(), errors)
+
+
+def test_columns_of_a_recorded_run(tmp_path):
+    config = change(arm(), {'reference.type': 'hold'})
+    with blf.ArmController(config, record=tmp_path / 'bag') as controller:
+        for k in range(3):
+            controller.update(1.0 + 1e-3 * k, NOW, NOW, NOW)
+    run = blf.read_run(tmp_path / 'bag')
+    names = external_names(JOINTS)
+    external = Series(names, run.stamp, np.zeros((run.stamp.size, len(names))))
+    assert {
+        'position sliding [m]',
+        'torque sliding [N]',
+        'torque turning [N m]',
+        'monitor disturbance sliding [N]',
+        'monitor viscous sliding [N s/m]',
+        'monitor viscous turning [N m s/rad]',
+        'monitor distance_to_bound sliding [m]',
+        'external sliding [N]',
+        'external sliding +- [N]',
+        'external turning +- [N m]',
+    } <= {*table(replace(run, external=external))}
 
 
 def test_stop_at_the_bound():
