@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
+_DECIMALS = 6  # of a position
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
 
@@ -40,7 +41,7 @@ def description(planned: Planned) -> str:
     """Return in a sentence how far and how fast a motion goes."""
     made = planned.excitation
     units = planned.config.units
-    posture = ', '.join(f'{position:.3g}' for position in planned.posture)
+    posture = ', '.join(f'{q:.3g}' for q in np.round(planned.posture, _DECIMALS) + 0.0)
     fastest = int(made.speed.argmax())
     return (
         f'{planned.duration:.3g} s around [{posture}] {unit_of_all(units, "rad")}; the tool '
