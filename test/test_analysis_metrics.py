@@ -26,8 +26,9 @@ from blf_dsc_controller.analysis.output import plain, write_json
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.factory.estimate import learned_arm
+from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LATE_STEPS
-from blf_dsc_controller.run import LearnedArm, Run, Series
+from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 SAMPLES = 10_000
@@ -57,6 +58,15 @@ def test_tracking(run):
     assert metrics.max_error_ratio == pytest.approx(0.4)
     rate = 2 * np.pi / np.sqrt(2)  # 1/s, of a sinusoid of 1 Hz
     assert metrics.torque_rate == pytest.approx((8.0 * rate, 3.0 * rate), rel=1e-4)
+
+
+def test_joint_that_left_its_bound_is_not_the_one_that_caused_it(run):
+    text = (
+        "joint 'shoulder' has demanded more than its torque limit of 40 N m for 0.1 s: carry "
+        "less; joint 'elbow' is +0.0021 rad from its reference: past its bound of 0.002 rad"
+    )
+    stop = Stop(int(run.stamp[500]), OUTSIDE_BOUND, text)
+    assert measure(replace(run, stops=(stop,))).violating_joint == 'elbow'
 
 
 def test_first_violation_is_the_earliest_of_all_joints(run):
