@@ -152,19 +152,19 @@ def _learning_lines(of: Metrics) -> Iterator[tuple[str, str]]:
             'rejected',
             f'{columns}: this motion cannot distinguish them from the other columns',
         )
-    if math.isnan(of.final_parameter_error):
+    off = of.parameter_error
+    if math.isnan(off.end):
         return
     title, what = 'parameters', 'error'
-    if of.of_torques:
+    if off.of_torques:
         title, what = 'model', 'torque error of the learned model'
     shown = [
         f'{t} s {100 * error:.3g} %'
-        for t, error in of.parameter_error.items()
+        for t, error in off.at.items()
         if not math.isnan(error)
     ]
-    shown.append(f'end {100 * of.final_parameter_error:.3g} %')
-    settled = of.time_to_1_percent
+    shown.append(f'end {100 * off.end:.3g} %')
     ending = 'not below 1 %'
-    if not math.isnan(settled):
-        ending = f'below 1 % from {settled:.3f} s on'
+    if not math.isnan(off.time_to_1_percent):
+        ending = f'below 1 % from {off.time_to_1_percent:.3f} s on'
     yield title, f'{what} {", ".join(shown)}; {ending}'

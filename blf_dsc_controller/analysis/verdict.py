@@ -82,13 +82,13 @@ def _load(of: Metrics) -> Figure:
 
 
 def _model(of: Metrics) -> Figure:
-    if not math.isnan(of.final_parameter_error):
+    if not math.isnan(of.parameter_error.end):
         what = (
             'of the torque, at the end'
-            if of.of_torques
+            if of.parameter_error.of_torques
             else 'of the parameters, at the end'
         )
-        return Figure('model error', f'{100.0 * of.final_parameter_error:.3g} %', what)
+        return Figure('model error', f'{100.0 * of.parameter_error.end:.3g} %', what)
     if not of.learns:
         return Figure('model', 'given', 'this law learns none')
     if math.isnan(of.latch_time):
