@@ -152,7 +152,10 @@ def test_file_of_another_kind_or_place_is_answered_with_what_to_give(
         ('excite e.yaml --config ur5e --radius nan', 'got nan: give a number'),
         ('excite e.yaml --config ur5e --floor inf', 'got inf: give a number'),
         ('identify bag --urdf a.urdf --gravity 0 nan 0', 'got nan: give a number'),
-        ('identify bag --urdf a.urdf --rated-payload -1', 'got -1: give at least 0'),
+        (
+            'identify bag --urdf a.urdf --rated-payload -1',
+            'got -1: give a number of at least 0',
+        ),
     ],
 )
 def test_wrong_option_is_one_line_with_what_to_type(words, answer, capsys):

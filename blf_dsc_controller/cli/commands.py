@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,40 +42,25 @@ def _positive(text: str) -> int:
     return value
 
 
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < 1.0:
-        raise argparse.ArgumentTypeError(
-            f'got {text}: give a number above 0 and below 1'
-        )
-    return value
+def _number(fits: Callable[[float], bool], wanted: str) -> Callable[[str], float]:
+    """Return the type of an option that is a number which fits."""
+
+    def parsed(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f'got {text}: give {wanted}')
+        return value
+
+    return parsed
 
 
-def _finite(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f'got {text}: give a number')
-    return value
-
-
-def _magnitude(text: str) -> float:
-    value = _finite(text)
-    if value < 0.0:
-        raise argparse.ArgumentTypeError(f'got {text}: give at least 0')
-    return value
-
-
-def _size(text: str) -> float:
-    value = _finite(text)
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError(f'got {text}: give a number above 0')
-    return value
+_finite = _number(math.isfinite, 'a number')
+_share = _number(lambda x: 0.0 < x < 1.0, 'a number above 0 and below 1')
+_magnitude = _number(lambda x: 0.0 <= x < math.inf, 'a number of at least 0')
+_size = _number(lambda x: 0.0 < x < math.inf, 'a number above 0')
 
 
 def _parameter_file(text: str) -> Path:
