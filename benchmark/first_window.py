@@ -139,7 +139,7 @@ def cycle_row(name: str) -> list[str]:
     pairs = zip(found['detected'], cycles, strict=True)
     changes = (f'{len(each.model_changes)} of {c.changes()}' for each, c in pairs)
     models = [
-        joined(percent(each.final_parameter_error) for each in found[law])
+        joined(percent(each.parameter_error.end) for each in found[law])
         for law in ('detected', 'not detected')
     ]
     errors = [
@@ -214,7 +214,7 @@ def sine_row(name: str, shaken: str) -> list[str]:
         name,
         shaken,
         f'{len(learning.model_changes)}',
-        percent(learning.final_parameter_error),
+        percent(learning.parameter_error.end),
         milliradians(learning),
         milliradians(without),
     ]

@@ -46,8 +46,7 @@ SOURCE = Path(__file__).with_name('reference.c')
 # The package's kernels are compiled for the native processor too; contraction would
 # change the numbers that are compared.
 FLAGS = ('-O3', '-march=native', '-ffp-contract=off')
-# joints, parameters, columns of a row: xi1, torque, theta
-_N = 2
+# parameters, columns of a row: xi1, torque, theta
 _P = 3
 _COLUMNS = 9
 Step = Callable[[float, np.ndarray], None]

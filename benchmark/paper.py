@@ -181,7 +181,7 @@ class Results(NamedTuple):
 
     def parameter_errors(self, *names: str) -> list[float]:
         """Return the relative parameter error of each case after 60 s."""
-        return [self.metrics[name].parameter_error[60] for name in names]
+        return [self.metrics[name].parameter_error.at[60] for name in names]
 
 
 def run_case(case: Case) -> tuple[Metrics, Run | None]:
@@ -515,7 +515,7 @@ def side_by_side(results: Results) -> Iterator[list[str]]:
     yield ['law', *columns, 'parameter error at 60 s', 'bound']
     for preset, label in SIDE_BY_SIDE.items():
         metrics = results.metrics[preset]
-        error = metrics.parameter_error[60]
+        error = metrics.parameter_error.at[60]
         yield [
             label,
             *(
@@ -563,7 +563,7 @@ def draw_robustness(results: Results, folder: Path) -> None:
                 'label': SIDE_BY_SIDE[law],
             }
             ratios = [min(each.max_error_ratio, _BROKEN) for each in found.values()]
-            errors = [100.0 * each.tail_parameter_error for each in found.values()]
+            errors = [100.0 * each.parameter_error.tail for each in found.values()]
             upper.plot([*found], ratios, **style)
             lower.plot([*found], errors, **style)
         upper.axhline(1.0, color=ALARM, lw=1.2, ls='--')

@@ -88,7 +88,7 @@ def cost_of(metrics: Metrics, sample_time: float) -> float:
     """
     largest = np.log10(metrics.max_error_ratio)
     typical = np.log10(np.linalg.norm(metrics.rms_error))
-    learned = np.log10(metrics.tail_parameter_error + 1e-12)
+    learned = np.log10(metrics.parameter_error.tail + 1e-12)
     rough = np.log10(max(metrics.torque_rate) * sample_time / ROUGHEST)
     value = largest + typical + learned + 10.0 * (max(largest, 0.0) + max(rough, 0.0))
     return float(value) if np.isfinite(value) else HOPELESS

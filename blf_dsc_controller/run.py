@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -113,13 +113,27 @@ class JointUnits(NamedTuple):
     position: str
     torque: str
 
+    inertia: str
+
     def of(self, unit: str) -> str:
-        """Return the unit of a joint that slides for one of a joint that turns."""
-        return unit.replace('rad', self.position).replace('N m', self.torque)
+        """Return the unit of such a joint for that of a joint that turns."""
+        for turning, own in zip(TURNING, self, strict=True):
+            unit = unit.replace(turning, own)
+        return unit
 
 
-TURNING = JointUnits('rad', 'N m')
-SLIDING = JointUnits('m', 'N')
+TURNING = JointUnits('rad', 'N m', 'kg m^2')
+SLIDING = JointUnits('m', 'N', 'kg')
+
+
+def joint_units(kind: str) -> JointUnits:
+    """Return the units of a kind of joint of a URDF."""
+    return SLIDING if kind == 'prismatic' else TURNING
+
+
+def unit_of_all(units: Iterable[JointUnits], unit: str) -> str:
+    """Return the unit, or both units, of several joints for that of joints that turn."""
+    return ' or '.join(dict.fromkeys(each.of(unit) for each in units))
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,9 @@ from blf_dsc_controller.analysis.output import plain, write_json
 from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.factory.estimate import learned_arm
+from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LATE_STEPS
-from blf_dsc_controller.run import LearnedArm, Run, Series
+from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 SAMPLES = 10_000
@@ -59,6 +60,15 @@ def test_tracking(run):
     assert metrics.torque_rate == pytest.approx((8.0 * rate, 3.0 * rate), rel=1e-4)
 
 
+def test_joint_that_left_its_bound_is_not_the_one_that_caused_it(run):
+    text = (
+        "joint 'shoulder' has demanded more than its torque limit of 40 N m for 0.1 s: carry "
+        "less; joint 'elbow' is +0.0021 rad from its reference: past its bound of 0.002 rad"
+    )
+    stop = Stop(int(run.stamp[500]), OUTSIDE_BOUND, text)
+    assert measure(replace(run, stops=(stop,))).violating_joint == 'elbow'
+
+
 def test_first_violation_is_the_earliest_of_all_joints(run):
     error = run.error.copy()
     error[4000, 0] = 0.0021
@@ -76,22 +86,26 @@ def test_learning(run):
     metrics = measure(run)
     assert metrics.latch_time == pytest.approx(LATCH_S)
     errors = {
-        t: error for t, error in metrics.parameter_error.items() if not np.isnan(error)
+        t: error
+        for t, error in metrics.parameter_error.at.items()
+        if not np.isnan(error)
     }
     # The run ends one sample before 10 s, which counts as 10 s.
     assert errors == {
         5: pytest.approx(0.5 * np.exp(-3.5)),
-        10: metrics.final_parameter_error,
+        10: metrics.parameter_error.end,
     }
-    assert metrics.final_parameter_error == pytest.approx(0.5 * np.exp(-8.499))
+    assert metrics.parameter_error.end == pytest.approx(0.5 * np.exp(-8.499))
     # 0.5 exp(-t) = 0.01 at t = ln 50 after the latch, seen at the next sample.
-    assert metrics.time_to_1_percent == pytest.approx(LATCH_S + np.log(50), abs=1e-3)
+    assert metrics.parameter_error.time_to_1_percent == pytest.approx(
+        LATCH_S + np.log(50), abs=1e-3
+    )
     assert metrics.true == dict(zip(PARAMETERS, TRUE, strict=True))
     assert list(metrics.estimate) == list(PARAMETERS)
     values = run.monitor.values.copy()
     values[-1, 0] = 0.0  # it has to stay below
     left = replace(run, monitor=replace(run.monitor, values=values))
-    assert np.isnan(measure(left).time_to_1_percent)
+    assert np.isnan(measure(left).parameter_error.time_to_1_percent)
 
 
 def test_parameter_error_is_unknown_at_moments_before_the_first_estimate(run):
@@ -99,8 +113,8 @@ def test_parameter_error_is_unknown_at_moments_before_the_first_estimate(run):
     stamp, values = run.monitor.stamp[6000:], run.monitor.values[6000:]
     late = replace(run, monitor=replace(run.monitor, stamp=stamp, values=values))
     metrics = measure(late)
-    assert np.isnan(metrics.parameter_error[5])
-    assert metrics.parameter_error[10] == metrics.final_parameter_error
+    assert np.isnan(metrics.parameter_error.at[5])
+    assert metrics.parameter_error.at[10] == metrics.parameter_error.end
 
 
 def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
@@ -110,7 +124,7 @@ def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
     error = recorded_run.relative_error(1e-3 * np.arange(SAMPLES))
     last = error[3e-3 * np.arange(SAMPLES) >= 29.997 - 10.0]
     expected = np.sqrt(np.mean(last**2))
-    assert measure(slow).tail_parameter_error == pytest.approx(expected, rel=1e-9)
+    assert measure(slow).parameter_error.tail == pytest.approx(expected, rel=1e-9)
 
 
 def test_parameter_error_is_shown_in_percent(run):
@@ -209,7 +223,7 @@ def test_unknown_values_are_null_and_never_nan(run, tmp_path):
             'learns',
             'model_changes',
         ),
-        *('rejected_columns', 'loads', 'of_torques', 'parameter_error'),
+        *('rejected_columns', 'loads', 'parameter_error'),
     }
 
 
@@ -219,7 +233,7 @@ def test_estimates_are_compared_only_with_a_truth_of_the_same_parameters(run):
     renamed = {'monitor': replace(run.monitor, names=names)}
     for changes, expected in (({'truth': None}, PARAMETERS), (renamed, others)):
         metrics = measure(replace(run, **changes))
-        assert np.isnan(metrics.final_parameter_error)
+        assert np.isnan(metrics.parameter_error.end)
         assert metrics.true is None
         assert list(metrics.estimate) == list(expected)
         assert 'parameters' not in format_table(metrics)
@@ -274,8 +288,9 @@ def test_learning_begins_only_in_a_law_that_learns_in_simulation_and_its_bag(
     write_bag(tmp_path / 'bag', record)
     simulated = measure(record.run())
     recorded = measure(read_run(tmp_path / 'bag'))
-    tail = simulated.tail_parameter_error  # of every sample
-    assert plain(replace(recorded, tail_parameter_error=tail)) == plain(simulated)
+    tail = simulated.parameter_error.tail  # of every sample
+    found = replace(recorded.parameter_error, tail=tail)
+    assert plain(replace(recorded, parameter_error=found)) == plain(simulated)
     assert record.run().monitor.column('latched')[-1] == 1.0
     assert f'learning    {line}' in format_table(recorded)
     assert np.isnan(recorded.latch_time) == bool(changes)
@@ -321,11 +336,11 @@ def run_of(estimate, true=P, regressor=pendulum):
 
 
 def test_parameter_error_is_the_torque_error_along_the_reference():
-    assert measure(run_of(1.1 * P)).final_parameter_error == pytest.approx(0.1)
-    assert measure(run_of(P * (1.0, 1.0, 7.0))).final_parameter_error == pytest.approx(
+    assert measure(run_of(1.1 * P)).parameter_error.end == pytest.approx(0.1)
+    assert measure(run_of(P * (1.0, 1.0, 7.0))).parameter_error.end == pytest.approx(
         0.0
     )
-    off = measure(run_of(P * (1.25, 1.0, 1.0))).final_parameter_error
+    off = measure(run_of(P * (1.25, 1.0, 1.0))).parameter_error.end
     expected = np.linalg.norm(0.5 * np.sin(TIME)) / np.linalg.norm(
         3.0 - 2.0 * np.sin(TIME)
     )
@@ -373,13 +388,13 @@ def test_regressor_is_evaluated_along_the_reference():
 
 def test_table_and_summary_name_the_torque_error():
     run = run_of(1.1 * P)
-    assert measure(run).of_torques
+    assert measure(run).parameter_error.of_torques
     line = (
         'torque error of the learned model 5 s 10 %, 10 s 10 %, end 10 %; not below 1 %'
     )
     assert f'model       {line}' in format_table(measure(run)).splitlines()
     still = replace(run, reference=np.full_like(run.reference, np.nan))
-    assert np.isnan(measure(still).final_parameter_error)
+    assert np.isnan(measure(still).parameter_error.end)
     assert 'torque error' not in format_table(measure(still))
 
 

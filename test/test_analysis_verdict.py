@@ -10,7 +10,7 @@ import pytest
 import recorded_run
 from recorded_run import Synthetic
 
-from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller.analysis.metrics import ParameterError, measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.verdict import figures_of, verdict_of
 from blf_dsc_controller.bags.reader import read_run
@@ -76,22 +76,22 @@ def load(mass, interval):
             ('2.000 kg', '± 0.05 kg'),
         ),
         (
-            {'final_parameter_error': 0.012, 'of_torques': True},
+            {'parameter_error': ParameterError(of_torques=True, end=0.012)},
             'model error',
             ('1.2 %', 'of the torque, at the end'),
         ),
         (
-            {'final_parameter_error': nan, 'learns': False},
+            {'parameter_error': ParameterError(), 'learns': False},
             'model',
             ('given', 'this law learns none'),
         ),
         (
-            {'final_parameter_error': nan, 'learns': True, 'latch_time': nan},
+            {'parameter_error': ParameterError(), 'learns': True, 'latch_time': nan},
             'model',
             ('as given', 'learning never began'),
         ),
         (
-            {'final_parameter_error': nan, 'learns': True, 'latch_time': 1.5},
+            {'parameter_error': ParameterError(), 'learns': True, 'latch_time': 1.5},
             'model',
             ('learned', 'from 1.5 s on'),
         ),

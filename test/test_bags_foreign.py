@@ -210,6 +210,7 @@ def test_wrong_names_are_reported_with_the_names_in_the_bag(bag, tmp_path):
         (path, swapped, r'/arm/torque \(std_msgs'),
         (path, {'joint1': 'x'}, "'x' is not in .* gripper, elbow"),
         (bag, {**dict.fromkeys(MAP), 'joint3': 'base'}, 'nor one of the joints'),
+        (bag, {**dict.fromkeys(MAP), 'joint1': 'joint2'}, 'map joint2, too; expected'),
     ):
         with pytest.raises(BlfDscError, match=message):
             read_run(each, names=names_of(**changes))

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import recorded_run
 from command import finished
@@ -20,6 +21,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.cli.run import loop_configuration, notes_on_ideal_arm
 from blf_dsc_controller.compiled.announcement import COMPILING
+from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 
 INTERRUPTED_WHILE_COMPILING = """
@@ -146,6 +148,14 @@ def test_file_of_another_kind_or_place_is_answered_with_what_to_give(
         ('commission --config ur5e --margin 1', 'got 1: give a number above 0 and be'),
         ('commission --config ur5e --torque 5', 'got 5: give a number above 0 and be'),
         ('commission --config ur5e --torque ?', 'got ?: give a number above 0 and be'),
+        ('excite e.yaml --config ur5e --radius 0', 'got 0: give a number above 0'),
+        ('excite e.yaml --config ur5e --radius nan', 'got nan: give a number'),
+        ('excite e.yaml --config ur5e --floor inf', 'got inf: give a number'),
+        ('identify bag --urdf a.urdf --gravity 0 nan 0', 'got nan: give a number'),
+        (
+            'identify bag --urdf a.urdf --rated-payload -1',
+            'got -1: give a number of at least 0',
+        ),
     ],
 )
 def test_wrong_option_is_one_line_with_what_to_type(words, answer, capsys):
@@ -265,6 +275,11 @@ def test_what_other_packages_call_it_is_answered_with_our_name(
             'two_link.urdf',
             'the recording lasts 1.96 s; record at least 5 s',
         ),
+        (
+            'time,q1,q2,tau1,tau2\n0,1,1,2,2\n.1,2,2,3,3\n',
+            'two_link.urdf',
+            'there are 2 joint state(s) with a position, a torque and a unique stamp; ',
+        ),
     ],
 )
 def test_recording_that_shows_nothing_is_told(
@@ -275,6 +290,54 @@ def test_recording_that_shows_nothing_is_told(
     (tmp_path / 'fixed.urdf').write_text('<robot name="a"><link name="b"/></robot>')
     assert main(['identify', 'run.csv', '--urdf', urdf, '--out', 'new.urdf']) == 1
     assert answer in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('words', 'answer'),
+    [
+        ('run.csv --gains 0 1', 'got a gain of 0 for joint1: give its torque per '),
+        ('run.csv --gains 1 nan', 'got a gain of nan for joint2: give its torque per '),
+        (
+            'run.csv two.csv',
+            'there are 2 joint state(s) with a position, a torque and ',
+        ),
+        ('run.csv --payload two.csv', 'there are 2 joint state(s) with a position, a '),
+        (
+            'run.csv --foresee',
+            'only 0 windows of 0.2 s have no gaps: record at least 1 s',
+        ),
+        (
+            'gaps.csv --foresee',
+            'only 0 windows of 0.2 s have no gaps: record at least 1',
+        ),
+    ],
+)
+def test_recording_that_cannot_be_identified_is_told_in_one_line(
+    words, answer, tmp_path, monkeypatch, capsys
+):
+    """Of 0.19 s; of two states; of four states at a time, and pauses."""
+    monkeypatch.chdir(tmp_path)
+    times = 0.01 * np.arange(20), 0.01 * (np.arange(400) + 10 * (np.arange(400) // 4))
+    for name, time in zip(('run', 'gaps'), times, strict=True):
+        rows = np.column_stack((time, *(np.sin(k + time) for k in range(4))))
+        header = 'time,q1,q2,tau1,tau2'
+        np.savetxt(f'{name}.csv', rows, '%.9f', ',', header=header, comments='')
+    Path('two.csv').write_text('\n'.join(Path('run.csv').read_text().splitlines()[:3]))
+    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
+    Path('a.urdf').write_text(urdf)
+    main(['identify', *words.split(), '--urdf', 'a.urdf', '--out', 'new.urdf'])
+    *_, error = capsys.readouterr().err.splitlines()
+    assert answer in error
+
+
+def test_limit_of_a_urdf_that_is_no_number_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
+    Path('a.urdf').write_text(re.sub('velocity="[^"]*"', 'velocity="fast"', urdf))
+    rows = ''.join(f'{k / 50},{k / 99},1,2,{k}\n' for k in range(99))
+    Path('run.csv').write_text(f'time,q1,q2,tau1,tau2\n{rows}')
+    assert main(['identify', 'run.csv', '--urdf', 'a.urdf', '--out', 'new.urdf']) == 1
+    assert '<limit velocity="fast">: expected 1 finite' in capsys.readouterr().err
 
 
 def test_mapping_that_is_none_is_told_before_work_is_announced(capsys):

@@ -48,7 +48,7 @@ from blf_dsc_controller.commissioning.motion import (
     excitation,
     lines_in,
 )
-from blf_dsc_controller.commissioning.own_loop import REPEATS
+from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.page import errors_table, sentences, table
 from blf_dsc_controller.commissioning.planned import measuring_gains, plan
 from blf_dsc_controller.commissioning.postures import PostureByPosture
@@ -1276,8 +1276,8 @@ def test_gains_far_from_those_of_the_measurement_are_to_be_raised_in_steps():
 
 
 def test_errors_above_100_mrad_are_told_without_an_exponent():
-    rows = errors_table(('joint1',), Errors(np.array([0.1293]), np.array([0.28])))
-    assert rows.split()[-3:] == ['joint1', '130', '280']
+    errors = Errors(np.array([0.1293, 0.0]), np.array([0.28, 0.0]))
+    assert errors_table(CONFIG, errors).split()[-6:-3] == ['joint1', '130', '280']
 
 
 def test_frequencies_above_100_hz_are_told_without_an_exponent():
@@ -1381,10 +1381,25 @@ def test_period_of_a_run_has_all_of_its_samples(period, T):
         np.testing.assert_array_equal(np.diff(values[:, 0]), 1.0)
 
 
+@pytest.mark.parametrize(
+    ('given', 'answer'),
+    [
+        ({'torque': 0.0}, 'torque: got 0, but it must be above 0'),
+        ({'travel': -0.01}, 'travel: got -0.01, but it must be above 0'),
+        ({'travel': np.nan}, 'travel: got nan, but it must be above 0'),
+    ],
+)
+def test_measures_of_a_motion_that_cannot_be_are_refused(given, answer):
+    with pytest.raises(BlfDscError, match=answer):
+        Commissioning(CONFIG, **given)
+
+
 def test_proof_has_the_largest_error_of_its_whole_run_or_the_reason_of_a_stop():
     loop = load_loop('recommended', {PLANT: {'duration': 0.5}})
     error = simulate(loop.controller, loop.plant).run().error
-    assert simulated.proof(loop) == (0.5, np.abs(error).max(), '', [])
+    proof = simulated.proof(loop)
+    np.testing.assert_array_equal(proof.error, np.abs(error).max(axis=0))
+    assert proof == (0.5, proof.error, '', [])
     slow = change(loop.controller, {'safety.velocity_limit': 0.02})
     assert 'velocity_limit' in simulated.proof(loop._replace(controller=slow)).stop
 

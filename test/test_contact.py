@@ -277,7 +277,7 @@ def test_run_and_its_bag_say_what_touched_the_arm(tmp_path, held, held_bag, free
         assert (found['time'], found['joint']) == (time, contact.joint)
         line = f'contacts    1: at {time:.3f} s {contact.torque:+.3g} N m on {contact.joint}'
         assert line in format_table(metrics)
-        assert metrics.final_parameter_error < 0.01
+        assert metrics.parameter_error.end < 0.01
         shown = {panel.title: panel for panel in panels([run])}
         panel = shown[f'external torque on {contact.joint}']
         torque, interval = panel.lines

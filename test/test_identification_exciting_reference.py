@@ -14,7 +14,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.clearance import Clearance, distance
 from blf_dsc_controller.identification.exciting_reference import (
@@ -143,6 +143,19 @@ def test_predicted_information_of_a_panda_matches_its_loop():
     assert found.gain == pytest.approx(gain, rel=0.01)
     assert found.left == pytest.approx(np.exp(-0.5 * gain / len(Phi)), rel=0.01)
     assert found.ratios[1].max() > 0.8
+
+
+def test_ripple_has_the_columns_of_the_law():
+    config = change(chain_problem()[0], {'learning.ripple_cycles': [2.0]})
+    problem = ExcitationProblem(config, 1, 0.02, -3.0)
+    q = np.linspace(0.0, 1.0, 3 * 64).reshape(64, 3)
+    rows = problem._rows(q, 0.0 * q, 0.0 * q)
+    assert rows.shape == (64, 3, settings_of_config(config).m)
+    for i in range(3):
+        sine, cosine = rows[:, i, -6 + i], rows[:, i, -3 + i]
+        np.testing.assert_array_equal(sine, np.sin(2.0 * q[:, i]))
+        np.testing.assert_array_equal(cosine, np.cos(2.0 * q[:, i]))
+    assert problem.evaluate(problem.parameters(np.ones(3 + 6))).gain > 0.0
 
 
 def test_lack_of_room_counts_as_an_excess():

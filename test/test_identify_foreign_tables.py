@@ -239,6 +239,16 @@ def test_table_that_was_cut_off_and_one_with_empty_cells_are_read(tmp_path):
     assert 'line 61: got 4 cells' in refused(path)
 
 
+@pytest.mark.parametrize('delimiter', [' ', ','])
+def test_row_with_a_cell_too_many_is_refused(tmp_path, delimiter):
+    names = ['t', *numbered('q'), *numbered('tau')]
+    path = written(tmp_path / 'a.txt', names, (TIME, Q, TAU), delimiter)
+    lines = path.read_text().splitlines()
+    lines[60] = lines[60].replace(delimiter, f'{delimiter}7{delimiter}', 1)
+    path.write_text('\n'.join(lines))
+    assert 'line 61: got 14 cells, but the first lines have 13' in refused(path)
+
+
 # Units.
 
 

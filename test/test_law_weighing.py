@@ -123,7 +123,7 @@ def test_load_of_every_cycle_from_the_first_on_is_weighed(name, first, within):
     picks_and_places = np.concatenate((begin, begin + CARRIED))
     metrics = measure(record.run())
     assert len(metrics.model_changes) == np.sum(picks_and_places < END_OF_CYCLES)
-    assert metrics.final_parameter_error < 0.08
+    assert metrics.parameter_error.end < 0.08
 
 
 def test_lightest_hand_is_taken_for_empty_if_the_run_begins_with_a_load():

@@ -207,7 +207,7 @@ def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_pane
     (name,) = rejected_columns(record.controller, names)
     assert name == column.partition(':')[0]
     assert f'rejected    {column}: ' in format_table(metrics)
-    assert metrics.final_parameter_error < 0.5
+    assert metrics.parameter_error.end < 0.5
     (panel,) = (panel for panel in panels([run]) if panel.group == 'Monitors')
     *terms, V = panel.lines
     assert [line.name for line in terms] == [

@@ -327,8 +327,11 @@ def test_tolerance_of_minus_one_allows_everything(loop):
     assert client.result(handle)[0] == SUCCEEDED
     handle = client.follow(point(FAR, LONG))
     followed = law.action._goals._followed
-    outside = np.array([[0.0, 1.01], [9.0, 9.0]]) * law.guard.controller.sample.bound
-    found = followed.path.violation(JOINTS, outside, law.guard.controller.sample.bound)
+    guard = law.guard
+    outside = np.array([[0.0, 1.01], [9.0, 9.0]]) * guard.controller.sample.bound
+    found = followed.path.violation(
+        guard.config, outside, guard.controller.sample.bound
+    )
     assert "'joint2' is " in found
     client.cancel(handle)
 

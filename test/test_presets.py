@@ -70,7 +70,7 @@ def test_preset_runs_by_name_and_saves_its_configuration(
     assert ('held by every joint' in printed) is held
     from_urdf = saved.model == 'urdf'
     assert ('torque error of the learned model' in printed) is from_urdf
-    assert summary['of_torques'] is from_urdf
+    assert summary['parameter_error']['of_torques'] is from_urdf
 
 
 @pytest.mark.usefixtures('blank_pictures')

@@ -183,7 +183,7 @@ def test_table_of_the_laws_matches_the_presets(found):
         values = 1e3 * np.array(metrics['max_error'] + metrics['rms_error'])
         np.testing.assert_allclose(values, np.array(errors, float), rtol=0.01)
         if parameter_error:
-            percent = 100 * metrics['final_parameter_error']
+            percent = 100 * metrics['parameter_error']['end']
             assert percent == pytest.approx(float(parameter_error), rel=0.1)
 
 

@@ -667,8 +667,8 @@ def test_arm_that_stands_still_under_noise_is_named_but_not_taken_for_braked():
     assert np.abs(steps).max() > 2.0  # a tenth of the limit
     measured = np.sqrt(rig.guard.controller.checks.effect.chatter)
     assert measured == pytest.approx(np.sqrt((steps**2).mean(axis=0)), rel=0.2)
-    assert 'joint1 changes by' in chatter_of(rig.guard.controller, JOINTS)
-    assert chatter_of(quiet.guard.controller, JOINTS) == ''
+    assert 'joint1 changes by' in chatter_of(rig.guard.controller, rig.guard.config)
+    assert chatter_of(quiet.guard.controller, quiet.guard.config) == ''
 
 
 def test_estimates_are_discarded_by_a_reset_at_once():

@@ -133,7 +133,7 @@ def test_feedback_is_softened_until_the_arm_is_calm_and_names_joint_and_frequenc
 
 
 def test_oscillation_above_100_hz_has_no_exponent():
-    shaking = calming.Shaking('joint1', 194.0, 118.0)
+    shaking = calming.Shaking('joint1', 194.0, 118.0, 'N m')
     assert shaking.text == "joint 'joint1' oscillates at 190 Hz with +-120 N m"
 
 
@@ -218,7 +218,7 @@ def test_arm_that_stops_in_want_of_torque_is_said_to_be_at_its_limit():
 def test_rate_limit_that_delays_the_torque_is_named():
     config = load_loop('recommended').controller
     law = controller_of(config)
-    cause = StopCause(config.joints, law, Calming(config, law))
+    cause = StopCause(config, law, Calming(config, law))
     assert cause.text(0.0) == ''
     cause.take_limited(1)
     law.signals.saturation.cuts[:] = 0.0, RATE_CUT

@@ -188,13 +188,14 @@ def test_r_fades_out_and_comes_back_smoothly_and_stays_whole_without_doubt():
 
 
 def test_joint_that_shows_it_is_named_with_its_own_difference():
-    law = controller_of(load_loop('fr3_direct').controller)
+    config = load_loop('fr3_direct').controller
+    law = controller_of(config)
     law.state.sensors.fault[0] = OFF
     law.state.sensors.joint[0] = 2
     law.signals.sensors.differences[0, :3] = [1.0, 2.0, -3.5]
-    joints = [f'j{i}' for i in range(7)]
-    assert "the effort of joint 'j2' is off -3.5 N m" in text_of(law, joints)
-    assert joint_of(law, joints) == 'j2'
+    joint = config.joints[2]
+    assert f'the effort of joint {joint!r} is off -3.5 N m' in text_of(law, config)
+    assert joint_of(law, config.joints) == joint
 
 
 def loop_of(preset, seconds, **plant):

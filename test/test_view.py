@@ -460,7 +460,7 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     )
     assert 8.0 < at < 8.1
     assert abs(torque) > float(details['model error and noise'].split()[0])
-    (event,) = events_with(view, 'external torque on joint1')
+    (event,) = events_with(view, "N m on joint 'joint1', and model error")
     assert event[:2] == (pytest.approx(at, abs=1e-3), 'contact')
     # Once it has ended, all of it can be looked at.
     assert view.page.slider is None

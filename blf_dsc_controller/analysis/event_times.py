@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from operator import itemgetter
 
 import numpy as np
@@ -77,7 +78,7 @@ def first_violation(run: Run) -> tuple[float, str]:
     counts.
     """
     found = [
-        (time, next((joint for joint in run.joints if f'{joint!r}' in stop.text), ''))
+        (time, _left(run.joints, stop.text))
         for time, stop in run.timed_stops
         if stop.reason == OUTSIDE_BOUND
     ]
@@ -86,3 +87,8 @@ def first_violation(run: Run) -> tuple[float, str]:
         if violated is not None and violated.any():
             found.append((float(run.time[violated.argmax()]), joint))
     return min(found, key=itemgetter(0), default=(math.nan, ''))
+
+
+def _left(joints: Sequence[str], text: str) -> str:
+    """Return the joint that is past its bound; a stop's text may name another as the cause."""
+    return next((joint for joint in joints if f'joint {joint!r} is ' in text), '')

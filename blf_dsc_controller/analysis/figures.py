@@ -210,7 +210,7 @@ def _motion_title(run: Run, metrics: Metrics) -> str:
 
 def _learning_title(run: Run, metrics: Metrics) -> str:
     """Return the error of what was learned at the end, if the truth is known."""
-    error = metrics.final_parameter_error
+    error = metrics.parameter_error.end
     if math.isnan(error):
         return 'Learning'
     what = 'relative parameter error' if run.arm is None else 'torque error'

@@ -28,7 +28,7 @@ from blf_dsc_controller.messages.topics import (
     LOAD,
     TOOL,
 )
-from blf_dsc_controller.run import Floats, Run
+from blf_dsc_controller.run import SLIDING, TURNING, Floats, JointUnits, Run
 
 MOMENTS = (5, 10, 20, 40, 60)
 """Times at which the parameter error is reported [s]."""
@@ -55,6 +55,21 @@ def tool_errors(run: Run) -> Floats | None:
         reference, error, bound = (np.asarray(each[some]) for each in arrays)
         found[some] = run.tool(reference, error, bound)
     return found
+
+
+@dataclass(frozen=True)
+class ParameterError:
+    """How far the estimates are off the truth: `Estimates.relative_error`; NaN if unknown."""
+
+    #: whether it is that of the model's torques, as of a URDF's arm
+    of_torques: bool = False
+    at: dict[int, float] = field(
+        default_factory=lambda: dict.fromkeys(MOMENTS, math.nan)
+    )  #: MOMENTS
+    end: float = math.nan
+    tail: float = math.nan  #: rms over the last ten seconds
+    #: s, after which it stays below 1 %
+    time_to_1_percent: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -98,15 +113,11 @@ class Metrics:
     # what was learned, beside the truth
     estimate: dict[str, float] | None = None  #: at the end
     true: dict[str, float] | None = None  #: at the end
-    #: whether the parameter errors are those of the model's torques, as of a URDF's arm
-    of_torques: bool = False
-    parameter_error: dict[int, float] = field(
-        default_factory=lambda: dict.fromkeys(MOMENTS, math.nan)
-    )  #: `Estimates.relative_error` at MOMENTS
-    final_parameter_error: float = math.nan
-    tail_parameter_error: float = math.nan  #: rms over the last ten seconds
-    #: s, after which the parameter error stays below 1 %
-    time_to_1_percent: float = math.nan
+    parameter_error: ParameterError = field(default_factory=ParameterError)
+
+    def units(self, joint: str) -> JointUnits:
+        """Return the units of a joint."""
+        return SLIDING if joint in self.sliding else TURNING
 
     @property
     def left_at_stop(self) -> bool:
@@ -183,11 +194,13 @@ def _learning(of: Estimates) -> dict[str, Any]:
     if error is None:
         return found
     return found | {
-        'of_torques': of.of_torques,
-        'parameter_error': _at_moments(at, error),
-        'final_parameter_error': float(error[-1]),
-        'tail_parameter_error': rms(error[at >= at[-1] - _TAIL]),
-        'time_to_1_percent': _settled(at, error),
+        'parameter_error': ParameterError(
+            of_torques=of.of_torques,
+            at=_at_moments(at, error),
+            end=float(error[-1]),
+            tail=rms(error[at >= at[-1] - _TAIL]),
+            time_to_1_percent=_settled(at, error),
+        )
     }
 
 

@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from blf_dsc_controller.analysis.metrics import Metrics
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.messages.topics import LOAD
-from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
 
 _SHOWN_CONTACTS = 3
 _OFTEN = 0.01  # of the samples
@@ -36,7 +35,7 @@ def rows(metrics: Metrics) -> list[list[str]]:
     """Return the table of the joints, with its heading."""
     found = [['', *_TABLE]]
     for i, joint in enumerate(metrics.joints):
-        units = _units(metrics, joint)
+        units = metrics.units(joint)
         values = ((getattr(metrics, name)[i], *form) for name, *form in _TABLE.values())
         cells = (
             f'{factor * value:.{decimals}f} {units.of(unit)}'
@@ -54,7 +53,7 @@ def sentences(of: Metrics) -> Iterator[tuple[str, str]]:
     yield 'bound', _bound_text(of)
     bounds = zip(of.joints, of.widest_bound, of.bound, strict=True)
     wider = [
-        f'{joint} {1e3 * widest:.3g} {_units(of, joint).of("mrad")}'
+        f'{joint} {1e3 * widest:.3g} {of.units(joint).of("mrad")}'
         for joint, widest, bound in bounds
         if widest > bound
     ]
@@ -65,7 +64,7 @@ def sentences(of: Metrics) -> Iterator[tuple[str, str]]:
     for stop in of.stops:
         yield 'stopped', f'at {stop["time"]:.3f} s, {stop["reason"]}: {stop["text"]}'
     if of.contacts is not None:
-        yield 'contacts', contacts_text(of.contacts)
+        yield 'contacts', contacts_text(of)
     if of.estimate is not None:
         yield from _learning_lines(of)
     for load in of.loads:
@@ -75,10 +74,6 @@ def sentences(of: Metrics) -> Iterator[tuple[str, str]]:
         )
     if of.timing is not None:
         yield 'real time', _timing_text(of.timing, of.samples)
-
-
-def _units(of: Metrics, joint: str) -> JointUnits:
-    return SLIDING if joint in of.sliding else TURNING
 
 
 def _bound_text(of: Metrics) -> str:
@@ -121,15 +116,18 @@ def tool_text(tool: Mapping[str, float]) -> str:
     return f'{mm}; {mrad}; at most {share}'
 
 
-def contacts_text(contacts: Sequence[Mapping[str, Any]]) -> str:
+def contacts_text(of: Metrics) -> str:
     """Return `Metrics.contacts` in words."""
+    contacts = of.contacts or []
     if not contacts:
         return '0'
-    shown = [
-        f'at {each["time"]:.3f} s {each["torque"]:+.3g} N m on {each["joint"]} (model error and '
-        f'noise: {each["interval"]:.2g} N m)'
-        for each in contacts[:_SHOWN_CONTACTS]
-    ]
+    shown = []
+    for each in contacts[:_SHOWN_CONTACTS]:
+        unit = of.units(each['joint']).torque
+        shown.append(
+            f'at {each["time"]:.3f} s {each["torque"]:+.3g} {unit} on {each["joint"]} (model error '
+            f'and noise: {each["interval"]:.2g} {unit})'
+        )
     more = len(contacts) - len(shown)
     if more:
         shown.append(f'{more} more')
@@ -154,19 +152,19 @@ def _learning_lines(of: Metrics) -> Iterator[tuple[str, str]]:
             'rejected',
             f'{columns}: this motion cannot distinguish them from the other columns',
         )
-    if math.isnan(of.final_parameter_error):
+    off = of.parameter_error
+    if math.isnan(off.end):
         return
     title, what = 'parameters', 'error'
-    if of.of_torques:
+    if off.of_torques:
         title, what = 'model', 'torque error of the learned model'
     shown = [
         f'{t} s {100 * error:.3g} %'
-        for t, error in of.parameter_error.items()
+        for t, error in off.at.items()
         if not math.isnan(error)
     ]
-    shown.append(f'end {100 * of.final_parameter_error:.3g} %')
-    settled = of.time_to_1_percent
+    shown.append(f'end {100 * off.end:.3g} %')
     ending = 'not below 1 %'
-    if not math.isnan(settled):
-        ending = f'below 1 % from {settled:.3f} s on'
+    if not math.isnan(off.time_to_1_percent):
+        ending = f'below 1 % from {off.time_to_1_percent:.3f} s on'
     yield title, f'{what} {", ".join(shown)}; {ending}'

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from blf_dsc_controller.analysis.metrics import Metrics
 from blf_dsc_controller.messages.topics import LOAD
-from blf_dsc_controller.run import SLIDING, TURNING
 
 GOOD, BAD, UNKNOWN = 'good', 'bad', 'unknown'
 _MASS, _SPREAD = LOAD[0], LOAD[4]
@@ -68,7 +67,7 @@ def _error(of: Metrics) -> Figure:
         return Figure('largest error', '-', 'not recorded')
     worst = max(known, key=lambda i: of.max_error[i])
     joint = of.joints[worst]
-    unit = (SLIDING if joint in of.sliding else TURNING).of('mrad')
+    unit = of.units(joint).of('mrad')
     return Figure('largest error', f'{1e3 * of.max_error[worst]:.3g} {unit}', joint)
 
 
@@ -83,13 +82,13 @@ def _load(of: Metrics) -> Figure:
 
 
 def _model(of: Metrics) -> Figure:
-    if not math.isnan(of.final_parameter_error):
+    if not math.isnan(of.parameter_error.end):
         what = (
             'of the torque, at the end'
-            if of.of_torques
+            if of.parameter_error.of_torques
             else 'of the parameters, at the end'
         )
-        return Figure('model error', f'{100.0 * of.final_parameter_error:.3g} %', what)
+        return Figure('model error', f'{100.0 * of.parameter_error.end:.3g} %', what)
     if not of.learns:
         return Figure('model', 'given', 'this law learns none')
     if math.isnan(of.latch_time):

@@ -333,6 +333,11 @@ class Tree(NamedTuple):
         ranges = [_range(self.joints[name]) for name in joints]
         return np.array([max(-lower, upper) for lower, upper in ranges])
 
+    def velocities(self, joints: Sequence[str]) -> np.ndarray:
+        """Return the velocity limits (n,) of some joints [rad/s or m/s]; inf: none is given."""
+        limits = [self.joints[name].find('limit') for name in joints]
+        return np.array([_number(limit, 'velocity') or inf for limit in limits])
+
     def only_chain(self) -> tuple[str, ...]:
         """Return the moving joints, which must be one chain."""
         moving = _moving([*self.joints.values()])

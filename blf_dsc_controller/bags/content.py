@@ -83,11 +83,15 @@ class NameMap:
         """Return the names that these joints have in the bag.
 
         Raises:
-            BlfDscError: a name is mapped that is neither a topic nor one of `joints`.
+            BlfDscError: a name is mapped that is neither a topic nor one of `joints`, or two of
+                these would have one name.
         """
         for joint, theirs in self.joints.items():
             if joint not in joints:
                 reason = f'{joint} is neither a topic nor one of the joints {", ".join(joints)}'
+                raise _bad_entry(f'{joint}={theirs}', reason)
+            if theirs in joints and theirs not in self.joints:
+                reason = f'this would be {joint} and {theirs}: map {theirs}, too'
                 raise _bad_entry(f'{joint}={theirs}', reason)
         return tuple(self.joints.get(joint, joint) for joint in joints)
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_traits import OWN
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.errors import BlfDscError
@@ -78,9 +78,11 @@ def recorded_run(
     stamp = run.states.stamp
     begin, end = run.received
     events = [event for at, event in content.events if begin <= at < end]
+    config, arm, unusable = _arm(content)
+    may_wrap = config is not None and bool(turns_freely(config).any())
     arrays: dict[str, Any] = {
         name: None if values is None else loaded(values)
-        for name, values in _arrays(content, run, joints).items()
+        for name, values in _arrays(content, run, joints, may_wrap=may_wrap).items()
     }
 
     def series(topic: topics.Topic, kind: str = 'position') -> Series | None:
@@ -91,7 +93,6 @@ def recorded_run(
         values = loaded(found.field(JOINT_STATE_FIELDS.index(kind)))
         return Series(found.names, found.stamp, values)
 
-    arm, unusable = _arm(content)
     return Run(
         **arrays,
         joints=joints,
@@ -109,10 +110,10 @@ def recorded_run(
             if event.type is EventType.OSCILLATION
         ),
         arm=arm,
-        tool=_tool(content),
+        tool=_tool(config) if config else None,
         learns=_learns([event.content.get('parameters', {}) for event in events]),
         notes=(*run.notes, *_unknown_parameters(content), *unusable),
-        sliding=_sliding(content),
+        sliding=config.robot.sliding(config.joints) if config else (),
     )
 
 
@@ -148,9 +149,12 @@ class SingleRun(NamedTuple):
 
 
 def _arrays(
-    content: Content, run: SingleRun, joints: Sequence[str]
+    content: Content, run: SingleRun, joints: Sequence[str], *, may_wrap: bool
 ) -> dict[str, Values | None]:
-    """Return the arrays of a run by name, one row per state; None if unknown."""
+    """Return the arrays of a run by name, one row per state; None if unknown.
+
+    The controller may count turns on for a joint, as for a continuous one: it `may_wrap`.
+    """
     states = run.states
     stamp = states.stamp
     errors = run.messages_of(content, topics.TRACKING_ERROR, joints)
@@ -171,18 +175,10 @@ def _arrays(
     if errors is not None:
         # Errors are not decimated: q - xi1 is the reference at every sample. Where the
         # positions may wrap, the controller's is whole turns off.
-        if references is None or _may_wrap(content):
+        if references is None or may_wrap:
             references = states.select(np.full(states.size, -1))
         arrays['reference'] = Values(references, 0, (states.field(0), errors.field(0)))
     return arrays
-
-
-def _may_wrap(content: Content) -> bool:
-    """Return whether the controller counts turns on for a joint, as a continuous one."""
-    if content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
-        with suppress(BlfDscError):
-            return bool(turns_freely(content.controller_config()).any())
-    return False
 
 
 def _torques(content: Content, states: JointStates) -> JointStates:
@@ -299,38 +295,31 @@ def _joints(content: Content) -> tuple[str, ...]:
     return (*of_controller, content.topics[topics.JOINT_STATES])[0].joint_names()
 
 
-def _arm(content: Content) -> tuple[LearnedArm | None, list[str]]:
-    """Return the arm of the recorded configuration, and what to say if it cannot be built."""
+def _arm(
+    content: Content,
+) -> tuple[ControllerConfig | None, LearnedArm | None, list[str]]:
+    """Return the recorded configuration of an arm from a URDF, and this arm; None without one.
+
+    Also what to say if it cannot be built.
+    """
     if not content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
-        return None, []
+        return None, None, []
     from blf_dsc_controller.factory.estimate import learned_arm  # slow: compiles
 
     try:
-        return learned_arm(content.controller_config()), []
+        config = content.controller_config()
+        return config, learned_arm(config), []
     except BlfDscError as error:
-        return None, [
-            f'what the recorded arm would tell is left out, as it cannot be built: {error}'
-        ]
+        text = f'what the recorded arm would tell is left out, as it cannot be built: {error}'
+        return None, None, [text]
 
 
-def _sliding(content: Content) -> tuple[str, ...]:
-    """Return the joints that slide by the recorded configuration; none if it is unknown."""
-    if content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
-        with suppress(BlfDscError):
-            config = content.controller_config()
-            return config.robot.sliding(config.joints)
-    return ()
-
-
-def _tool(content: Content) -> ToolErrors | None:
+def _tool(config: ControllerConfig) -> ToolErrors | None:
     """Return the errors at the tool as configured; None without a bound there."""
-    if content.configurations.get(CONTROLLER, {}).get('robot.urdf'):
-        from blf_dsc_controller.configuration.tool_bound import tool_of  # as above
+    from blf_dsc_controller.configuration.tool_bound import tool_of  # as above
 
-        with suppress(BlfDscError):
-            tool = tool_of(content.controller_config())
-            return tool.errors if tool else None
-    return None
+    tool = tool_of(config)
+    return tool.errors if tool else None
 
 
 def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:

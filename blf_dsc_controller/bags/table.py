@@ -74,7 +74,8 @@ def table(run: Run, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
             held = series.held(stamp, series.names)
             for name, column in zip(series.names, held.T, strict=True):
                 unit = 'N m' if topic == 'external' else _unit(name, run)
-                columns[f'{topic} {name} [{unit}]'] = column
+                joint = name.removesuffix(topics.INTERVAL).rpartition(' ')[2]
+                columns[f'{topic} {name} [{run.units(joint).of(unit)}]'] = column
     return columns
 
 

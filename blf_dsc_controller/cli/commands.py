@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,16 +42,25 @@ def _positive(text: str) -> int:
     return value
 
 
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < 1.0:
-        raise argparse.ArgumentTypeError(
-            f'got {text}: give a number above 0 and below 1'
-        )
-    return value
+def _number(fits: Callable[[float], bool], wanted: str) -> Callable[[str], float]:
+    """Return the type of an option that is a number which fits."""
+
+    def parsed(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f'got {text}: give {wanted}')
+        return value
+
+    return parsed
+
+
+_finite = _number(math.isfinite, 'a number')
+_share = _number(lambda x: 0.0 < x < 1.0, 'a number above 0 and below 1')
+_magnitude = _number(lambda x: 0.0 <= x < math.inf, 'a number of at least 0')
+_size = _number(lambda x: 0.0 < x < math.inf, 'a number above 0')
 
 
 def _parameter_file(text: str) -> Path:
@@ -295,7 +305,7 @@ _COMMISSION = Command(
         ),
         option(
             '--posture',
-            'angles of all joints [rad]; can be repeated (three along the reference)',
+            'positions of all joints [rad, m]; can be repeated (three along the reference)',
             type=float,
             nargs='+',
             action='append',
@@ -310,7 +320,7 @@ _COMMISSION = Command(
         option(
             '--travel',
             'farthest that the tool travels from its middle [m] (0.01)',
-            type=float,
+            type=_size,
             default=0.01,
         ),
         option(
@@ -345,13 +355,13 @@ _EXCITE = Command(
         option(
             '--radius',
             'radius of the links, for their clearance [m] (0.07)',
-            type=float,
+            type=_size,
             default=0.07,
         ),
         option(
             '--floor',
             'height of the floor in the base frame [m] (0)',
-            type=float,
+            type=_finite,
             default=0.0,
         ),
     ),
@@ -429,7 +439,7 @@ _IDENTIFY = Command(
         option(
             '--gravity',
             'gravity in the base frame [m/s^2] (0 0 -9.81)',
-            type=float,
+            type=_finite,
             nargs=3,
             default=(0.0, 0.0, -9.81),
             metavar=tuple('XYZ'),
@@ -437,7 +447,7 @@ _IDENTIFY = Command(
         option(
             '--rated-payload',
             'largest mass on the last link that is not in the URDF [kg] (3)',
-            type=float,
+            type=_magnitude,
             default=3.0,
         ),
     ),

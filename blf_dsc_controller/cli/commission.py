@@ -38,7 +38,7 @@ from blf_dsc_controller.configuration.nodes import (
 )
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import announce_reading, print_notice, steps
-from blf_dsc_controller.supervision.digits import two_digits
+from blf_dsc_controller.supervision.digits import largest_error
 
 _WIDTH = 98
 
@@ -177,7 +177,7 @@ def _prove_on_robot(
     except EndedError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
-    print(page.errors_table(config.joints, last))
+    print(page.errors_table(config, last))
     for each in cycles:
         print(page.of_limit_cycle(each))
     return 0
@@ -261,7 +261,7 @@ def _prove(path: Path) -> None:
         return
     print(
         f'with these gains the simulated arm follows its own motion for {proof.duration:g} s, '
-        f'with {two_digits(1e3 * proof.error)} mrad at most'
+        f'with {largest_error(proof.error, loop.controller.units)} at most'
     )
     for each in proof.cycles:
         print(page.of_limit_cycle(each))

@@ -37,6 +37,8 @@ from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import print_notice
+from blf_dsc_controller.run import unit_of_all
+from blf_dsc_controller.supervision.digits import largest_error
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -101,8 +103,8 @@ def proven_on(
         ask(options, _of_proof(options, planned))
         found, shaking = [], []
         for step, errors, cycles in here.proof(planned):
-            worst = 1e3 * float(errors.measured.max())
-            print(f'{step.name}: calm, errors of {worst:.2g} mrad at most', flush=True)
+            worst = largest_error(errors.measured, config.units)
+            print(f'{step.name}: calm, errors of {worst} at most', flush=True)
             found.append(errors)
             shaking += cycles
         here.hold_after()
@@ -159,8 +161,8 @@ def _of_proof(options: Namespace, planned: Sequence[Step]) -> Iterator[str]:
     """Yield what the arm is about to do in a proof."""
     seconds = sum(each.duration for each in planned)
     yield (
-        f'before each step the joints move straight to the start of the reference, at {SPEED:g} '
-        'rad/s at most: keep the way of the arm free'
+        'before each step the joints move straight to the start of the reference, at '
+        f'{_speed(planned[0].config)} at most: keep the way of the arm free'
     )
     yield (
         f'then the arm follows the reference of {options.config}, for {seconds:g} s in all, with '
@@ -182,12 +184,14 @@ def _limits(
     slid = [commissioning.sliding(each.posture) for each in planned]
     again = REPEATS * sum(each.duration for each in slid)
     again += commissioning.anew_left * (1 + REPEATS) * slid[0].duration
-    bound = ', '.join(f'{each:.2g}' for each in planned[0].config.barrier.bound)
+    first = planned[0].config
+    bound = ', '.join(f'{each:.2g}' for each in first.barrier.bound)
+    unit = unit_of_all(first.units, 'rad')
     yield from _of_motions(options, commissioning.config, planned)
     yield from _of_repeats(options, commissioning, slid)
     yield (
-        f'an error of {bound} rad, any other check of the controller, or Ctrl-C brings the arm to '
-        'rest and ends'
+        f'an error of {bound} {unit}, any other check of the controller, or Ctrl-C brings the arm '
+        'to rest and ends'
     )
     yield (
         f'the arm moves for {duration:.0f} s in all, and for {duration + again:.0f} s if '
@@ -203,12 +207,12 @@ def _of_motions(
         yield f'posture {k}: {page.description(each)}'
     most = ', '.join(f'{torque:.3g}' for torque in config.torque.limit)
     yield (
-        f'to each posture the joints move straight, at {SPEED:g} rad/s at most: keep the way of '
+        f'to each posture the joints move straight, at {_speed(config)} at most: keep the way of '
         'the arm free'
     )
     yield (
-        f'the motions add torques of {_rated(config, options.torque)} N m (rms); torque.limit is '
-        f'{most} N m'
+        f'the motions add torques of {_rated(config, options.torque)} (rms); torque.limit is '
+        f'{most} {unit_of_all(config.units, "N m")}'
     )
 
 
@@ -218,14 +222,15 @@ def _of_repeats(
     """Yield when a posture is measured again, and how; `slid` are the motions with swings."""
     most = _rated(commissioning.config, MOST * options.torque)
     yield (
-        f'where noise hides too much, a posture is measured once more, with {most} N m at '
-        f'most; the tool then travels {1e3 * options.travel:.3g} mm at most'
+        f'where noise hides too much, a posture is measured once more, with {most} at most; '
+        f'the tool then travels {1e3 * options.travel:.3g} mm at most'
     )
     swing = np.max([each.excitation.swing for each in slid], axis=0)
     swings = ', '.join(f'{torque:.2g}' for torque in swing)
+    unit = unit_of_all(commissioning.config.units, 'N m')
     yield (
         f'where friction damps a joint more than its gains do, likewise, with swings of {swings} '
-        'N m, and friction, which keep all joints sliding'
+        f'{unit}, and friction, which keep all joints sliding'
     )
     yield 'where the arm nearly oscillates, likewise, with half of the gains of the file'
     if commissioning.anew_left:
@@ -237,6 +242,12 @@ def _of_repeats(
 
 
 def _rated(config: ControllerConfig, share: float) -> str:
-    """Return a share of the rated torques [N m] in words."""
+    """Return a share of the rated torques in words."""
     rated = config.robot.efforts(config.robot.chain(config.joints))
-    return ', '.join(f'{torque:.2g}' for torque in share * rated)
+    torques = ', '.join(f'{torque:.2g}' for torque in share * rated)
+    return f'{torques} {unit_of_all(config.units, "N m")}'
+
+
+def _speed(config: ControllerConfig) -> str:
+    """Return the largest speed on the way to a posture in words."""
+    return f'{SPEED:g} {unit_of_all(config.units, "rad/s")}'

@@ -166,10 +166,12 @@ def _widened_at_tool(config: ControllerConfig, least: Floats) -> dict[str, Value
     over = least / barrier.bound
     if not _follow_from_tool(config):
         j = int(over.argmax())
+        unit = config.units[j].position
         raise BlfDscError(
-            f'barrier.bound: {config.joints[j]} would be off by up to {least[j] / _EXCESS:.2g} rad '
-            f'with the gains that have the margin, past its bound of {barrier.bound[j]:g} rad: '
-            'drop barrier.bound, which then follows from that at the tool and is widened with it'
+            f'barrier.bound: {config.joints[j]} would be off by up to {least[j] / _EXCESS:.2g} '
+            f'{unit} with the gains that have the margin, past its bound of {barrier.bound[j]:g} '
+            f'{unit}: drop barrier.bound, which then follows from that at the tool and is widened '
+            'with it'
         )
     arm, _ = design_of(config)
     values: dict[str, Value] = {}
@@ -199,11 +201,10 @@ def _check_bound(config: ControllerConfig, least: Floats) -> None:
     limits, kinds = config.limits, config.robot.kinds(config.joints)
     widest = map(widest_bound, kinds, limits.position_lower, limits.position_upper)
     given = config.barrier.bound
-    for joint, kind, needed, most in zip(
-        config.joints, kinds, least, np.maximum(given, [*widest]), strict=True
+    for joint, (unit, _, _), needed, most in zip(
+        config.joints, config.units, least, np.maximum(given, [*widest]), strict=True
     ):
         if needed > most:
-            unit = 'm' if kind == 'prismatic' else 'rad'
             far = f'by up to {needed / _EXCESS:.2g} {unit}'
             if needed > ENDLESS:
                 far = 'without end'

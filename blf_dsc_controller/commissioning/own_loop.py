@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from blf_dsc_controller.commissioning.planned import (
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run
 
 REPEATS = 2
@@ -91,8 +93,12 @@ class Commissioning:
             lags: lags of the damping that are tried, joint by joint [s]; empty: none.
 
         Raises:
+            BlfDscError: torque or travel is not above 0.
             ConfigurationError: with all problems of the file.
         """
+        for name, given in (('torque', torque), ('travel', travel)):
+            if not 0.0 < given < inf:
+                raise BlfDscError(f'{name}: got {given:g}, but it must be above 0')
         if not isinstance(config, ControllerConfig):
             config = load(locate(config), CONTROLLER, ControllerConfig)
         self.config = config

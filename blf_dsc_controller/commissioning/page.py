@@ -22,8 +22,10 @@ from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.strength import LITTLE
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.run import unit_of_all
 from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.expected_errors import expectation
 
@@ -31,20 +33,24 @@ Floats = NDArray[np.float64]
 
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel
+_DECIMALS = 6  # of a position
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
 
 def description(planned: Planned) -> str:
     """Return in a sentence how far and how fast a motion goes."""
     made = planned.excitation
-    angles = ', '.join(f'{angle:.3g}' for angle in planned.posture)
+    units = planned.config.units
+    posture = ', '.join(f'{q:.3g}' for q in np.round(planned.posture, _DECIMALS) + 0.0)
+    fastest = int(made.speed.argmax())
     return (
-        f'{planned.duration:.3g} s around [{angles}] rad; the tool travels '
-        f'{1e3 * made.travel:.2g} mm, the fastest joint moves at {made.speed.max():.2g} rad/s'
+        f'{planned.duration:.3g} s around [{posture}] {unit_of_all(units, "rad")}; the tool '
+        f'travels {1e3 * made.travel:.2g} mm, the fastest joint moves at {made.speed[fastest]:.2g} '
+        f'{units[fastest].of("rad/s")}'
     )
 
 
-# what it is, whether it was measured or chosen, and its unit
+# what it is, whether it was measured or chosen, and its unit for a joint that turns
 _COLUMNS = (
     ('', '', ''),  # the joint
     ('inertia', 'measured', 'kg m^2'),
@@ -60,7 +66,9 @@ _COLUMNS = (
 
 def table(found: Commissioned) -> str:
     """Return what was measured and chosen for each joint, beside what was assumed."""
-    rows: list[Sequence[str]] = list(zip(*_COLUMNS, strict=True))
+    names, origins, units = zip(*_COLUMNS, strict=True)
+    of_all = [unit_of_all(found.before.units, unit) for unit in units]
+    rows: list[Sequence[str]] = [names, origins, of_all]
     gains = found.choice.gains
     lags = np.broadcast_to(gains.damping_lag, gains.damping.shape)
     for j, joint in enumerate(found.joints):
@@ -115,8 +123,10 @@ def _of_states(found: Commissioned) -> Iterator[str]:
     """Yield how often joint states come, in which steps, and how late they and torques are."""
     arm = found.findings
     states = f'joint states at {arm.rate:.4g} Hz, jitter {1e3 * arm.jitter:.3f} ms'
-    step = float(arm.resolution.max())
-    steps = f'; positions in steps of {1e3 * step:.2g} mrad' if step else ''
+    coarsest = int(arm.resolution.argmax())
+    step = float(arm.resolution[coarsest])
+    unit = found.before.units[coarsest].of('mrad')
+    steps = f'; positions in steps of {1e3 * step:.2g} {unit}' if step else ''
     yield f'{states}, {100.0 * arm.lost:.2g} % lost{steps}'
     if not np.isnan(arm.drive_lag):
         yield (
@@ -203,15 +213,14 @@ def _of_hidden(found: Commissioned, *, is_simulated: bool) -> Iterator[str]:
             f'Measure again with a larger --torque or --travel{last}'
         )
     unseen = ', '.join(
-        f'{joint} {more:.2g}'
-        for joint, more in zip(found.joints, found.unseen, strict=True)
+        f'{joint} {more:.2g} {units.inertia}'
+        for joint, more, units in zip(
+            found.joints, found.unseen, found.before.units, strict=True
+        )
         if more > 0.0
     )
     if unseen:
-        yield (
-            f'so much more inertia would not show, and the errors to expect count it: {unseen} '
-            'kg m^2'
-        )
+        yield f'so much more inertia would not show, and the errors to expect count it: {unseen}'
 
 
 def _of_friction(found: Commissioned, *, is_simulated: bool) -> Iterator[str]:
@@ -228,15 +237,16 @@ def _of_friction(found: Commissioned, *, is_simulated: bool) -> Iterator[str]:
     if found.coulomb is not None:
         measured = ', '.join(f'{each:.2g}' for each in found.coulomb)
         yield (
-            f'friction of {measured} N m is written as robot.coulomb: the last runs and the gains '
-            'have it compensated'
+            f'friction of {measured} {unit_of_all(found.before.units, "N m")} is written as '
+            'robot.coulomb: the last runs and the gains have it compensated'
         )
         return
     known = known_friction(found.before)
     more = [
-        f'{joint} {measured:.2g} N m instead of {assumed:g}'
-        for joint, measured, assumed, floor in zip(
+        f'{joint} {measured:.2g} {unit} instead of {assumed:g}'
+        for joint, (_, unit, _), measured, assumed, floor in zip(
             found.joints,
+            found.before.units,
             found.findings.friction,
             known,
             found.before.learning.residual_floor,
@@ -283,7 +293,7 @@ def _wider(found: Commissioned) -> dict[str, list[str]]:
         }
     wider = [
         f'{joint} {wide:g} {unit} instead of {usual:g}'
-        for joint, (unit, _), wide, usual in zip(
+        for joint, (unit, _, _), wide, usual in zip(
             found.joints, found.config.units, after.bound, before.bound, strict=True
         )
         if wide > usual
@@ -301,12 +311,13 @@ def of_limit_cycle(cycle: LimitCycle) -> str:
     )
 
 
-def errors_table(joints: Sequence[str], errors: Errors) -> str:
+def errors_table(config: ControllerConfig, errors: Errors) -> str:
     """Return the largest errors of a proof beside those to expect, for each joint."""
-    rows: list[Sequence[str]] = [('', 'error', 'expected'), ('', 'mrad', 'mrad')]
+    unit = unit_of_all(config.units, 'mrad')
+    rows: list[Sequence[str]] = [('', 'error', 'expected'), ('', unit, unit)]
     rows += [
         (joint, two_digits(1e3 * measured), two_digits(1e3 * expected))
-        for joint, measured, expected in zip(joints, *errors, strict=True)
+        for joint, measured, expected in zip(config.joints, *errors, strict=True)
     ]
     return aligned(rows)
 
@@ -368,7 +379,7 @@ def _draw_response(axes: Axes, found: Commissioned, j: int) -> None:
         own = np.abs(response.position[:, j, j])
         axes.loglog(f, own * (2.0 * np.pi * f) ** 2, color=_colour(k))
     axes.set_title(f'{found.joints[j]}: acceleration by torque', loc='left')
-    axes.set_ylabel('rad/(s^2 N m)')
+    axes.set_ylabel(found.before.units[j].of('rad/(s^2 N m)'))
     axes.set_xlabel('frequency [Hz]')
 
 

@@ -32,7 +32,7 @@ class Proof(NamedTuple):
     """What a simulated arm does with its new gains, along its own reference."""
 
     duration: float  # s
-    error: float  # rad, the largest
+    error: Floats  # (n,) rad, the largest of each joint
     stop: str  # empty: none
     cycles: list[LimitCycle]  # of an arm that does not stop
 
@@ -61,7 +61,7 @@ def proof(loop: LoopConfig) -> Proof:
     stop = next((each.text for each in run.stops), '')
     error = np.zeros(1) if run.error is None else run.error
     cycles = [] if stop else cycles_of(run, loop.controller)
-    return Proof(duration, float(np.nanmax(np.abs(error))), stop, cycles)
+    return Proof(duration, np.nanmax(np.abs(error), axis=0), stop, cycles)
 
 
 def runs_of(

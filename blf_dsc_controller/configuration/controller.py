@@ -57,7 +57,7 @@ from blf_dsc_controller.configuration.schema import (
     flatten,
 )
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
+from blf_dsc_controller.run import JointUnits, joint_units
 
 _FILTERED = '; of the law paper, gains.prediction filtered'
 
@@ -128,8 +128,7 @@ class ControllerConfig(ArmConfig):
     @property
     def units(self) -> tuple[JointUnits, ...]:
         """Units of each joint."""
-        sliding = self.robot.sliding(self.joints)
-        return tuple(SLIDING if each in sliding else TURNING for each in self.joints)
+        return tuple(map(joint_units, self.robot.kinds(self.joints)))
 
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other and against the model."""

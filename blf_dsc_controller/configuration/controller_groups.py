@@ -197,7 +197,7 @@ class Barrier:
                     f'barrier.slope_limit: got {limit:g} {unit} for {joint}, but it must be above '
                     f'barrier.weight, {weight:g} {unit}'
                 )
-        for joint, (unit, _), initial, bound in zip(
+        for joint, (unit, _, _), initial, bound in zip(
             joints, units, self.initial_bound, self.bound, strict=True
         ):
             if 0.0 < initial < bound:

@@ -157,6 +157,6 @@ class MotionLimits:
         return [
             f'limits.position_upper: got {upper:g} {unit} for {joint}, but it must be above '
             f'limits.position_lower, {lower:g} {unit}'
-            for joint, (unit, _), lower, upper in limits
+            for joint, (unit, _, _), lower, upper in limits
             if upper <= lower
         ]

@@ -122,7 +122,7 @@ def _refused(doubts: Iterable[_Doubt], insist: Sequence[str]) -> Iterator[str]:
 def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
     """Check torques against the efforts of the drives."""
     strongest = max(UNKNOWN_EFFORT, config.robot.largest_effort(chain))
-    for joint, (_, unit), limit in zip(
+    for joint, (_, unit, _), limit in zip(
         chain.joints, config.units, config.torque.limit, strict=True
     ):
         allowed = joint.effort

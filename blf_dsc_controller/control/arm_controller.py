@@ -14,16 +14,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.bags.topic_recorder import TopicRecorder
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.control.outputs import Output, Outputs
+from blf_dsc_controller.control.loop_outputs import LoopOutputs
+from blf_dsc_controller.control.outputs import Output
 from blf_dsc_controller.errors import BlfDscError, LoopEndedError, check_type
 from blf_dsc_controller.law.weighing import DEVIATION
-from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference.retargeting import TrajectoryError
@@ -124,14 +122,8 @@ class ArmController:
         self.config = config
         self.joints = config.joints
         self._loop = GuardedLoop(config)
-        self._recorder: TopicRecorder | None = None
-        self._outputs = Outputs()
-        if record is not None:
-            self._recorder = TopicRecorder(Path(record), in_background=True)
-            self.add_output(self._recorder)
+        self._outputs = LoopOutputs(self._loop, record)
         self._is_on_wall = stamps == 'wall'
-        self._states = JointStateEncoder(config.joints)
-        self._motors = JointStateEncoder(config.joints, ('position', 'velocity'))
         self._shift: int | None = None  # ns, of the stamps
         self._logged_turns: set[str] = set()
         self._is_closed = False
@@ -196,11 +188,7 @@ class ArmController:
                 send(answer)
         finally:
             self._loop.guard.perceive()
-            if self._outputs:
-                self._write_state(nanoseconds, values, torque)
-                if of_motors is not None:
-                    raw = self._motors.encode(nanoseconds, *of_motors)
-                    self._outputs.write(nanoseconds, topics.MOTOR_STATES, raw)
+            self._outputs.write_state(nanoseconds, values, of_motors, torque)
             self._log_turns('the reference', self._loop.guard.reference.turned)
         return answer
 
@@ -364,7 +352,7 @@ class ArmController:
         has been commanded yet, so command nothing.
         """
         torque = self._loop.guard.fail(text)
-        self._write_end(torque)
+        self._outputs.write_end(torque)
         return None if torque is None else np.array(torque)
 
     def withdraw(self, text: str) -> None:
@@ -459,10 +447,8 @@ class ArmController:
         """
         self._is_closed = True
         torque = self._loop.guard.release()
-        self._write_end(torque)
-        if self._recorder is not None:
-            self._outputs.end(self._recorder, self._recorder.close)
-            self._recorder = None
+        self._outputs.write_end(torque)
+        self._outputs.close()
         return None if torque is None else np.array(torque)
 
     def _check_open(self) -> None:
@@ -492,26 +478,3 @@ class ArmController:
     def estimate_names(self) -> tuple[str, ...]:
         """Names of the learned parameters."""
         return tuple(self._loop.estimates)
-
-    def _write_state(self, stamp: int, values: Vector, torque: Vector | None) -> None:
-        """Give the messages about a state to the outputs."""
-        state = self._states.encode(stamp, *values.reshape(3, -1))
-        self._outputs.write(stamp, topics.JOINT_STATES, state)
-        if torque is not None:
-            self._outputs.write(stamp, *self._loop.telemetry.command(torque))
-        for message in self._loop.messages(torque):
-            self._outputs.write(stamp, *message)
-        self._write_events(stamp)
-
-    def _write_end(self, torque: Vector | None) -> None:
-        """Give a torque that no state asked for to the outputs, and the events."""
-        if not self._outputs:
-            return
-        stamp = max(self._loop.guard.journal.stamp, 0)
-        if torque is not None:
-            self._outputs.write(stamp, *self._loop.telemetry.command(torque))
-        self._write_events(stamp)
-
-    def _write_events(self, stamp: int) -> None:
-        for message in self._loop.guard.journal.take():
-            self._outputs.write(stamp, *message)

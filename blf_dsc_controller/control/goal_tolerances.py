@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.goal_messages import JointTolerance
 from blf_dsc_controller.errors import BlfDscError
 
@@ -28,12 +29,12 @@ class Tolerances(NamedTuple):
     velocity: np.ndarray  # (n,) [rad/s]
 
     def violation(
-        self, joints: Sequence[str], error: np.ndarray, bound: np.ndarray
+        self, config: ControllerConfig, error: np.ndarray, bound: np.ndarray
     ) -> str:
         """Return which joint exceeds what; empty if none.
 
         Args:
-            joints: names.
+            config: of the joints.
             error: (2, n), of positions [rad] and velocities [rad/s].
             bound: (n,) [rad].
         """
@@ -41,11 +42,11 @@ class Tolerances(NamedTuple):
         ratio = np.abs(error) / (largest, self.velocity)
         if ratio.max() <= 1.0:
             return ''
-        kind, i = divmod(int(ratio.argmax()), len(joints))
-        unit = ('rad', 'rad/s')[kind]
+        kind, i = divmod(int(ratio.argmax()), len(config.joints))
+        unit = config.units[i].of(('rad', 'rad/s')[kind])
         allowed = (largest, self.velocity)[kind][i]
         return (
-            f'{joints[i]!r} is {error[kind, i]:+.3g} {unit} from its reference, and '
+            f'{config.joints[i]!r} is {error[kind, i]:+.3g} {unit} from its reference, and '
             f'{allowed:.3g} {unit} are allowed'
         )
 

@@ -169,7 +169,7 @@ class Goals:
         tolerated = followed.arrival if t >= followed.end else followed.path
         violation = ''
         if t >= followed.begin:
-            violation = tolerated.violation(self._joints, error, signals.bound)
+            violation = tolerated.violation(guard.config, error, signals.bound)
         if t < followed.end:
             if violation:
                 self._abort(guard, PATH_VIOLATED, f'off the path: {violation}')

@@ -91,7 +91,7 @@ class StatusReport:
             return 'loop', ERROR, 'another node commands torques, too', values
         if message := missing or _unusual(guard):
             return 'loop', WARN, message, values
-        if chatter := chatter_of(guard.controller, guard.config.joints):
+        if chatter := chatter_of(guard.controller, guard.config):
             self._warn_once(chatter)
             return 'loop', WARN, chatter, values
         return 'loop', OK, _PHASES[guard.supervisor.phase][1], values
@@ -191,11 +191,12 @@ def _contact(guard: Guard) -> Part:
         'tared': str(guard.controller.is_tared).lower(),
     }
     if last is not None:
+        unit = guard.config.units[guard.config.joints.index(last.joint)].torque
         values |= {
             'last contact': f'at {(last.stamp - guard.reference.start_stamp) * 1e-9:.3f} s',
             'joint': last.joint,
-            'external torque': f'{last.torque:+.3g} N m',
-            'model error and noise': f'{last.interval:.3g} N m',
+            'external torque': f'{last.torque:+.3g} {unit}',
+            'model error and noise': f'{last.interval:.3g} {unit}',
         }
     if not guard.supervisor.running:
         return 'contact', OK, 'not monitored: the law is not in command', values

@@ -20,6 +20,7 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.drive.drivers import driver_of
+from blf_dsc_controller.run import joint_units
 
 _TURN = 2.0 * np.pi  # rad
 
@@ -27,7 +28,7 @@ _TURN = 2.0 * np.pi  # rad
 def lines(chain: Chain, positions: ArrayLike) -> Iterator[str]:
     """Yield a line for each joint at positions (n,) [rad or m], which says if they cannot be."""
     for joint, q in zip(chain.joints, np.asarray(positions, np.float64), strict=True):
-        unit = 'm' if joint.kind == 'prismatic' else 'rad'
+        unit = joint_units(joint.kind).position
         text = (
             f'{joint.name:24} {q:8.3f} of {joint.lower:.2f} to {joint.upper:.2f} {unit}'
         )

@@ -85,7 +85,7 @@ class SimulatedDriver(Driver):
         if self.plant.is_stopped:
             raise ReflexError(
                 'a torque changed faster than actuator.reflex_rate '
-                f'({self.plant_config.actuator.reflex_rate:g} N m/s)'
+                f'({self.plant_config.actuator.reflex_rate:g} N m/s or N/s)'
             )
         self._count += 1
         stamp = NANOSECOND * FIRST_STAMP + self._count * period

@@ -88,7 +88,7 @@ def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Col
     usual = UNKNOWN_FRICTION * config.torque.limit[i] / velocity
     return Column(
         name=f'{block} {config.joints[i]}',
-        unit='N m s/rad' if is_viscous else 'N m',
+        unit=config.units[i].of('N m s/rad' if is_viscous else 'N m'),
         initial=initial,
         deviation=0.5 * initial or usual,
         least=initial / _MOST_FRICTION if is_friction else -np.inf,

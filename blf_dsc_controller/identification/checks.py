@@ -30,7 +30,7 @@ from blf_dsc_controller.run import Floats, Stamps
 _BEYOND = 2.0  # times what a joint reaches, and at least turns: no angle in rad
 _FAST = 3.0  # times its limit: no speed of most joints in rad/s
 _SHARE = 0.9  # of the time, in which joints are slower than the speed that is compared
-_FASTEST = 10.0  # rad/s, limit of a joint for which none is stated
+_FASTEST = 10.0  # rad/s, largest limit of a joint, also where none is stated
 _STILL = 0.01  # rad/s
 _STEP = 0.05  # s, over which speeds are means
 _SHORTEST = 1.0  # s, motion whose speeds are looked at
@@ -119,7 +119,7 @@ def _check_angles(motion: Motion, rows: NDArray[np.bool_], tree: Tree) -> None:
 def _check_speeds(motion: Motion, rows: NDArray[np.bool_], tree: Tree) -> None:
     """Raise BlfDscError if most joints that turn are far faster than they can be."""
     speed = _speeds(motion, np.flatnonzero(rows))
-    limit = np.array([_speed_limit(tree, name) for name in motion.joints])
+    limit = np.minimum(tree.velocities(motion.joints), _FASTEST)
     moving = np.flatnonzero(tree.turning(motion.joints) & (speed > _STILL))
     ratio = speed[moving] / limit[moving]
     if moving.size and np.median(ratio) > _FAST:
@@ -153,13 +153,6 @@ def _speeds(motion: Motion, rows: NDArray[np.intp]) -> Floats:
     if not len(known):
         return np.zeros(len(motion.joints))
     return np.asarray(np.quantile(known, _SHARE, axis=0))
-
-
-def _speed_limit(tree: Tree, joint: str) -> float:
-    """Return the speed limit of a joint [rad/s or m/s], at most that of fast arms."""
-    limit = tree.joints[joint].find('limit')
-    stated = float(limit.get('velocity', 0.0)) if limit is not None else 0.0
-    return min(stated, _FASTEST) if stated > 0.0 else _FASTEST
 
 
 def _check_torques(motion: Motion, tau: Group, rows: NDArray[np.bool_]) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -116,8 +117,14 @@ def _with_gains(recording: Recording, gains: Sequence[float]) -> Recording:
 
 
 def _checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:
-    """Return the gains (n,); raises BlfDscError if there is not one for each joint."""
+    """Return the gains (n,); raises BlfDscError if there is not one for each joint, or one is 0."""
     if len(gains) != len(joints):
         found = f'{len(joints)} joints: {", ".join(joints)}'
         raise BlfDscError(f'got {len(gains)} gains for {found}')
+    for joint, gain in zip(joints, gains, strict=True):
+        if gain == 0.0 or not math.isfinite(gain):
+            raise BlfDscError(
+                f'got a gain of {gain:g} for {joint}: give its torque per current, 1 if it is a '
+                'torque'
+            )
     return np.array(gains)

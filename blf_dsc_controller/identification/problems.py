@@ -43,8 +43,9 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
     if not is_explained(found):
         yield (
             'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
-            'N m (currents need --gains), is --gravity given in the base frame, are the zeros and '
-            'directions of the joints those of the URDF, and was the load the same throughout?'
+            'N m or N (currents need --gains), is --gravity given in the base frame, are the '
+            'zeros and directions of the joints those of the URDF, and was the load the same '
+            'throughout?'
         )
     yield from _joint_problems(found)
 
@@ -100,8 +101,8 @@ def _size_problems(found: Identified, effort: str) -> Iterator[str]:
         )
     elif found.gravity > most:
         cause = (
-            'If they are not in N m, give --gains. Are the masses of the URDF far too small, or is '
-            'it without its tool?'
+            'If they are not in N m or N, give --gains. Are the masses of the URDF far too small, '
+            'or is it without its tool?'
         )
         if effort == 'without-gravity':
             cause = 'The efforts are the whole torque: give --effort torque'
@@ -109,7 +110,7 @@ def _size_problems(found: Identified, effort: str) -> Iterator[str]:
     elif np.isnan(found.gravity) and not INERTIA[0] < found.inertia < INERTIA[1]:
         yield (
             f"INERTIA IS NOT OF THIS SIZE: the efforts contain {found.inertia:.2g} of the URDF's. "
-            'If they are not in N m (or N), give --gains'
+            'If they are not in N m or N, give --gains'
         )
 
 

@@ -23,6 +23,7 @@ LONGEST_PERIOD = 0.02
 
 _JITTER = 1.2  # times that, median that is accepted
 _FASTEST = 1e-5  # s, likewise
+_FEWEST = 10  # states
 _SPARSE = 100.0  # times the intervals between states: longest bag
 GAP = 3.0
 """Intervals between two states from which something is missing."""
@@ -126,7 +127,7 @@ def _grid_of(stamp: Stamps) -> _Grid:
     Raises:
         BlfDscError: there are too few, or they cannot be of one clock.
     """
-    if stamp.size < 2:
+    if stamp.size < _FEWEST:
         raise BlfDscError(
             f'there are {stamp.size} joint state(s) with a position, a torque and a unique '
             'stamp; hundreds are needed'

@@ -27,6 +27,7 @@ from blf_dsc_controller.identification.values import (
 )
 from blf_dsc_controller.identification.windows import SMOOTHING, WINDOW
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
+from blf_dsc_controller.run import joint_units
 
 UNSEEN = 0.5
 """Share of the prior's variance; parameters that keep more are not shown."""
@@ -155,7 +156,7 @@ def stiffness_table(found: Identified) -> Iterator[str]:
     rows = [('joint', 'stiffness between motor and link', '95 % interval')]
     values, least, most = compliance.stiffness
     for i, joint in enumerate(found.chain.joints):
-        unit = 'N/m' if joint.kind == 'prismatic' else 'N m/rad'
+        unit = joint_units(joint.kind).of('N m/rad')
         is_bound = 0.0 < least[i] < np.inf
         bound = f': above {least[i]:.3g} {unit}' if is_bound else ''
         cells = f'cannot be known{bound}', ''
@@ -192,7 +193,7 @@ def errors_table(found: Identified) -> str:
     rows = [['joint', 'URDF', 'corrected', 'with all terms', 'rms torque']]
     for i, joint in enumerate(found.chain.joints):
         errors = [f'{share:.2f}' for share in shares[:, i]]
-        unit = 'N' if joint.kind == 'prismatic' else 'N m'
+        unit = joint_units(joint.kind).torque
         rows.append([joint.name, *errors, f'{score.torque[i]:.3g} {unit}'])
     rows.append(['all', *(f'{total:.2f}' for total in score.total), ''])
     begin, end = score.held_back
@@ -209,9 +210,11 @@ def notes_of(found: Identified) -> Iterator[str]:
     if coupling.any():
         deviations = found.deviations.coupling
         inertia, viscous, coulomb = map(interval, coupling, deviations)
+        units = units_of(found.chain.joints[-1].kind)
         yield (
-            f'one motor drives {found.joints[-2]} and {found.joints[-1]}: inertia {inertia} kg '
-            f'm^2, viscous friction {viscous} N m s and Coulomb friction {coulomb} N m act on both'
+            f'one motor drives {found.joints[-2]} and {found.joints[-1]}: inertia {inertia} '
+            f'{units[ROTOR_INERTIA]}, viscous friction {viscous} {units[VISCOUS]} and Coulomb '
+            f'friction {coulomb} {units[COULOMB]} act on both'
         )
     if found.reversed:
         yield (

@@ -107,12 +107,12 @@ class _Layout(NamedTuple):
     ) -> Floats:
         """Return some columns (k, m) of numbered lines with so many cells."""
         lines = [line for _, line in block]
-        mark = self.delimiter
-        if mark and any(line.count(mark) != width - 1 for line in lines):
+        mark = self.delimiter or None
+        if any(len(line.split(mark)) != width for line in lines):
             return self._any_numbers(path, block, width, at)
         lines = [self._with_points(line) for line in lines]
         try:
-            return np.loadtxt(lines, delimiter=mark or None, usecols=at, ndmin=2)
+            return np.loadtxt(lines, delimiter=mark, usecols=at, ndmin=2)
         except ValueError:  # cells that are empty or text
             return self._any_numbers(path, block, width, at)
 

@@ -18,6 +18,7 @@ sample (Savitzky and Golay, Smoothing and differentiation of data, 1964).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -294,7 +295,11 @@ class Rows(NamedTuple):
 
 
 def rows_of(recording: Recording, model: SerialChain) -> Rows:
-    """Return the rows of all windows of a recording without gaps."""
+    """Return the rows of all windows of a recording without gaps.
+
+    Raises:
+        BlfDscError: there are too few.
+    """
     n = len(recording.joints)
     rows = _empty_rows(recording, model)
     dq = rows.dq
@@ -321,8 +326,15 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
     h = recording.period
     n = len(recording.joints)
     g, slope = weighting(h)
-    q, dq, near_gap = _smoothed(recording)
+    near_gap = _near_gap(recording)
     starts = _starts(near_gap, g.size, h)
+    needed = _WINDOWS_OF_JOINT * n
+    if starts.size < needed:
+        raise BlfDscError(
+            f'only {starts.size} windows of {WINDOW:g} s have no gaps: record at least '
+            f'{needed * HOP:.3g} s without losses'
+        )
+    q, dq = _smoothed(recording)
     return Rows(
         time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
         inertial=OnDisk(n * model.p),
@@ -347,9 +359,17 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
     )
 
 
-def _smoothed(recording: Recording) -> tuple[OnDisk, OnDisk, NDArray[np.bool_]]:
-    """Return smoothed positions, velocities (N, n), and where they are near a gap (N,)."""
+def _near_gap(recording: Recording) -> NDArray[np.bool_]:
+    """Return at which samples (N,) smoothed positions have a gap within."""
     from scipy.ndimage import maximum_filter1d
+
+    width = smoothing_width(recording.period)
+    found = maximum_filter1d(recording.gap, width, mode='constant')
+    return np.asarray(found, dtype=bool)
+
+
+def _smoothed(recording: Recording) -> tuple[OnDisk, OnDisk]:
+    """Return smoothed positions and velocities (N, n)."""
     from scipy.signal import savgol_filter
 
     h = recording.period
@@ -363,9 +383,8 @@ def _smoothed(recording: Recording) -> tuple[OnDisk, OnDisk, NDArray[np.bool_]]:
         )
         return np.asarray(found[rows.start - first : rows.stop - first])
 
-    near_gap = maximum_filter1d(recording.gap, width, mode='constant')
-    q = mapped(size, lambda rows: smoothed(rows, 0))
-    return q, mapped(size, lambda rows: smoothed(rows, 1)), near_gap
+    q, dq = (mapped(size, partial(smoothed, derivative=k)) for k in range(2))
+    return q, dq
 
 
 def smoothing_width(h: float) -> int:
@@ -456,12 +475,7 @@ def split(rows: Rows) -> Split:
     Raises:
         BlfDscError: there are too few.
     """
-    n = rows.speed.size
-    needed = _WINDOWS_OF_JOINT * n
-    if rows.time.size < needed:
-        raise BlfDscError(
-            f'only {rows.time.size} windows have no gaps: record without losses'
-        )
+    needed = _WINDOWS_OF_JOINT * rows.speed.size
     if rows.speed.max() < STILL:
         fastest = f'{rows.speed.max():.2g} rad/s (or m/s)'
         raise BlfDscError(

@@ -9,6 +9,7 @@ from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.process import PlainNode
+from blf_dsc_controller.run import unit_of_all
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.supervisor import STAMPS, Phase, Reason
@@ -132,9 +133,10 @@ class ControllerLog:
         self._model_changes = state.change.changes[0]
         if has_changed:
             residual = state.change.contradiction[0] ** 0.5
+            unit = unit_of_all(guard.config.units, 'N m')
             self._log.warning(
-                f'the arm has changed: torques differ by {residual:.3g} N m from those expected; '
-                'learning restarts'
+                f'the arm has changed: torques differ by {residual:.3g} {unit} from those '
+                'expected; learning restarts'
             )
         columns = state.latch.active.tobytes() + state.latch.columns_checked.tobytes()
         if columns == self._columns:

@@ -315,7 +315,7 @@ class PlantNode(LoopNode[PlantConfig]):
             return
         rate = self.config.actuator.reflex_rate
         self._halt = (
-            f'reflex: the commands jumped to {torque} N m, faster than {rate:g} N m/s: the arm '
+            f'reflex: the commands jumped to {torque}, faster than {rate:g} N m/s or N/s: the arm '
             'stands still until it is reset'
         )
         self.get_logger().error(self._halt)

@@ -38,6 +38,7 @@ from blf_dsc_controller.reference.terms import (
     unpack,
 )
 from blf_dsc_controller.reference.turns import reference_near
+from blf_dsc_controller.run import TURNING, JointUnits
 
 AT_REST = 0.01
 """Largest velocity of an arm at rest [rad/s]."""
@@ -74,15 +75,12 @@ class Violation(NamedTuple):
     time: float  # s
     # value over limit; positions are relative to the middle of their range
     ratio: float
-    slides: bool = False  # whether the joint does
+    units: JointUnits = TURNING  # of the joint
 
     def __str__(self) -> str:
         """Describe the violation: joint, quantity, value and limit with their unit."""
-        unit = ('m' if self.slides else 'rad') + {
-            'position': '',
-            'velocity': '/s',
-            'acceleration': '/s^2',
-        }[self.quantity]
+        per = {'position': '', 'velocity': '/s', 'acceleration': '/s^2'}
+        unit = self.units.position + per[self.quantity]
         return (
             f'the {self.quantity} of joint {self.joint!r} would be {self.value:.6g} {unit} at '
             f't = {self.time:.6g} s, past its limit of {self.limit:.6g} {unit}'
@@ -134,9 +132,14 @@ def worst_violation(
         reached = float(value[at, i])
         limit = shift + float(np.copysign(allowed[i], reached))
         time = float(times[at])
-        slides = config.robot.kinds(config.joints)[i] == 'prismatic'
         worst = Violation(
-            config.joints[i], quantity, shift + reached, limit, time, ratio, slides
+            config.joints[i],
+            quantity,
+            shift + reached,
+            limit,
+            time,
+            ratio,
+            config.units[i],
         )
     return worst
 
@@ -267,7 +270,7 @@ def end_of_waypoints(config: ControllerConfig) -> str:
     last = reference.rows(len(config.joints))[-1]
     posture = ', '.join(
         f'{joint} {value:g} {unit}'
-        for joint, value, (unit, _) in zip(
+        for joint, value, (unit, _, _) in zip(
             config.joints, last, config.units, strict=True
         )
     )
@@ -293,7 +296,7 @@ def check_takeover(
     """
     qr, dqr, ddqr = np.zeros((3, q.size))
     evaluate(reference_vector, t, qr, dqr, ddqr)
-    for joint, (unit, _), error, limit in zip(
+    for joint, (unit, _, _), error, limit in zip(
         config.joints, config.units, q - qr, bound, strict=True
     ):
         if not abs(error) < limit:
@@ -304,7 +307,7 @@ def check_takeover(
     limits = np.sqrt(
         2.0 * np.array(config.limits.acceleration) * (bound - np.abs(q - qr))
     )
-    for joint, (unit, _), difference, limit in zip(
+    for joint, (unit, _, _), difference, limit in zip(
         config.joints, config.units, dq - dqr, limits, strict=True
     ):
         if not abs(difference) < limit:
@@ -334,17 +337,16 @@ def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:
     """Check that an arm at rest at q (n,) [rad] is at most `PAST_LIMITS` past its limits."""
     limits = zip(
         config.joints,
-        config.robot.kinds(config.joints),
+        config.units,
         config.limits.position_lower,
         config.limits.position_upper,
         strict=True,
     )
-    for at, (joint, kind, lower, upper) in zip(q, limits, strict=True):
+    for at, (joint, units, lower, upper) in zip(q, limits, strict=True):
         if lower - PAST_LIMITS <= at <= upper + PAST_LIMITS:
             continue
-        slides = kind == 'prismatic'
-        unit = 'm' if slides else 'rad'
-        hint = '' if slides else hint_at_degrees(at, lower, upper)
+        unit = units.position
+        hint = hint_at_degrees(at, lower, upper) if units == TURNING else ''
         raise StartError(
             f'joint {joint!r} would be held at {at:.6g} {unit}, and its limits are {lower:g} to '
             f'{upper:g} {unit}: if the arm really is there, change limits.position_lower or '
@@ -459,7 +461,7 @@ def _braked(
     config: ControllerConfig, q: np.ndarray, dq: np.ndarray, t: float
 ) -> BlendedReference:
     """Plan to hold the arm where it comes to rest from q, dq (n,) at time t [s]."""
-    for joint, (unit, _), speed, limit in zip(
+    for joint, (unit, _, _), speed, limit in zip(
         config.joints, config.units, np.abs(dq), config.limits.velocity, strict=True
     ):
         if speed > limit + AT_REST:

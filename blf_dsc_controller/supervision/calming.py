@@ -33,7 +33,8 @@ class Shaking(NamedTuple):
 
     joint: str
     frequency: float  # Hz
-    torque: float  # N m, amplitude
+    torque: float  # N m or N, amplitude
+    unit: str  # of the torque
 
     @property
     def text(self) -> str:
@@ -48,7 +49,7 @@ class Shaking(NamedTuple):
     def _with(self, verb: str) -> str:
         return (
             f'joint {self.joint!r} {verb} at {two_digits(self.frequency)} Hz with '
-            f'+-{two_digits(self.torque)} N m'
+            f'+-{two_digits(self.torque)} {self.unit}'
         )
 
 
@@ -134,8 +135,9 @@ class Calming:
             return None
         worst = int(np.argmax(np.where(shakes, torque / limit, -1.0)))
         frequency = 0.5 / float(now.half[worst])
-        joint = self._config.joints[worst]
-        return Shaking(joint, frequency, float(torque[worst]))
+        config = self._config
+        unit = config.units[worst].torque
+        return Shaking(config.joints[worst], frequency, float(torque[worst]), unit)
 
     def _is_violent(self, shakes: NDArray[np.bool_]) -> bool:
         """Whether one of the joints that oscillate (n,) does so with large torques."""

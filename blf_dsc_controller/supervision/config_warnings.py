@@ -156,11 +156,13 @@ def _of_placeholders(config: ControllerConfig) -> Iterator[str]:
     robot = config.robot
     chain = robot.chain(config.joints)
     if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
-        largest = max(joint.effort for joint in chain.joints)
+        efforts = {joint.name: joint.effort for joint in chain.joints}
+        largest = max(joints, key=efforts.__getitem__)
+        unit = config.units[config.joints.index(largest)].torque
         yield (
-            f'torque.limit: an effort of up to {largest:g} N m for {", ".join(joints)} looks like '
-            'a placeholder on an arm of this weight. The assumed inertia of the drives and '
-            'learning.residual_floor follow from the weight instead: give the rated torques'
+            f'torque.limit: an effort of up to {efforts[largest]:g} {unit} for {", ".join(joints)} '
+            'looks like a placeholder on an arm of this weight. The assumed inertia of the drives '
+            'and learning.residual_floor follow from the weight instead: give the rated torques'
         )
     if (joints := implausible_friction(robot, chain)) and not (
         robot.viscous and robot.coulomb
@@ -189,12 +191,13 @@ def _of_first_error(
     widest = settings.barrier.initial_bound
     worst = int(np.argmax(errors / widest))
     if errors[worst] > widest[worst]:
+        unit = config.units[worst].position
         needed = _FIRST_ERROR * errors[worst]
         yield (
             f'barrier.bound: until the arm is learned, {config.joints[worst]} may be '
-            f'{errors[worst]:.2g} rad from its reference with these gains, past its bound of '
-            f'{widest[worst]:g} rad: give {needed:.2g} rad or more, or a barrier.initial_bound '
-            'of that, or larger gains at a shorter sample_time'
+            f'{errors[worst]:.2g} {unit} from its reference with these gains, past its bound of '
+            f'{widest[worst]:g} {unit}: give {needed:.2g} {unit} or more, or a '
+            'barrier.initial_bound of that, or larger gains at a shorter sample_time'
         )
 
 

@@ -17,12 +17,12 @@ def contact_of(controller: Controller, config: ControllerConfig, stamp: int) -> 
     """Return what the last sample, of a stamp [ns], shows of a contact."""
     sample = controller.sample
     worst = int(np.argmax(np.abs(sample.external) / sample.external_interval))
-    joint = config.joints[worst]
+    joint, unit = config.joints[worst], config.units[worst].torque
     torque = float(sample.external[worst])
     interval = float(sample.external_interval[worst])
     text = (
-        f'something touches the arm: the external torque is {torque:+.3g} N m on joint '
-        f'{joint!r}, and model error and noise explain at most {interval:.3g} N m '
+        f'something touches the arm: the external torque is {torque:+.3g} {unit} on joint '
+        f'{joint!r}, and model error and noise explain at most {interval:.3g} {unit} '
         f'(distance {sample.contact[DISTANCE]:.3g}, threshold {config.contact.threshold:g})'
     )
     return Contact(stamp, joint, torque, interval, text)

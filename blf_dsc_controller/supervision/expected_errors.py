@@ -21,7 +21,7 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.tool_bound import at_reversal
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.state import Settings
-from blf_dsc_controller.supervision.digits import two_digits
+from blf_dsc_controller.supervision.digits import largest_error
 from blf_dsc_controller.supervision.reference_load import along
 
 Floats = NDArray[np.float64]
@@ -152,10 +152,7 @@ def expectation(config: ControllerConfig) -> str:
     errors = expected_errors(config, settings_of_config(config))
     if errors.is_endless:
         return 'none can be told, since errors grow from sample to sample: give lower gains'
-    usual, most = (
-        f'{two_digits(1e3 * float(each.max()))} {config.units[int(each.argmax())].of("mrad")}'
-        for each in errors
-    )
+    usual, most = (largest_error(each, config.units) for each in errors)
     joint = config.joints[int(errors.pick_up.argmax())]
     sensed = config.disturbance.observer_bandwidth > 0.0
     return (

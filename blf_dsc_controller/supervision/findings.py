@@ -36,7 +36,7 @@ class Findings:
     def restart(self) -> None:
         """Begin again before a start: the arm no longer holds after a contact."""
         command = self._command
-        self.untrusted = not_sensors.text_of(command.controller, command.config.joints)
+        self.untrusted = not_sensors.text_of(command.controller, command.config)
         self.contacts.hold = False
 
     def check_efforts(self) -> None:
@@ -45,7 +45,7 @@ class Findings:
         if not command.controller.flags & NOT_SENSORS:
             return
         joint = not_sensors.joint_of(command.controller, joints)
-        self.untrusted = not_sensors.text_of(command.controller, joints)
+        self.untrusted = not_sensors.text_of(command.controller, command.config)
         command.samples.compare_efforts()
         command.note(EventType.TORQUE_SENSORS, joint=joint, text=self.untrusted)
 

@@ -68,9 +68,10 @@ def check_first_torque(
     speed = np.abs(dq)
     if speed.max() > AT_REST:
         fastest = int(np.argmax(speed))
+        unit = config.units[fastest].of('rad/s')
         text += (
             f'; the arm still moves, joint {config.joints[fastest]!r} at {speed[fastest]:.3g} '
-            'rad/s: start again when it rests'
+            f'{unit}: start again when it rests'
         )
     raise StartError(text)
 
@@ -85,9 +86,10 @@ def _too_large_step(config: ControllerConfig, torque: Vector, held: Vector) -> s
     worst = int(np.argmax(excess))
     if excess[worst] <= 0.0:
         return ''
+    unit = config.units[worst].torque
     return (
-        f'the first torque would step to {torque[worst]:.4g} N m on joint '
-        f'{config.joints[worst]!r}, more than the {step[worst]:g} N m that its drive tolerates '
+        f'the first torque would step to {torque[worst]:.4g} {unit} on joint '
+        f'{config.joints[worst]!r}, more than the {step[worst]:g} {unit} that its drive tolerates '
         '(torque.first_step)'
     )
 
@@ -131,10 +133,10 @@ def _check_not_twice(
     if not (shows_drives and is_like(effort, gravity)):
         return
     worst = int(np.argmax(np.abs(gravity)))
-    joint = config.joints[worst]
+    joint, unit = config.joints[worst], config.units[worst].torque
     raise StartError(
-        f'gravity twice: the first torque would be {torque[worst]:.4g} N m on joint {joint!r}, '
-        f'but the joint already rests with an effort of {effort[worst]:.4g} N m, before any '
+        f'gravity twice: the first torque would be {torque[worst]:.4g} {unit} on joint {joint!r}, '
+        f'but the joint already rests with an effort of {effort[worst]:.4g} {unit}, before any '
         'command. If the drives compensate gravity, set robot.drive_compensates to gravity. '
         'If a torque of another or an earlier controller holds the arm, set robot.effort to '
         f'commanded (if efforts contain only commands), or {_SEND}{_DRIVER}'
@@ -146,7 +148,7 @@ def _check_compensated(
 ) -> None:
     """Raise StartError if efforts (n,) [N m] do not show the drives that compensate gravity."""
     worst = int(np.argmax(np.abs(gravity)))
-    joint = config.joints[worst]
+    joint, unit = config.joints[worst], config.units[worst].torque
     is_commanded = config.robot.effort == 'commanded'
     no_gravity = (
         f'no gravity: robot.drive_compensates is {config.robot.drive_compensates}, but joint '
@@ -154,10 +156,10 @@ def _check_compensated(
     )
     if is_commanded and is_like(effort, gravity):
         raise StartError(
-            f'{no_gravity} with a commanded effort of {effort[worst]:.4g} N m, where none should '
-            'be needed. If the drives compensate nothing, set robot.drive_compensates to none. If '
-            'the effort contains what the drives add, set robot.effort to whole. If a torque of '
-            f'another controller holds the arm, set {_SEND}{_DRIVER}'
+            f'{no_gravity} with a commanded effort of {effort[worst]:.4g} {unit}, where none '
+            'should be needed. If the drives compensate nothing, set robot.drive_compensates to '
+            'none. If the effort contains what the drives add, set robot.effort to whole. If a '
+            f'torque of another controller holds the arm, set {_SEND}{_DRIVER}'
         )
     noticed = _NOTICED * np.linalg.norm(gravity)
     if not is_commanded and np.linalg.norm(effort) <= noticed:
@@ -165,9 +167,9 @@ def _check_compensated(
         observes = config.disturbance.observer_bandwidth > 0.0
         off = ' and disturbance.observer_bandwidth to 0' if observes else ''
         raise StartError(
-            f'{no_gravity} with an effort of {effort[worst]:.4g} N m where the drives should hold '
-            f'{gravity[worst]:.4g} N m. The first torque, {torque[worst]:.4g} N m, would drop the '
-            'arm. If the brakes hold it, release them. If the drives compensate nothing, set '
-            'robot.drive_compensates to none. If the effort does not contain what the drives add, '
-            f'set robot.effort to commanded{off}, or {_SEND}{_DRIVER}'
+            f'{no_gravity} with an effort of {effort[worst]:.4g} {unit} where the drives should '
+            f'hold {gravity[worst]:.4g} {unit}. The first torque, {torque[worst]:.4g} {unit}, '
+            'would drop the arm. If the brakes hold it, release them. If the drives compensate '
+            'nothing, set robot.drive_compensates to none. If the effort does not contain what the '
+            f'drives add, set robot.effort to commanded{off}, or {_SEND}{_DRIVER}'
         )

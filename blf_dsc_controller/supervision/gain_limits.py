@@ -64,15 +64,15 @@ def _limits_of_gains(
 def _limits_of_torque(
     config: ControllerConfig, load: ReferenceLoad
 ) -> Iterator[Finding]:
-    for joint, need, limit in zip(
-        config.joints, load.torque, config.torque.limit, strict=True
+    for joint, (_, unit, _), need, limit in zip(
+        config.joints, config.units, load.torque, config.torque.limit, strict=True
     ):
         yield Finding(
             f'torque.limit: {joint}',
             _MARGIN * need / limit,
-            f'has {limit:g} N m, but with learning.initial_estimate the reference alone needs '
-            f'{need:.3g} N m: let the reference be slower, or give at least '
-            f'{_MARGIN * need:.3g} N m if the drive has that much',
+            f'has {limit:g} {unit}, but with learning.initial_estimate the reference alone needs '
+            f'{need:.3g} {unit}: let the reference be slower, or give at least '
+            f'{_MARGIN * need:.3g} {unit} if the drive has that much',
         )
 
 

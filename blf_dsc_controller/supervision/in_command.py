@@ -248,8 +248,10 @@ class InCommand:
         if not self.safe_stop.observe_speed(self.config.safety, speed, gap):
             return
         when = 'in the safe stop' if self.commanding else 'while nothing is commanded'
+        fastest = int(np.abs(self.readings.velocity).argmax())
+        unit = self.config.units[fastest].of('rad/s')
         self.supervisor.add(
-            f'the arm speeds up {when}, to {speed:.3g} rad/s: engage the brakes'
+            f'the arm speeds up {when}, to {speed:.3g} {unit}: engage the brakes'
         )
 
     def release(self) -> Vector | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque_sensors import (
     COMMANDS,
@@ -35,7 +36,7 @@ _TEXTS = {
         f'or unknown if they are currents of motors, and robot.torque_loop to false{_DRIVER}'
     ),
     OFF: (
-        'the effort of joint {joint!r} is off {off:+.3g} N m from what is commanded while the '
+        'the effort of joint {joint!r} is off {off:+.3g} {unit} from what is commanded while the '
         f'arm follows: a sensor is stuck, dead or in another unit; {_ALONE}. Mend it, or set '
         f'robot.effort to unknown{_DRIVER}'
     ),
@@ -52,14 +53,15 @@ def is_off(controller: Controller) -> bool:
     return fault_of(controller) == OFF
 
 
-def text_of(controller: Controller, joints: Sequence[str]) -> str:
+def text_of(controller: Controller, config: ControllerConfig) -> str:
     """Return what is wrong and the remedy; empty if nothing is."""
     fault = fault_of(controller)
     if fault == NONE:
         return ''
     i = int(controller.state.sensors.joint[0])
     off = float(controller.signals.sensors.differences[0, i])
-    return _TEXTS[fault].format(joint=joints[i], off=off)
+    unit = config.units[i].torque
+    return _TEXTS[fault].format(joint=config.joints[i], off=off, unit=unit)
 
 
 def joint_of(controller: Controller, joints: Sequence[str]) -> str:

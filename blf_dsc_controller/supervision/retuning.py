@@ -82,7 +82,7 @@ def _outside_bound(
     """Yield which joints the bound of a configuration leaves outside at t [s]."""
     bounds = barrier.bound_at(settings.barrier, t)
     errors = np.abs(controller.sample.xi1)
-    for joint, (unit, _), error, bound in zip(
+    for joint, (unit, _, _), error, bound in zip(
         config.joints, config.units, errors, bounds, strict=True
     ):
         if not error < bound:
@@ -98,7 +98,7 @@ def _above_torque_limit(
 ) -> Iterator[str]:
     """Yield which joints are held by more than their limit."""
     torques = np.abs(controller.sample.torque)
-    for joint, (_, unit), torque, limit in zip(
+    for joint, (_, unit, _), torque, limit in zip(
         config.joints, config.units, torques, config.torque.limit, strict=True
     ):
         if torque > limit:

@@ -46,7 +46,7 @@ class SafeStop:
         held: HeldTorque,
     ) -> None:
         """Use the ramp of `torque`, what `held` finds, and the kept `estimates` of the law."""
-        self._joints = config.joints
+        self._joints, self._units = config.joints, config.units
         self._controller = controller
         self._estimates = estimates
         self._torque = torque
@@ -142,10 +142,10 @@ class SafeStop:
             return ''
         worst = int(np.argmax(np.abs(change) / self._controller.settings.torque.limit))
         return (
-            f'the torque of joint {self._joints[worst]!r} has changed by '
-            f'{change[worst]:+.4g} N m since, but the arm has not accelerated: release the brakes, '
-            'activate the effort controller, or free the arm; a joint that sticks does so, too, if '
-            'its drive gives less than it is sent'
+            f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} '
+            f'{self._units[worst].torque} since, but the arm has not accelerated: release the '
+            'brakes, activate the effort controller, or free the arm; a joint that sticks does so, '
+            'too, if its drive gives less than it is sent'
         )
 
     def _continue_from_held(self) -> None:

@@ -55,7 +55,7 @@ class SampleCheck:
         self._units = config.units
         self._tool = tool_of(config)
         self._controller = controller
-        self._cause = StopCause(config.joints, controller, calming)
+        self._cause = StopCause(config, controller, calming)
         self.ratio = controller.checks.ratio
         self._estimates = estimates
         self._saturation = 0  # ns, times _RELIEF
@@ -154,19 +154,21 @@ class SampleCheck:
         change = checks.effect.recent - checks.effect.before
         worst = int(np.argmax(np.abs(change) / limit))
         text = (
-            f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} N m, '
-            'but no joint has moved: release the brakes, and activate the effort controller; if '
-            'neither is it, the drives give less than they are sent, or the joints stick: correct '
-            'torque constant or gear ratio, or give robot.coulomb'
+            f'the torque of joint {self._joints[worst]!r} has changed by {change[worst]:+.4g} '
+            f'{self._units[worst].torque}, but no joint has moved: release the brakes, and '
+            'activate the effort controller; if neither is it, the drives give less than they are '
+            'sent, or the joints stick: correct torque constant or gear ratio, or give '
+            'robot.coulomb'
         )
         return Fault(Reason.NO_EFFECT, text)
 
     def _falling_short(self, joint: int, shortfall: Vector) -> Fault:
         """Return the fault of a joint whose effort is `shortfall` (n,) [N m] below its command."""
+        unit = self._units[joint].torque
         text = (
-            f'the effort of joint {self._joints[joint]!r} lacks {shortfall[joint]:+.4g} N m of '
+            f'the effort of joint {self._joints[joint]!r} lacks {shortfall[joint]:+.4g} {unit} of '
             'what is commanded: release the brakes, and activate the effort controller; if the '
-            'effort is not a torque in N m, set robot.effort to current or unknown; if the joint '
+            f'effort is not in {unit}, set robot.effort to current or unknown; if the joint '
             'moves, its drive gives less than it is sent: correct its torque constant, gear ratio '
             'or current limit, or give what it can as torque.limit'
         )
@@ -240,9 +242,9 @@ class SampleCheck:
                 'effort controller'
             )
         return (
-            f'; its drive seems to have {assumed + error:.2g} kg m^2 instead of the assumed '
-            f'{assumed:.2g}, too little for these gains: give robot.rotor_inertia, or a wider '
-            'bound'
+            f'; its drive seems to have {assumed + error:.2g} {self._units[joint].inertia} instead '
+            f'of the assumed {assumed:.2g}, too little for these gains: give robot.rotor_inertia, '
+            'or a wider bound'
         )
 
     def _imbalance(self, joint: int) -> str:
@@ -257,7 +259,7 @@ class SampleCheck:
         model = needed_torque(
             controller.settings, self._estimates.estimate, q, rest, rest
         )[joint]
-        sent = sample.torque[joint]
+        sent, unit = sample.torque[joint], self._units[joint].torque
         least = _AGAINST * controller.settings.torque.limit[joint]
         is_against = -np.sign(sample.xi1[joint]) * (sent - model) > least
         if not is_against or (sent - model) * model < -least * abs(model):
@@ -269,8 +271,8 @@ class SampleCheck:
             'current limit)'
         )
         return (
-            f'; it is sent {sent:.3g} N m, where the model needs {model:.3g} N m at rest, and '
-            f'leaves all the same: it carries more than the model knows{drive}, or something '
+            f'; it is sent {sent:.3g} {unit}, where the model needs {model:.3g} {unit} at rest, '
+            f'and leaves all the same: it carries more than the model knows{drive}, or something '
             'holds it'
         )
 

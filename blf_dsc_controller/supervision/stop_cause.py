@@ -8,10 +8,9 @@ the check that stops the arm.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.supervision.calming import Calming
@@ -22,7 +21,7 @@ _STEPPED = 1.5
 _SATURATED = 0.05  # s: brakes that close in motion leave the bound sooner
 
 
-def chatter_of(controller: Controller, joints: Sequence[str]) -> str:
+def chatter_of(controller: Controller, config: ControllerConfig) -> str:
     """Return what to do about a torque that changes in each sample; empty if it does not."""
     checks = controller.checks
     limit = controller.settings.torque.limit
@@ -30,17 +29,19 @@ def chatter_of(controller: Controller, joints: Sequence[str]) -> str:
     worst = int(np.argmax(steps / limit))
     if not steps[worst] > _CHATTER * limit[worst]:
         return ''
+    units = config.units[worst]
     step = float(checks.sensor.resolution[worst])
     is_stepped = step > _STEPPED * float(np.sqrt(checks.sensor.noise[worst]))
     why = (
-        f'its positions come in steps of {1e3 * step:.2g} mrad, and its velocity with them'
+        f'its positions come in steps of {1e3 * step:.2g} {units.of("mrad")}, and its velocity '
+        'with them'
         if is_stepped
         else 'its measured velocity is noisy, or the gains are too high for its drive'
     )
     return (
-        f'the torque of {joints[worst]} changes by {steps[worst]:.2g} N m rms each '
-        f'sample: {why}. Lower the pole of the velocity filter '
-        'and add its lag to robot.lag, which makes the gains softer'
+        f'the torque of {config.joints[worst]} changes by {steps[worst]:.2g} {units.torque} rms '
+        f'each sample: {why}. Lower the pole of the velocity filter and add its lag to '
+        'robot.lag, which makes the gains softer'
     )
 
 
@@ -48,9 +49,9 @@ class StopCause:
     """Finds why an arm may be about to stop."""
 
     def __init__(
-        self, joints: Sequence[str], controller: Controller, calming: Calming
+        self, config: ControllerConfig, controller: Controller, calming: Calming
     ) -> None:
-        self._joints = joints
+        self._config = config
         self._controller = controller
         self._calming = calming
         self._limited = 0  # number of the joint that was last at its limit
@@ -67,7 +68,7 @@ class StopCause:
     @property
     def shaking(self) -> str:
         """What oscillates or chatters, and the remedy; empty if nothing does."""
-        return self.oscillation or chatter_of(self._controller, self._joints)
+        return self.oscillation or chatter_of(self._controller, self._config)
 
     def text(self, saturated_time: float) -> str:
         """Return the cause, and the remedy; empty if it is unknown.
@@ -84,8 +85,8 @@ class StopCause:
         settings = self._controller.settings
         i = self._limited
         demands = (
-            f'joint {self._joints[i]!r} has demanded more than its torque limit of '
-            f'{settings.torque.limit[i]:g} N m for {time:.2g} s'
+            f'joint {self._config.joints[i]!r} has demanded more than its torque limit of '
+            f'{settings.torque.limit[i]:g} {self._config.units[i].torque} for {time:.2g} s'
         )
         if self._controller.signals.saturation.cuts[i] >= RATE_CUT:
             return (

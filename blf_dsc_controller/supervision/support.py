@@ -36,11 +36,12 @@ def check_support(
     # which the check above sees
     is_held = np.isfinite(effort).all() and is_like(effort, gravity)
     if matters and not is_held and not np.abs(dq).max() > AT_REST:
+        unit = config.units[worst].torque
         raise StartError(
             'what holds the arm? The arm rests, but the joint states do not show whether its '
             'brakes hold it, or drives that compensate gravity: on joint '
-            f'{config.joints[worst]!r} gravity is {gravity[worst]:.4g} N m, and the effort is '
-            f'{effort[worst]:.4g} N m. If the drives compensate gravity, set '
+            f'{config.joints[worst]!r} gravity is {gravity[worst]:.4g} {unit}, and the effort is '
+            f'{effort[worst]:.4g} {unit}. If the drives compensate gravity, set '
             'robot.drive_compensates. If not, set robot.effort to whole, if the drives measure '
             'torques, or set torque.first_step to the torques that may be sent at once'
         )

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from math import inf, isnan, nan
 from typing import Any
 
-from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType, contact_in
+from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType
 from blf_dsc_controller.view.newest import LONGEST
 from blf_dsc_controller.view.plant_events import plant_events
-from blf_dsc_controller.view.texts import contact_text
 
 _LISTED = 12
 _PAUSE = 1.0  # s without targets, after which another stream is listed
@@ -63,9 +62,6 @@ class Events:
     def add_event(self, event: Event) -> None:
         """List an event of the controller's journal."""
         details = [f'{event.content[k]}' for k in _DETAILS if k in event.content]
-        if event.type is EventType.CONTACT:
-            _, joint, torque, interval, _ = contact_in(event)
-            details = [contact_text(joint, torque, interval)]
         self.add(self.take_time(event.stamp), event.type.value, ', '.join(details))
 
     def add_motion(self, event: Event) -> None:

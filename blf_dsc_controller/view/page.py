@@ -26,7 +26,7 @@ from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import missing_extra
-from blf_dsc_controller.run import Floats
+from blf_dsc_controller.run import Floats, unit_of_all
 from blf_dsc_controller.view.model_error import shares
 from blf_dsc_controller.view.shown_arm import arm_of
 from blf_dsc_controller.view.snapshot import Snapshot
@@ -146,6 +146,7 @@ class Page:
         self._clear()
         self._arm = arm
         self._joints = [joint.name for joint in arm.chain.joints]
+        self._units = config.units
         self._shows_contact = config.contact.enabled
         prefix, names = _shortened(self._joints)
         server = self.server
@@ -175,9 +176,10 @@ class Page:
             'bound',
             _DECADES,
         )
-        yield self._plot(f'{prefix}: torque [N m]', names)
+        unit = unit_of_all(self._units, 'N m')
+        yield self._plot(f'{prefix}: torque [{unit}]', names)
         if self._shows_contact:
-            yield self._plot(f'{prefix}: external torque [N m]', names)
+            yield self._plot(f'{prefix}: external torque [{unit}]', names)
         yield self._plot(
             'torque error of the model [%]', ('learned', 'initial'), _FROM_ZERO
         )
@@ -329,7 +331,7 @@ class Page:
         )
         scene.add_label(
             '/contact/text',
-            contact_of(self._joints, now),
+            contact_of(self._arm.chain.joints, now),
             position=(0.0, 0.0, 0.1 * reach),
             visible=felt is not None,
         )
@@ -353,7 +355,7 @@ class Page:
         with self.server.atomic():
             for plot, values in zip(self.plots, curves, strict=True):
                 plot.data = with_marks(t, values, marks)
-            self.caption.content = caption(now, contact_of(self._joints, now))
+            self.caption.content = caption(now, contact_of(self._arm.chain.joints, now))
 
     def _aim(self, camera: Any, width: float = inf) -> None:
         """Point a camera at the arm, which then fills a picture of this width [px]."""

@@ -9,24 +9,22 @@ from html import escape
 import numpy as np
 
 from blf_dsc_controller.analysis.panels import ALARM
+from blf_dsc_controller.arms.urdf import Joint
 from blf_dsc_controller.messages.named_values import load_text
+from blf_dsc_controller.run import joint_units
 from blf_dsc_controller.view.snapshot import Snapshot
 
 
-def contact_text(joint: str, torque: float, interval: float) -> str:
-    """Return the external torque of a contact, and how much of it is no contact."""
-    return (
-        f'external torque on {joint}: {torque:+.3g} N m, of which model error and noise '
-        f'explain at most {interval:.2g} N m'
-    )
-
-
-def contact_of(joints: Sequence[str], now: Snapshot) -> str:
-    """Return what touches the arm; empty if nothing does."""
+def contact_of(joints: Sequence[Joint], now: Snapshot) -> str:
+    """Return the external torque of a contact, and how much of it is none; empty without one."""
     k = now.felt_at
     if k is None:
         return ''
-    return contact_text(joints[k], float(now.external[k]), float(now.interval[k]))
+    unit = joint_units(joints[k].kind).torque
+    return (
+        f'external torque on {joints[k].name}: {now.external[k]:+.3g} {unit}, of which model '
+        f'error and noise explain at most {now.interval[k]:.2g} {unit}'
+    )
 
 
 def caption(now: Snapshot, contact: str) -> str:
