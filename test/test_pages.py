@@ -102,6 +102,14 @@ def test_python_of_the_home_page_keeps_the_bound(tmp_path, monkeypatch):
     assert Path('pictures/change.png').is_file()
 
 
+@each_page(sorted(DOC.glob('*.md')))
+def test_no_paragraph_of_a_page_is_long(page):
+    """At most 90 words, as CONTRIBUTING.md says; tables and equations do not count."""
+    for before, token in pairwise(tokens(page)):
+        if before.type == 'paragraph_open' and '\n| ---' not in token.content:
+            assert len(token.content.split()) <= 90, token.content
+
+
 def blocks_of(page):
     """Return the blocks of a page, and the names of those that are saved as Python files."""
     blocks, saved = [], {}
