@@ -21,18 +21,16 @@ from random_arm import Reference, recording_of, reference_of
 from benchmark.harness import print_table
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.identification.identify import identify_arm
+from blf_dsc_controller.identification.identify import ripples_left
+from blf_dsc_controller.identification.problem import problem_of
+from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.ripple import Ripples, listed_cycles
 from blf_dsc_controller.run import Floats
 from sim_plant.plant import plant_of
 
-EVERY = 4
-"""Samples of 1 ms between states of a recording."""
-
-SHARE = 0.008
-"""Amplitude of a ripple, of the rated torque."""
-
 _SECONDS = 20.0
+_EVERY = 4  # samples of 1 ms
+_SHARE = 0.008  # of the rated torque
 _RAMP = 2.0  # s, in which the motion begins
 _MOST_EFFORT = 100.0  # N m, that scales the PD
 _GAINS = 8.0, 0.48  # 1/rad and s/rad, times the effort
@@ -76,9 +74,14 @@ def main(options: argparse.Namespace) -> None:
         joints = amount = 0
         ratios: list[float] = []
         for seed in range(options.arms):
-            ripples, true, amplitudes = found_of(case, seed)
+            config = config_of(case.preset, seed)
+            n = len(config.joints)
+            true = [case.cycles[i % len(case.cycles)] for i in range(n)]
+            reference = reference_of(config.robot.chain(config.joints), seed)
+            ripples = found_of(config, true, reference, case.pace)
+            amplitudes = amplitudes_of(config)
             joints += sum(map(len, true))
-            amount += len(true)
+            amount += n
             for own, cycles, amplitude in zip(ripples, true, amplitudes, strict=True):
                 for each in own.found:
                     is_right = any(abs(each.cycles / N - 1.0) < _RIGHT for N in cycles)
@@ -86,38 +89,50 @@ def main(options: argparse.Namespace) -> None:
                     wrong += not is_right
                     if is_right:
                         ratios.append(each.amplitude / amplitude)
-            found.append(list(listed_cycles(ripples)))
+            found.append(str(list(listed_cycles(ripples))))
         span = f'{min(ratios):.2f} to {max(ratios):.2f}' if ratios else ''
         rows.append((
             case.name, f'{right} of {joints}', f'{wrong} in {amount} joints', span,
-            '; '.join(map(str, found)),
+            '; '.join(f'{found.count(each)} times {each}' for each in sorted({*found})),
         ))  # fmt: skip
-        print(rows[-1], flush=True)
     print_table(('case', 'found', 'wrong', 'amplitude', 'ripple_cycles'), rows)
 
 
+def config_of(preset: str, seed: int, **events: Sequence[float]) -> PlantConfig:
+    """Return an arm without a ripple of its own; `events` are a load."""
+    plant: dict[str, object] = {'actuator.ripple': 0.0, 'truth.seed': seed}
+    for name in ('begin', 'duration', 'payload'):
+        plant[f'events.{name}'] = tuple(events.get(name, ()))
+    return load_loop(preset, {PLANT: plant}).plant
+
+
 def found_of(
-    case: Case, seed: int
-) -> tuple[Sequence[Ripples], list[Sequence[float]], Floats]:
-    """Return what is found, and the true N and amplitudes [N m] of each joint."""
-    events: dict[str, list[float]] = {
-        f'events.{each}': [] for each in ('begin', 'duration', 'payload')
-    }
-    plant = {'actuator.ripple': 0.0, 'truth.seed': seed, **events}
-    config = load_loop(case.preset, {PLANT: plant}).plant
-    n = len(config.joints)
-    true = [case.cycles[i % len(case.cycles)] for i in range(n)]
-    amplitudes = SHARE * np.array(config.actuator.torque_limit)
-    reference = reference_of(config.robot.chain(config.joints), seed)
-    states = moved(config, true, amplitudes, reference, case.pace)[::EVERY]
-    recording = recording_of(states, config.joints, EVERY * config.sample_time)
-    return identify_arm(recording, config.robot).ripples, true, amplitudes
+    config: PlantConfig,
+    cycles: Sequence[Sequence[float]],
+    reference: Reference,
+    pace: float = 1.0,
+    load: float | None = None,
+) -> Sequence[Ripples]:
+    """Return what is found of an arm with N `cycles` of each joint; a load comes at that time [s].
+
+    Friction is fitted as viscous and Coulomb friction: terms are not selected, which takes long.
+    """
+    states = moved(config, cycles, reference, pace)[::_EVERY]
+    recording = recording_of(states, config.joints, _EVERY * config.sample_time)
+    problem = problem_of(recording, config.robot, 'torque', load, find_signs=False)
+    prior = problem.prior.only([])
+    fit = fitted(problem.rows, problem.windows.moving, problem.G, prior)
+    return ripples_left(problem, np.zeros(len(cycles)), fit)
+
+
+def amplitudes_of(config: PlantConfig) -> Floats:
+    """Return the amplitude (n,) [N m] of each ripple."""
+    return _SHARE * np.array(config.actuator.torque_limit)
 
 
 def moved(
     config: PlantConfig,
     cycles: Sequence[Sequence[float]],
-    amplitudes: Floats,
     reference: Reference,
     pace: float,
 ) -> Floats:
@@ -132,6 +147,7 @@ def moved(
     efforts = np.array([min(joint.effort, _MOST_EFFORT) for joint in chain.joints])
     n = efforts.size
     states = np.zeros((len(motion), 3, n))
+    amplitudes = amplitudes_of(config)
     ripple = np.zeros(n)
     for k, (position, velocity, _) in enumerate(motion):
         q, dq, effort = plant.measure().reshape(3, -1)

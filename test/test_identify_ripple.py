@@ -7,13 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from random_arm import recording_of, reference_of
+from random_arm import reference_of
 
-from benchmark.ripple import EVERY, SHARE, moved
-from blf_dsc_controller.configuration.nodes import PLANT, load_loop
-from blf_dsc_controller.identification.identify import ripples_left
-from blf_dsc_controller.identification.problem import problem_of
-from blf_dsc_controller.identification.regression import fitted
+from benchmark.ripple import amplitudes_of, config_of, found_of
 from blf_dsc_controller.identification.ripple import (
     NOTHING,
     Ripple,
@@ -23,30 +19,18 @@ from blf_dsc_controller.identification.ripple import (
 from blf_dsc_controller.identification.summary import ripple_table
 
 LOAD = {'begin': [10.0], 'duration': [100.0], 'payload': [3.0]}
-NO_LOAD = {name: [] for name in LOAD}
 
 
-def found_of(
-    cycles, *, preset='ur5e', seed=0, pace=1.0, reach=1.0, events=NO_LOAD, load=None
+def found_in(
+    cycles, preset='ur5e', *, seed=0, pace=1.0, reach=1.0, events=None, load=None
 ):
-    """Return the ripples found of an arm with these N of each joint, and its true amplitudes.
-
-    Its friction is not selected: only viscous and Coulomb friction are known.
-    """
-    given = {f'events.{name}': values for name, values in events.items()}
-    plant = {'actuator.ripple': 0.0, 'truth.seed': seed, **given}
-    config = load_loop(preset, {PLANT: plant}).plant
-    n = len(config.joints)
-    amplitudes = SHARE * np.array(config.actuator.torque_limit)
-    true = [cycles[i % len(cycles)] for i in range(n)]
+    """Return what is found of an arm with N of each joint, and the true amplitudes."""
+    config = config_of(preset, seed, **(events or {}))
     reference = reference_of(config.robot.chain(config.joints), seed)
     reference = reference._replace(amplitude=reach * reference.amplitude)
-    states = moved(config, true, amplitudes, reference, pace)[::EVERY]
-    recording = recording_of(states, config.joints, EVERY * config.sample_time)
-    problem = problem_of(recording, config.robot, 'torque', load, find_signs=False)
-    prior = problem.prior.only([])
-    fit = fitted(problem.rows, problem.windows.moving, problem.G, prior)
-    return ripples_left(problem, np.zeros(n), fit), amplitudes
+    n = len(config.joints)
+    true = [cycles[i % len(cycles)] for i in range(n)]
+    return found_of(config, true, reference, pace, load), amplitudes_of(config)
 
 
 def check(found, amplitudes, cycles):
@@ -66,12 +50,12 @@ def check(found, amplitudes, cycles):
         ('ur5e', [[12.5]], 1.0),
         ('ur5e', [[20.0, 50.0]], 1.0),
         ('ur5e', [[20.0], [50.0]], 1.0),
-        ('ur5e', [[100.0]], 0.33),
+        ('ur5e', [[100.0]], 1.0),
         ('panda', [[30.0]], 1.0),
     ],
 )
 def test_ripples_are_found(preset, cycles, pace):
-    found, amplitudes = found_of(cycles, preset=preset, pace=pace)
+    found, amplitudes = found_in(cycles, preset, pace=pace)
     check(found, amplitudes, cycles)
     every = sorted({N for own in cycles for N in own})
     assert sorted(listed_cycles(found)) == pytest.approx(every, rel=5e-3)
@@ -80,7 +64,7 @@ def test_ripples_are_found(preset, cycles, pace):
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('preset', ['ur5e', 'panda'])
 def test_no_ripple_is_claimed_where_there_is_none(preset, seed):
-    found, amplitudes = found_of([[]], preset=preset, seed=seed)
+    found, amplitudes = found_in([[]], preset, seed=seed)
     assert not any(own.found for own in found)
     assert listed_cycles(found) == ()
     assert all(own.is_known for own in found)
@@ -89,12 +73,12 @@ def test_no_ripple_is_claimed_where_there_is_none(preset, seed):
 
 
 def test_a_load_that_is_picked_up_does_not_hide_a_ripple():
-    found, amplitudes = found_of([[30.0]], events=LOAD, load=10.0)
+    found, amplitudes = found_in([[30.0]], events=LOAD, load=10.0)
     check(found, amplitudes, [[30.0]])
 
 
 def test_an_arm_that_hardly_moves_shows_no_ripple():
-    found, _ = found_of([[30.0]], reach=0.02)
+    found, _ = found_in([[30.0]], reach=0.02)
     assert found == (NOTHING,) * 6
 
 
