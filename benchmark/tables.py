@@ -49,6 +49,7 @@ GROUPS = {
         'intervals': 'whether the intervals hold where the model does not',
         'league': 'models of real and simulated robots by several methods',
         'stiffness': 'stiffness of gears from positions of motors and links',
+        'ripple': 'periods of torque ripple that are found, or are not there',
     },
     'references': {
         'streams': 'how far behind and how smooth the reference of a stream is',

@@ -43,6 +43,7 @@ from blf_dsc_controller.identification.summary import (
     joints_table,
     load_table,
     notes_of,
+    ripple_table,
     stiffness_table,
 )
 from blf_dsc_controller.progress import Stages, announce_reading, print_notice
@@ -74,8 +75,8 @@ def identify(options: Namespace) -> int:
     bodies = bodies_table(found)
     base = '\n'.join(base_table(found))
     joints = joints_table(found)
-    stiffness = stiffness_table(found)
-    tables = [*load_table(found), joints, *stiffness, errors_table(found)]
+    others = [*stiffness_table(found), *ripple_table(found)]
+    tables = [*load_table(found), joints, *others, errors_table(found)]
     print('\n\n'.join([*facts[:2], bodies, base, *tables, *facts[2:]]))
     if options.report:
         print_notice(f'drawing {options.report}: some seconds')

@@ -10,6 +10,7 @@ import numpy as np
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.identification.conventions import Convention
+from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.identification.stiffness import Compliance
 from blf_dsc_controller.identification.values import Parts, indices, parts
 from blf_dsc_controller.identification.windows import Carried
@@ -95,6 +96,7 @@ class Identified(NamedTuple):
     carried: Carried | None  # when the arm carried the load that was weighed
     # of gears, if positions of motors and links are known
     compliance: Compliance | None
+    ripples: tuple[Ripples, ...]  # (n,) of the torque
 
     @property
     def joints(self) -> list[str]:

@@ -32,12 +32,26 @@ from blf_dsc_controller.identification.problem import Effort, Problem, problem_o
 from blf_dsc_controller.identification.problems import is_usable, unexplained_joints
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.regression import Fit, fitted
+from blf_dsc_controller.identification.ripple import (
+    PER_HOP,
+    ROWS,
+    SAMPLES,
+    SHORT,
+    Ripples,
+    ripples_of,
+)
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import Selected, select
 from blf_dsc_controller.identification.stiffness import Compliance, compliance_of
 from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
-from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
+from blf_dsc_controller.identification.windows import (
+    COLUMNS,
+    HOP,
+    STILL,
+    shortened,
+)
+from blf_dsc_controller.run import Floats
 
 STAGES = READING, CHECKING, SELECTING, FITTING, INTERVALS, OTHERS = (
     'reading',
@@ -219,6 +233,7 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
         other_load=None,
         carried=problem.carried,
         compliance=compliance,
+        ripples=ripples_left(problem, selected.distances, final),
     )
 
 
@@ -232,6 +247,22 @@ def _compliance(problem: Problem, recording: Recording, fit: Fit) -> Compliance 
     theta = (problem.G @ links)[:-1]
     moving = problem.windows.moving
     return compliance_of(fit.rows, recording.twist, moving, theta, fit.values[-1])
+
+
+def ripples_left(problem: Problem, distances: Floats, fit: Fit) -> tuple[Ripples, ...]:
+    """Return the ripple of each joint in the torques that a fit leaves.
+
+    `distances` (n,) are those of its contacts.
+    """
+    theta = problem.G @ fit.values
+    length = max(SHORT, SAMPLES * fit.rows.period)
+    moving = problem.windows.moving
+    model = problem.parameters.model
+    parts = max(1, min(PER_HOP, ROWS // moving.size))
+    short = shortened(fit.rows, moving, model, distances, length, parts).with_load(
+        theta[: fit.rows.p]
+    )
+    return ripples_of(short, theta[:-1], theta[-1])
 
 
 def _named(joints: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:

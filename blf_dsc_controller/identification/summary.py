@@ -15,6 +15,7 @@ from blf_dsc_controller.identification.identified import (
 )
 from blf_dsc_controller.identification.left_out import KINDS
 from blf_dsc_controller.identification.problems import unexplained_joints
+from blf_dsc_controller.identification.ripple import Ripples, listed_cycles
 from blf_dsc_controller.identification.stiffness import LARGEST_TWIST
 from blf_dsc_controller.identification.values import (
     COULOMB,
@@ -166,6 +167,38 @@ def stiffness_table(found: Identified) -> Iterator[str]:
             cells = f'{values[i]:.5g} {unit}', f'{least[i]:.5g} to {most[i]:.5g}'
         rows.append((joint.name, *cells))
     yield aligned(rows)
+
+
+def ripple_table(found: Identified) -> Iterator[str]:
+    """Yield the torque ripple of each joint, and the parameter by which it is learned."""
+    rows = [('joint', 'torque ripple: its amplitude, and periods per turn')]
+    for joint, own in zip(found.chain.joints, found.ripples, strict=True):
+        slides = joint.kind == 'prismatic'
+        cells = _ripple_cells(own, units_of(joint.kind)[OFFSET], ' rad/m' * slides)
+        rows.append((joint.name, cells))
+    lines = [aligned(rows)]
+    if cycles := listed_cycles(found.ripples):
+        lines += [
+            'the controller learns to compensate it with this parameter:',
+            f'learning.ripple_cycles: [{", ".join(map(str, cycles))}]',
+        ]
+    yield '\n'.join(lines)
+
+
+def _ripple_cells(own: Ripples, torque: str, cycles: str) -> str:
+    """Return the ripples of one joint, in units of its torque and of N."""
+    if not own.is_known:
+        return 'cannot be known: the joint moved too little'
+    if not own.found:
+        first, last = own.seen
+        return (
+            f'none above {own.least:.2g} {torque} at {first:.3g} to {last:.3g}{cycles}'
+        )
+    return '; '.join(
+        f'{interval(each.amplitude, each.amplitude_deviation, ".3g")} {torque} at '
+        f'{interval(each.cycles, each.cycles_deviation)}{cycles}'
+        for each in own.found
+    )
 
 
 def base_table(found: Identified) -> Iterator[str]:

@@ -300,16 +300,20 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
     Raises:
         BlfDscError: there are too few.
     """
-    n = len(recording.joints)
     rows = _empty_rows(recording, model)
+    _add_gravity(rows, model)
+    return _filled(rows, model, np.zeros(len(recording.joints)))
+
+
+def _filled(rows: Rows, model: SerialChain, distances: Floats) -> Rows:
+    """Return rows that have no columns yet with all but load friction."""
     dq = rows.dq
     _add_inertial(rows, model)
-    _add_gravity(rows, model)
-    rows = rows.with_sliding(np.zeros(n))
+    rows = rows.with_sliding(distances)
     rows = rows.with_column('viscous', lambda at: dq[at])
     rows = rows.with_column('offset', lambda at: np.ones_like(dq[at]))
     rows = rows.with_column('quadratic', lambda at: dq[at] * np.abs(dq[at]))
-    if n > 1:
+    if rows.speed.size > 1:
         _set_coupling(rows)
 
     def in_motion(at: slice) -> Floats:
@@ -319,6 +323,39 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         weight=rows.over_windows(in_motion, rows.g) ** 2,
         speeds=rows.over_windows(lambda at: np.abs(dq[at]), rows.g),
     )
+
+
+def shortened(
+    rows: Rows,
+    windows: Indices,
+    model: SerialChain,
+    distances: Floats,
+    length: float,
+    parts: int,
+) -> Rows:
+    """Return rows of windows of so many seconds, in `parts` for each of some of the windows.
+
+    They pass what changes faster.  `distances` (n,) are those of `with_sliding`; there is no load
+    friction.
+    """
+    h = rows.period
+    g, slope = weighting(h, length)
+    hop = max(1.0, HOP / h) / parts
+    middle = 0.5 * (rows.g.size - g.size)
+    after = np.round(middle + hop * (np.arange(parts) - 0.5 * (parts - 1)))
+    at = (rows.starts[windows, None] + after.astype(np.intp)).ravel()
+    starts, first = np.unique(at, return_index=True)
+    short = rows._replace(
+        time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
+        inertial=OnDisk(rows.speed.size * rows.p),
+        columns={},
+        coupling=np.zeros((starts.size, *rows.coupling.shape[1:])),
+        clipped=np.repeat(rows.clipped[windows], parts, axis=0)[first],
+        g=g,
+        slope=slope,
+        starts=starts,
+    )
+    return _filled(short, model, distances)
 
 
 def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
@@ -425,9 +462,9 @@ def _add_gravity(rows: Rows, model: SerialChain) -> None:
         rows.gravity.append(H.reshape(len(H), -1))
 
 
-def weighting(h: float) -> tuple[Floats, Floats]:
-    """Return g with sum 1, and g' [1/s], at the samples of a window."""
-    length = round(WINDOW / h) + 1
+def weighting(h: float, window: float = WINDOW) -> tuple[Floats, Floats]:
+    """Return g with sum 1, and g' [1/s], at the samples of a window [s]."""
+    length = round(window / h) + 1
     turn = np.pi / (length - 1)
     phase = turn * np.arange(length) - 0.5 * np.pi
     g = np.cos(phase) ** 4

@@ -1,0 +1,405 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torque ripple of gears and motors, in what model and friction leave of the torques.
+
+A ripple with N periods per turn leaves a torque of the joint's own position,
+
+    a sin(N q) + b cos(N q)                                                        [N m]
+
+which `law/ripple.py` compensates.  N is searched on a grid by least squares (the periodogram of
+Lomb, Least-squares frequency analysis of unequally spaced data, 1976, over position instead of
+time).  Both sides pass windows of 0.05 s: at a speed v, these leave a share G(N v) of it.
+
+What is left is correlated.  So deviations are those of passes, which are motions in one
+direction and err independently (Liang and Zeger, Longitudinal data analysis using
+generalized linear models, 1986).  And a ripple must be the same in both directions, where
+friction is not, and in both halves of the recording, and stand out of its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.identification.windows import STILL, Rows
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
+from blf_dsc_controller.run import Floats
+
+SHORT = 0.05
+"""Length of the windows [s]."""
+
+SAMPLES = 6
+"""Samples of a window, at least."""
+
+PER_HOP = 4
+"""Windows in the time from one window of the fit to the next; fewer in long recordings."""
+
+ROWS = 20_000
+"""Windows that are enough."""
+
+_LARGEST = 300.0  # N that is searched
+_PERIODS = 2.5  # of a ripple in the range of the joint, at least
+_GRID = 6000  # N that are tried, at most
+_PER_LOBE = 4.0  # steps of N in a lobe, 2 pi / range, within which ripples look alike
+_PASSES = 8  # least number
+_ROWS = 4  # of a pass, at least
+_LONGEST = 2.0  # s of a pass; a longer one is cut
+_ROBUST = 2.5  # robust deviations, beyond which rows count less
+_CHANCE = 1e-3  # of a false ripple, in all N of a joint
+_LIKE = 0.5  # of a ripple, most that directions and halves may differ by
+_ABOVE = 6.0  # times the median power of its neighbours, at least
+_NEAR, _FAR = 1.5, 8.0  # lobes, from and to which there are neighbours
+_MOST = 3  # ripples of a joint
+_LISTED = 3
+_FELT = 0.35  # of the rms torque that is left without it, least amplitude that is told
+_ROUNDING = 2e-3  # of N, that makes no difference
+_ALIKE = 0.5  # of a lobe, by which N of two joints may differ
+_TABLE = 4096  # frequencies
+_AT_ONCE = 1_000_000  # numbers of a block
+_TINY = 1e-12
+
+
+class Ripple(NamedTuple):
+    """A ripple of one joint."""
+
+    cycles: float  # N, periods per turn; of a sliding joint rad/m
+    cycles_deviation: float
+    amplitude: float  # N m or N
+    amplitude_deviation: float
+
+
+class Ripples(NamedTuple):
+    """What is found of one joint."""
+
+    found: tuple[Ripple, ...]  # the strongest first
+    # N that can be found; infinite and 0 if the joint moved too little for any
+    seen: tuple[float, float]
+    least: float  # amplitude that would have been found for most N, N m or N
+    torque: float  # rms of what model and friction leave, N m or N
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the motion shows ripples."""
+        return self.seen[0] < self.seen[1]
+
+
+NOTHING = Ripples((), (np.inf, 0.0), np.inf, 0.0)
+"""What is found of a joint that moved too little."""
+
+
+def ripples_of(short: Rows, theta: Floats, delay: float) -> tuple[Ripples, ...]:
+    """Return the ripples of each joint in short windows, for the unknowns `theta` (m,)."""
+    windows = np.arange(short.time.size)
+    left = short.u(delay) - short.torques(windows, theta)
+    q = short.over_windows(lambda at: short.q[at], short.g)
+    dq = short.over_windows(lambda at: short.dq[at], short.g)
+    share = _Share(short.g, short.period)
+    found = []
+    for i in range(short.speed.size):
+        passes = _Passes.of(short.time, dq[:, i], ~short.clipped[:, i])
+        at = passes.rows
+        found.append(_of_joint(passes, q[at, i], dq[at, i], left[at, i], share))
+    return tuple(found)
+
+
+def listed_cycles(ripples: Sequence[Ripples]) -> tuple[float, ...]:
+    """Return the N of `learning.ripple_cycles`: of all joints, the few that disturb most."""
+    groups: list[list[_Listed]] = []
+    listed = [
+        _Listed(each, _worth(each, own), own.seen[0] / _PERIODS)
+        for own in ripples
+        for each in own.found
+    ]
+    for each in sorted(listed, key=lambda one: -one.worth):
+        same = next((group for group in groups if _is_same(group[0], each)), None)
+        if same is None:
+            groups.append([each])
+        else:
+            same.append(each)
+    groups.sort(key=lambda group: -sum(each.worth for each in group))
+    return tuple(
+        _rounded([each.ripple for each in group]) for group in groups[:_LISTED]
+    )
+
+
+class _Listed(NamedTuple):
+    """A ripple that may be listed."""
+
+    ripple: Ripple
+    worth: float
+    lobe: float  # of its joint
+
+
+def _worth(ripple: Ripple, own: Ripples) -> float:
+    """Return how much of what is left of a joint's torque a ripple takes."""
+    strengths = [each.amplitude**2 for each in own.found]
+    return ripple.amplitude**2 / (sum(strengths) + 2.0 * own.torque**2)
+
+
+def _is_same(one: _Listed, other: _Listed) -> bool:
+    """Return whether ripples of two joints may have the same N, or look alike in their motion."""
+    a, b = one.ripple, other.ripple
+    deviation = float(np.hypot(a.cycles_deviation, b.cycles_deviation))
+    lobe = _ALIKE * max(one.lobe, other.lobe)
+    return abs(a.cycles - b.cycles) < max(lobe, TWO_SIDED * deviation)
+
+
+def _rounded(same: Sequence[Ripple]) -> float:
+    """Return the mean N of ripples, with no more digits than are known: 30.0 for 29.98 +- 0.03."""
+    weights = np.array([1.0 / (each.cycles_deviation**2 + _TINY) for each in same])
+    mean = float(weights @ [each.cycles for each in same] / weights.sum())
+    half = max(TWO_SIDED / float(np.sqrt(weights.sum())), _ROUNDING * mean)
+    for digits in range(3):
+        rounded = round(mean, digits)
+        if abs(rounded - mean) < half:
+            break
+    return rounded
+
+
+class _Share:
+    """The share of a sine that passes a window, by its angular frequency."""
+
+    def __init__(self, g: Floats, h: float) -> None:
+        time = h * (np.arange(g.size) - 0.5 * (g.size - 1))
+        self._frequency = np.linspace(0.0, np.pi / h, _TABLE)
+        self._share = np.cos(np.multiply.outer(self._frequency, time)) @ g
+
+    def __call__(self, frequency: Floats) -> Floats:
+        """Return it for frequencies (...) [rad/s], as of the nearest in the table."""
+        at = np.abs(frequency) / self._frequency[1] + 0.5
+        return np.asarray(np.take(self._share, at.astype(np.intp), mode='clip'))
+
+    @property
+    def half(self) -> float:
+        """Frequency of which half passes [rad/s]."""
+        return float(self._frequency[np.argmax(self._share < 0.5)])
+
+
+class _Passes(NamedTuple):
+    """Rows in which a joint moves, by passes in one direction."""
+
+    rows: NDArray[np.intp]  # (K,)
+    begins: NDArray[np.intp]  # (G,) of passes, in `rows`
+    is_forward: NDArray[np.bool_]  # (G,)
+    time: Floats  # (G,) s
+
+    @classmethod
+    def of(cls, time: Floats, dq: Floats, is_sound: NDArray[np.bool_]) -> _Passes:
+        """Return those at times (R,) with the speeds (R,)."""
+        moves = np.flatnonzero(is_sound & (np.abs(dq) > STILL))
+        if moves.size < 2:
+            nothing = np.zeros(0, dtype=np.intp)
+            return cls(nothing, nothing, nothing > 0, np.zeros(0))
+        step = np.diff(time[moves])
+        is_end = (np.diff(np.sign(dq[moves])) != 0) | (step > 1.5 * np.median(step))
+        number = np.concatenate(([0], np.cumsum(is_end)))
+        since = time[moves] - time[moves][np.searchsorted(number, number)]
+        part = np.floor(since / _LONGEST)
+        is_new = (np.diff(number) != 0) | (np.diff(part) != 0)
+        number = np.concatenate(([0], np.cumsum(is_new)))
+        is_long = np.bincount(number) >= _ROWS
+        rows = moves[is_long[number]]
+        begins = np.unique(number[is_long[number]], return_index=True)[1]
+        return cls(rows, begins, dq[rows[begins]] > 0.0, time[rows[begins]])
+
+    def sums(self, values: Floats) -> Floats:
+        """Return sums (..., G) of values (..., K) over each pass."""
+        return np.asarray(np.add.reduceat(values, self.begins, axis=-1))
+
+    def spread(self, values: Floats) -> Floats:
+        """Return values (..., G) of passes at their rows (..., K)."""
+        counts = np.diff(np.append(self.begins, self.rows.size))
+        return np.repeat(values, counts, axis=-1)
+
+    def parts(self) -> Iterator[NDArray[np.bool_]]:
+        """Yield the passes (G,) of both directions, and of both halves."""
+        first = self.time < np.median(self.time)
+        yield from (self.is_forward, ~self.is_forward, first, ~first)
+
+
+class _Estimate(NamedTuple):
+    """Least squares of what is left by a sine and a cosine, for k values of N."""
+
+    A: Floats  # (k, G, 2, 2) products of the columns in each pass
+    b: Floats  # (k, G, 2) and of them with what is left
+
+    def of(self, passes: NDArray[np.bool_] | slice = slice(None)) -> Floats:
+        """Return the coefficients (k, 2) by some passes."""
+        A = self.A[:, passes].sum(axis=1) + _TINY * np.eye(2)
+        return np.asarray(
+            np.linalg.solve(A, self.b[:, passes].sum(axis=1)[..., None])[..., 0]
+        )
+
+    @property
+    def power(self) -> Floats:
+        """What they explain (k,)."""
+        return np.asarray(np.sum(self.of() * self.b.sum(axis=1), axis=-1))
+
+    def covariance(self) -> Floats:
+        """Return the covariance (k, 2, 2) of the coefficients, by passes."""
+        G = self.A.shape[1]
+        score = self.b - np.einsum('kgab,kb->kga', self.A, self.of())
+        B = np.einsum('kga,kgb->kab', score, score) * G / (G - 2.0)
+        inverse = np.linalg.inv(self.A.sum(axis=1) + _TINY * np.eye(2))
+        return np.asarray(inverse @ B @ inverse)
+
+
+class _Joint(NamedTuple):
+    """Rows (K,) of one joint."""
+
+    passes: _Passes
+    q: Floats  # from the middle of its range
+    dq: Floats
+    weight: Floats
+    share: _Share
+
+    def columns(self, cycles: Floats) -> Floats:
+        """Return sine and cosine (k, 2, K) for some N (k,), without their mean of each pass."""
+        angle = np.multiply.outer(cycles, self.q)
+        passed = self.share(np.multiply.outer(cycles, self.dq))
+        return self.centred(
+            np.stack((passed * np.sin(angle), passed * np.cos(angle)), axis=1)
+        )
+
+    def centred(self, values: Floats) -> Floats:
+        """Return values (..., K) without their weighted mean of each pass."""
+        means = self.passes.sums(self.weight * values) / self.passes.sums(self.weight)
+        return np.asarray(values - self.passes.spread(means))
+
+    def estimate(self, cycles: Floats, left: Floats) -> _Estimate:
+        """Return the estimate for some N (k,)."""
+        A, b = [], []
+        for part in np.array_split(cycles, 1 + cycles.size * left.size // _AT_ONCE):
+            sine, cosine = np.moveaxis(self.columns(part), 1, 0)
+            weighted = self.weight * sine, self.weight * cosine
+            ss, sc, cc, se, ce = map(self.passes.sums, (
+                weighted[0] * sine, weighted[0] * cosine, weighted[1] * cosine,
+                weighted[0] * left, weighted[1] * left))  # fmt: skip
+            A.append(np.moveaxis(np.array(((ss, sc), (sc, cc))), (0, 1), (2, 3)))
+            b.append(np.stack((se, ce), axis=-1))
+        return _Estimate(np.concatenate(A), np.concatenate(b))
+
+    def fitted(self, cycles: Sequence[float], left: Floats) -> Floats:
+        """Return what ripples with these N explain together."""
+        H = self.columns(np.array(cycles)).reshape(-1, left.size)
+        c = np.linalg.lstsq(
+            (self.weight * H) @ H.T, (self.weight * H) @ left, rcond=None
+        )[0]
+        return np.asarray(c @ H)
+
+
+def _of_joint(
+    passes: _Passes, q: Floats, dq: Floats, left: Floats, share: _Share
+) -> Ripples:
+    """Return the ripples of a joint by its rows (K,)."""
+    forward = passes.is_forward.sum()
+    if passes.begins.size < _PASSES or not 3 <= forward <= passes.begins.size - 3:
+        return NOTHING
+    low, high = np.percentile(q, (1.0, 99.0))
+    lobe = 2.0 * np.pi / (high - low)
+    first = _PERIODS * lobe
+    fastest = share.half / float(np.median(np.abs(dq)))
+    seen = first, min(_LARGEST, fastest, first + _GRID * lobe / _PER_LOBE)
+    if seen[1] < seen[0] + lobe:
+        return NOTHING
+    joint = _Joint(passes, q - 0.5 * (low + high), dq, np.ones(q.size), share)
+    left = joint.centred(left)
+    spread = 1.4826 * float(np.median(np.abs(left))) + _TINY
+    weight = np.minimum(1.0, _ROBUST * spread / (np.abs(left) + _TINY))
+    joint = joint._replace(weight=weight)
+    left = joint.centred(left)
+    grid = np.arange(seen[0], seen[1], lobe / _PER_LOBE)
+    cycles: list[float] = []
+    rest = left
+    while True:
+        estimate = joint.estimate(grid, rest)
+        is_new = (
+            np.abs(np.subtract.outer(grid, cycles)).min(axis=1, initial=np.inf)
+            > _NEAR * lobe
+        )
+        certain = np.flatnonzero(
+            _is_ripple(estimate, grid, lobe, passes.parts()) & is_new
+        )
+        if not certain.size or len(cycles) == _MOST:
+            break
+        best = certain[np.argmax(estimate.power[certain])]
+        cycles.append(_refined(joint, rest, float(grid[best]), lobe))
+        rest = left - joint.fitted(cycles, left)
+    torque = float(np.sqrt(np.mean(rest**2)))
+    found = [_ripple(joint, left, cycles, k) for k in range(len(cycles))]
+    found.sort(key=lambda each: -each.amplitude)
+    told = tuple(each for each in found if each.amplitude > _FELT * torque)
+    certain_from = float(np.median(_least(estimate, grid.size / _PER_LOBE)))
+    return Ripples(told, seen, max(certain_from, _FELT * torque), torque)
+
+
+def _level(passes: int, cells: float) -> float:
+    """Return the F statistic that noise exceeds in one of so many cells by `_CHANCE`."""
+    from scipy.special import fdtri
+
+    return float(fdtri(2.0, passes - 2.0, 1.0 - _CHANCE / max(cells, 1.0)))
+
+
+def _least(estimate: _Estimate, cells: float) -> Floats:
+    """Return the amplitudes (k,) that would be certain."""
+    variance = 0.5 * np.trace(estimate.covariance(), axis1=1, axis2=2)
+    return np.asarray(np.sqrt(2.0 * variance * _level(estimate.A.shape[1], cells)))
+
+
+def _is_ripple(
+    estimate: _Estimate, grid: Floats, lobe: float, parts: Iterable[NDArray[np.bool_]]
+) -> NDArray[np.bool_]:
+    """Return at which N (k,) of the grid there is a ripple, like in all parts of the passes."""
+    c = estimate.of()
+    V = estimate.covariance() + _TINY * np.eye(2)
+    F = 0.5 * np.einsum('ka,ka->k', c, np.linalg.solve(V, c[..., None])[..., 0])
+    certain = _level(estimate.A.shape[1], grid.size / _PER_LOBE) < F
+    amplitude = np.linalg.norm(c, axis=1)
+    for part in parts:
+        certain &= np.linalg.norm(estimate.of(part) - c, axis=1) < _LIKE * amplitude
+    power = estimate.power
+    for k in np.flatnonzero(certain):
+        away = np.abs(grid - grid[k])
+        others = power[(away > _NEAR * lobe) & (away < _FAR * lobe)]
+        certain[k] = others.size > 0 and power[k] > _ABOVE * np.median(others)
+    return np.asarray(certain)
+
+
+def _refined(joint: _Joint, left: Floats, cycles: float, lobe: float) -> float:
+    """Return the N near one of the grid that explains most."""
+    step = lobe / _PER_LOBE
+    for _ in range(3):
+        near = cycles + step * np.linspace(-1.0, 1.0, 11)
+        cycles = float(near[np.argmax(joint.estimate(near, left).power)])
+        step *= 0.2
+    return cycles
+
+
+def _ripple(joint: _Joint, left: Floats, all_cycles: Sequence[float], k: int) -> Ripple:
+    """Return ripple k of several, without what the others explain."""
+    others = [N for j, N in enumerate(all_cycles) if j != k]
+    if others:
+        both = joint.columns(np.array(all_cycles)).reshape(-1, left.size)
+        weighted = joint.weight * both
+        c = np.linalg.lstsq(weighted @ both.T, weighted @ left, rcond=None)[0]
+        c[2 * k : 2 * k + 2] = 0.0
+        left = left - c @ both
+    N = all_cycles[k]
+    sine, cosine = joint.columns(np.array([N]))[0]
+    estimate = joint.estimate(np.array([N]), left)
+    a, b = estimate.of()[0]
+    amplitude = float(np.hypot(a, b))
+    along = np.array((a, b)) / (amplitude + _TINY)
+    V = estimate.covariance()[0]
+    # N by its own column, d/dN, and the passes' scores of all three
+    step = joint.q * (a * cosine - b * sine)
+    H = np.stack((sine, cosine, joint.centred(step)))
+    inverse = np.linalg.inv((joint.weight * H) @ H.T)
+    score = joint.passes.sums(joint.weight * H * (left - a * sine - b * cosine))
+    G = joint.passes.begins.size
+    C = inverse @ score @ score.T @ inverse * G / (G - 3.0)
+    return Ripple(
+        N, float(np.sqrt(C[2, 2])), amplitude, float(np.sqrt(along @ V @ along))
+    )
