@@ -402,7 +402,8 @@ class Learning:
     )
     ripple_cycles: tuple[float, ...] = sizing(
         (),
-        'also estimate a torque ripple of each joint with so many periods per turn',
+        'also estimate a torque ripple of each joint with so many periods per turn; where it '
+        'slides, rad per metre',
         above=0.0,
         omittable=True,
     )

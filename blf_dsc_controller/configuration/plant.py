@@ -279,7 +279,9 @@ class Actuator:
         0.0, 'amplitude of the torque ripple, relative to the rated torque'
     )
     ripple_cycles: float = _fixed(
-        20.0, 'periods of the ripple per turn, or per metre', above=0.0
+        20.0,
+        'periods of the ripple per turn; where a joint slides, rad per metre',
+        above=0.0,
     )
     command_timeout: float = positive(
         0.05, 'age after which a torque is no longer applied, in real time', 's'
