@@ -50,9 +50,8 @@ class State(NamedTuple):
     sensed1: Annotated[Array, 'n * observer.enabled']  # tau_J behind one pole, N m
     sensed2: Annotated[Array, 'n * observer.enabled']  # and behind both, N m
     rows: Cell  # of motion so far
-    Phi: Annotated[
-        Array, 'motors.size * observer.enabled', 'motors.size'
-    ]  # of [X | D]^T [X | D], upper triangle
+    # of [X | D]^T [X | D], upper triangle
+    Phi: Annotated[Array, 'motors.size * observer.enabled', 'motors.size']
     b: Annotated[Array, 'motors.size * observer.enabled']  # of [X | D]^T (g - D d_0)
     square: Cell  # of |g - D d_0|^2, (N m)^2
     residual: Cell  # s^2, (N m)^2
