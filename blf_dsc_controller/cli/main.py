@@ -8,7 +8,6 @@ extras.
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import shlex
 import signal
@@ -64,9 +63,7 @@ def _code_of(options: argparse.Namespace) -> int:
         if options.command == 'run' and not options.offline:
             require_ros()  # before what takes a second to import
         module, function = options.handler
-        command = getattr(
-            importlib.import_module(f'blf_dsc_controller.cli.{module}'), function
-        )
+        command = getattr(child.imported(f'blf_dsc_controller.cli.{module}'), function)
         code: int | None = command(options)
     except BrokenPipeError:
         return 1  # nobody reads any more
@@ -188,7 +185,7 @@ def _node(module: str) -> int:
     except BlfDscError as error:
         print(error, file=sys.stderr)
         return 1
-    code: int = importlib.import_module(module).main()
+    code: int = child.imported(module).main()
     return code
 
 
