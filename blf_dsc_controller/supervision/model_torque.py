@@ -28,16 +28,12 @@ def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
     n = settings.n
     at = settings.p + settings.n * settings.columns.bias
     torque = np.zeros(n)
-    directions = [
-        sliding(velocity, settings.columns.coulomb_velocity) for velocity in dq
-    ]
-    for is_on, effect in (
-        (settings.columns.viscous, dq),
-        (settings.columns.coulomb, directions),
-    ):
-        if is_on:
-            torque += estimate[at : at + n] * effect
-            at += n
+    if settings.columns.viscous:
+        torque += estimate[at : at + n] * dq
+        at += n
+    if settings.columns.coulomb:
+        smoothing = settings.columns.coulomb_velocity
+        torque += estimate[at : at + n] * [sliding(v, smoothing) for v in dq]
     return torque
 
 

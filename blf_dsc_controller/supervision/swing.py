@@ -100,13 +100,14 @@ class Swing:
         least = np.maximum(_LEAST, unsure / FILTER)
         back = np.abs(v - self._farthest)
         ends = back > np.maximum(0.5 * least, _TURNED * travel)
-        self._end_half_waves(ends, travel, travel > least)
-        self._farthest[ends] = v[ends]
-        self._farthest_at[ends] = self._since[ends]
-        moves = np.abs(v) > 0.5 * least
-        returns = (self._steady > _LONGEST) & moves
-        self.share[returns] = np.minimum(1.0, 2.0 * self.share[returns])
-        self._steady[returns] = 0.0
+        if ends.any():
+            self._end_half_waves(ends, travel, travel > least)
+            self._farthest[ends] = v[ends]
+            self._farthest_at[ends] = self._since[ends]
+        returns = (self._steady > _LONGEST) & (np.abs(v) > 0.5 * least)
+        if returns.any():
+            self.share[returns] = np.minimum(1.0, 2.0 * self.share[returns])
+            self._steady[returns] = 0.0
 
     def _begin_at(self, v: Vector) -> None:
         """Begin with the next half waves at v (n,) [rad/s]."""
