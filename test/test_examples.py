@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from command import COMPILED
+from command import COMPILED, NO_PICTURES
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
@@ -39,6 +40,7 @@ def test_example_runs_without_hardware(path, tmp_path):
     ended = subprocess.run(
         [sys.executable, path, *arguments],
         cwd=tmp_path,
+        env=os.environ | NO_PICTURES,
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
