@@ -30,6 +30,7 @@ from rosbags.rosbag2 import (
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from blf_dsc_controller.bags import writer
 from blf_dsc_controller.bags.background_file import BackgroundFile
 from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.bags.sources import BagError, open_bag
@@ -218,15 +219,18 @@ def test_data_is_flushed_periodically(tmp_path, compression, monkeypatch):
     assert read(path) == complete
 
 
-def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path):
+def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(
+    tmp_path, monkeypatch
+):
     """Every chunk has an entry in the index, which is in memory until its file ends."""
+    monkeypatch.setattr(writer, '_MOST_CHUNKS', 2_500)  # 10_000 for users
     with BagWriter(tmp_path / 'bag', flush_interval=0.0) as bag:
         handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
         peaks = []
         tracemalloc.start()
-        for k in range(40_000):
+        for k in range(10_000):
             bag.write(handle, message(k), k)
-            if k % 10_000 == 9_999:
+            if k % 2_500 == 2_499:
                 peaks.append(tracemalloc.get_traced_memory()[1])
                 tracemalloc.reset_peak()
         tracemalloc.stop()
@@ -234,15 +238,15 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(tmp_path)
     found = information(tmp_path / 'bag')
     assert (found['starting_time'], found['duration']) == (
         {'nanoseconds_since_epoch': 0},
-        {'nanoseconds': 39_999},
+        {'nanoseconds': 9_999},
     )
     files = [(file['starting_time'], file['message_count']) for file in found['files']]
     assert files == [
-        ({'nanoseconds_since_epoch': k}, 10_000) for k in range(0, 40_000, 10_000)
+        ({'nanoseconds_since_epoch': k}, 2_500) for k in range(0, 10_000, 2_500)
     ]
     with open_bag(tmp_path / 'bag' / 'bag_3.mcap') as opened:
-        assert len(list(opened.messages({'/a'}))) == 10_000
-    expected = [*map(message, range(40_000))]
+        assert len(list(opened.messages({'/a'}))) == 2_500
+    expected = [*map(message, range(10_000))]
     assert not recover(tmp_path / 'bag', tmp_path / 'clean').losses
     for name in ('bag', 'clean'):
         with open_bag(tmp_path / name) as opened:

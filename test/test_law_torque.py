@@ -354,7 +354,7 @@ def test_torque_at_its_rate_limit_turns_round_with_its_demand(amplitude):
     demand on its way down.
     """
     turn = round(1.0 / DT)
-    k = np.arange(8 * turn)
+    k = np.arange(4 * turn)
     demands = amplitude * np.sin(2.0 * np.pi * k / turn)
     torques = np.array([*follow(demands, 20.0)])[-turn:]
     step = 20.0 * DT
