@@ -281,58 +281,94 @@ class _Joint(NamedTuple):
             b.append(np.stack((se, ce), axis=-1))
         return _Estimate(np.concatenate(A), np.concatenate(b))
 
-    def fitted(self, cycles: Sequence[float], left: Floats) -> Floats:
-        """Return what ripples with these N explain together."""
+    def fitted(
+        self, cycles: Sequence[float], left: Floats, but: int | None = None
+    ) -> Floats:
+        """Return what ripples with these N explain together, or all of them but one."""
         H = self.columns(np.array(cycles)).reshape(-1, left.size)
-        c = np.linalg.lstsq(
-            (self.weight * H) @ H.T, (self.weight * H) @ left, rcond=None
-        )[0]
+        weighted = self.weight * H
+        c = np.linalg.lstsq(weighted @ H.T, weighted @ left, rcond=None)[0]
+        if but is not None:
+            c[2 * but : 2 * but + 2] = 0.0
         return np.asarray(c @ H)
+
+
+class _Search(NamedTuple):
+    """Which N of a joint are searched."""
+
+    middle: float  # of its range, rad
+    lobe: float  # of N, within which ripples look alike
+    seen: tuple[float, float]
+
+    @property
+    def grid(self) -> Floats:
+        """The N that are tried (k,)."""
+        return np.arange(*self.seen, self.lobe / _PER_LOBE)
+
+
+def _search_of(passes: _Passes, q: Floats, dq: Floats, share: _Share) -> _Search | None:
+    """Return which N the motion of a joint may show, None if it moved too little."""
+    forward = passes.is_forward.sum()
+    if passes.begins.size < _PASSES or not 3 <= forward <= passes.begins.size - 3:
+        return None
+    low, high = np.percentile(q, (1.0, 99.0))
+    lobe = 2.0 * np.pi / (high - low)
+    first = _PERIODS * lobe
+    fastest = share.half / float(np.median(np.abs(dq)))
+    last = min(_LARGEST, fastest, first + _GRID * lobe / _PER_LOBE)
+    if last < first + lobe:
+        return None
+    return _Search(0.5 * (low + high), lobe, (first, last))
 
 
 def _of_joint(
     passes: _Passes, q: Floats, dq: Floats, left: Floats, share: _Share
 ) -> Ripples:
     """Return the ripples of a joint by its rows (K,)."""
-    forward = passes.is_forward.sum()
-    if passes.begins.size < _PASSES or not 3 <= forward <= passes.begins.size - 3:
+    search = _search_of(passes, q, dq, share)
+    if search is None:
         return NOTHING
-    low, high = np.percentile(q, (1.0, 99.0))
-    lobe = 2.0 * np.pi / (high - low)
-    first = _PERIODS * lobe
-    fastest = share.half / float(np.median(np.abs(dq)))
-    seen = first, min(_LARGEST, fastest, first + _GRID * lobe / _PER_LOBE)
-    if seen[1] < seen[0] + lobe:
-        return NOTHING
-    joint = _Joint(passes, q - 0.5 * (low + high), dq, np.ones(q.size), share)
-    left = joint.centred(left)
-    spread = 1.4826 * float(np.median(np.abs(left))) + _TINY
-    weight = np.minimum(1.0, _ROBUST * spread / (np.abs(left) + _TINY))
-    joint = joint._replace(weight=weight)
-    left = joint.centred(left)
-    grid = np.arange(seen[0], seen[1], lobe / _PER_LOBE)
-    cycles: list[float] = []
-    rest = left
-    while True:
-        estimate = joint.estimate(grid, rest)
-        is_new = (
-            np.abs(np.subtract.outer(grid, cycles)).min(axis=1, initial=np.inf)
-            > _NEAR * lobe
-        )
-        certain = np.flatnonzero(
-            _is_ripple(estimate, grid, lobe, passes.parts()) & is_new
-        )
-        if not certain.size or len(cycles) == _MOST:
-            break
-        best = certain[np.argmax(estimate.power[certain])]
-        cycles.append(_refined(joint, rest, float(grid[best]), lobe))
-        rest = left - joint.fitted(cycles, left)
+    joint = _Joint(passes, q - search.middle, dq, np.ones(q.size), share)
+    joint, left = _robust(joint, left)
+    cycles, rest, without = _all_cycles(joint, left, search)
     torque = float(np.sqrt(np.mean(rest**2)))
     found = [_ripple(joint, left, cycles, k) for k in range(len(cycles))]
     found.sort(key=lambda each: -each.amplitude)
     told = tuple(each for each in found if each.amplitude > _FELT * torque)
-    certain_from = float(np.median(_least(estimate, grid.size / _PER_LOBE)))
-    return Ripples(told, seen, max(certain_from, _FELT * torque), torque)
+    certain_from = float(np.median(_least(without, search.grid.size / _PER_LOBE)))
+    return Ripples(told, search.seen, max(certain_from, _FELT * torque), torque)
+
+
+def _robust(joint: _Joint, left: Floats) -> tuple[_Joint, Floats]:
+    """Return the joint with less weight of rows far off, and what is left without its means."""
+    left = joint.centred(left)
+    spread = 1.4826 * float(np.median(np.abs(left))) + _TINY
+    weight = np.minimum(1.0, _ROBUST * spread / (np.abs(left) + _TINY))
+    joint = joint._replace(weight=weight)
+    return joint, joint.centred(left)
+
+
+def _all_cycles(
+    joint: _Joint, left: Floats, search: _Search
+) -> tuple[list[float], Floats, _Estimate]:
+    """Return the N of all ripples, what is left without these, and its estimate on the grid.
+
+    The strongest is found first, and the next in what it leaves.
+    """
+    grid = search.grid
+    cycles: list[float] = []
+    rest = left
+    while True:
+        estimate = joint.estimate(grid, rest)
+        away = np.abs(np.subtract.outer(grid, cycles)).min(axis=1, initial=np.inf)
+        is_new = away > _NEAR * search.lobe
+        is_ripple = _is_ripple(estimate, grid, search.lobe, joint.passes.parts())
+        certain = np.flatnonzero(is_ripple & is_new)
+        if not certain.size or len(cycles) == _MOST:
+            return cycles, rest, estimate
+        best = certain[np.argmax(estimate.power[certain])]
+        cycles.append(_refined(joint, rest, float(grid[best]), search.lobe))
+        rest = left - joint.fitted(cycles, left)
 
 
 def _level(passes: int, cells: float) -> float:
@@ -379,27 +415,32 @@ def _refined(joint: _Joint, left: Floats, cycles: float, lobe: float) -> float:
 
 def _ripple(joint: _Joint, left: Floats, all_cycles: Sequence[float], k: int) -> Ripple:
     """Return ripple k of several, without what the others explain."""
-    others = [N for j, N in enumerate(all_cycles) if j != k]
-    if others:
-        both = joint.columns(np.array(all_cycles)).reshape(-1, left.size)
-        weighted = joint.weight * both
-        c = np.linalg.lstsq(weighted @ both.T, weighted @ left, rcond=None)[0]
-        c[2 * k : 2 * k + 2] = 0.0
-        left = left - c @ both
+    if len(all_cycles) > 1:
+        left = left - joint.fitted(all_cycles, left, but=k)
     N = all_cycles[k]
-    sine, cosine = joint.columns(np.array([N]))[0]
     estimate = joint.estimate(np.array([N]), left)
-    a, b = estimate.of()[0]
-    amplitude = float(np.hypot(a, b))
-    along = np.array((a, b)) / (amplitude + _TINY)
-    V = estimate.covariance()[0]
-    # N by its own column, d/dN, and the passes' scores of all three
-    step = joint.q * (a * cosine - b * sine)
-    H = np.stack((sine, cosine, joint.centred(step)))
+    c = estimate.of()[0]
+    amplitude = float(np.hypot(*c))
+    along = c / (amplitude + _TINY)
+    return Ripple(
+        N,
+        _deviation_of_cycles(joint, left, N, c),
+        amplitude,
+        float(np.sqrt(along @ estimate.covariance()[0] @ along)),
+    )
+
+
+def _deviation_of_cycles(joint: _Joint, left: Floats, N: float, c: Floats) -> float:
+    """Return the deviation of N of a ripple with the coefficients c (2,), by passes.
+
+    Its column is d/dN of the ripple; sine and cosine are estimated with it.
+    """
+    a, b = c
+    sine, cosine = joint.columns(np.array([N]))[0]
+    slope = joint.centred(joint.q * (a * cosine - b * sine))
+    H = np.stack((sine, cosine, slope))
     inverse = np.linalg.inv((joint.weight * H) @ H.T)
     score = joint.passes.sums(joint.weight * H * (left - a * sine - b * cosine))
     G = joint.passes.begins.size
     C = inverse @ score @ score.T @ inverse * G / (G - 3.0)
-    return Ripple(
-        N, float(np.sqrt(C[2, 2])), amplitude, float(np.sqrt(along @ V @ along))
-    )
+    return float(np.sqrt(C[2, 2]))
