@@ -29,7 +29,6 @@ from blf_dsc_controller.motors.frame import Frame
 from blf_dsc_controller.motors.mounting import Mounting
 from sim_plant.motors import IN_REAL_TIME, MotorPlant
 
-_PATIENCE = 0.05  # s, after which it is seen that the bus is closed
 _AT_ONCE = 0.002  # s, in which no frame is answered
 _LATEST = 0.2  # s behind the clock, at most
 _COLD = 30  # deg C
@@ -69,7 +68,6 @@ class DamiaoArm:
         self.mute: set[int] = set()
         self._codes = np.zeros((5, n), int)
         self.forget()
-        self._commanded: set[int] = set()
 
     def forget(self) -> None:
         """Forget all frames: no gains, no torque."""
@@ -109,17 +107,6 @@ class DamiaoArm:
             self._take(message.arbitration_id - 1, data)
         return True
 
-    def serve_in_lockstep(self) -> None:
-        """Serve until the bus is closed; time goes on once all motors got a frame."""
-        try:
-            while True:
-                self.serve(_PATIENCE)
-                if len(self._commanded) == self._n:
-                    self._commanded.clear()
-                    self._advance(self.arm.per_frame)
-        except can.CanError:
-            return
-
     def serve_in_real_time(self) -> None:
         """Serve for ever; time goes on with the clock."""
         period = self.arm.plant.period_ns * 1e-9
@@ -149,10 +136,13 @@ class DamiaoArm:
             self.status[joint] = Status.DISABLED
             self._forget(joint)
         elif data not in (damiao.ENABLE, damiao.CLEAR):
-            if self.modes[joint] == damiao.MIT:
-                self._codes[:, joint] = damiao.codes_of_command(data)
-            self._commanded.add(joint)
+            self._obey(joint, data)
         self._send_state(joint)
+
+    def _obey(self, joint: int, data: bytes) -> None:
+        """Take what a frame commands, in the mode for it."""
+        if self.modes[joint] == damiao.MIT:
+            self._codes[:, joint] = damiao.codes_of_command(data)
 
     def _answer_request(self, data: bytes) -> None:
         identifier, request = int.from_bytes(data[:2], 'little'), data[2]

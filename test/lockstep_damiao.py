@@ -9,6 +9,7 @@ gets the motors before they are reached; `at` calls something with them at a sta
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from typing import ClassVar
 
 import can
@@ -22,8 +23,30 @@ from blf_dsc_controller.drive.ticks import Ticks
 from sim_plant.damiao import DamiaoArm
 
 PATIENCE = 20.0  # s, for an answer of a thread
+_CLOSED = 0.05  # s, after which it is seen that the bus is closed
 LIMITS = limits_of(load(locate('openarm'), DRIVE, DriveConfig), 7)
 YAM = 6  # joints
+
+
+class LockstepArm(DamiaoArm):
+    """Motors whose time goes on once all of them have got a frame."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self._commanded = set()
+
+    def _obey(self, joint, data):
+        super()._obey(joint, data)
+        self._commanded.add(joint)
+
+    def serve_in_lockstep(self):
+        """Serve until the bus is closed."""
+        with suppress(can.CanError):
+            while True:
+                self.serve(_CLOSED)
+                if len(self._commanded) == self._n:
+                    self._commanded.clear()
+                    self._advance(self.arm.per_frame)
 
 
 class LockstepTicks(Ticks):
@@ -66,7 +89,7 @@ class LockstepDriver(DamiaoDriver):
         plant = load_loop(name, given).plant
         limits = limits_of(self.config, n) if n == YAM else LIMITS
         mounting = mounting_of(self.config, n)
-        self.motors = DamiaoArm(self.bus, plant, limits, 2000.0, mounting)
+        self.motors = LockstepArm(self.bus, plant, limits, 2000.0, mounting)
         if type(self).arrange is not None:
             type(self).arrange(self.motors)
         self.thread = threading.Thread(

@@ -19,7 +19,7 @@ pytest.importorskip('can')
 
 import can
 import lockstep_damiao
-from lockstep_damiao import LockstepDriver, LockstepTicks
+from lockstep_damiao import LockstepArm, LockstepDriver, LockstepTicks
 from markdown_it import MarkdownIt
 from motor_arm import loop_of
 
@@ -351,7 +351,8 @@ def test_two_motors_with_one_identifier_are_named(made):
 
     def double(motors):
         bus = can.Bus(interface='virtual', channel=motors._bus.channel_info.split()[-1])
-        others.append(DamiaoArm(bus, loop_of(0.004).plant, lockstep_damiao.LIMITS))
+        plant = loop_of(0.004).plant
+        others.append(LockstepArm(bus, plant, lockstep_damiao.LIMITS))
         thread = threading.Thread(target=others[0].serve_in_lockstep, daemon=True)
         thread.start()
 
