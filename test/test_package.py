@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import configparser
+import gc
 import json
 import pickle
 import re
@@ -21,7 +22,7 @@ import pytest
 import yaml
 
 import blf_dsc_controller
-from blf_dsc_controller import errors
+from blf_dsc_controller import child, errors
 from blf_dsc_controller.compiled import linked
 from blf_dsc_controller.errors import (
     BlfDscError,
@@ -409,3 +410,22 @@ def test_hooks_of_pre_commit_have_the_versions_of_make_lint():
     for hook in hooks:
         (checker, *_) = hook['additional_dependencies']
         assert checker in lint, hook['id']
+
+
+def test_garbage_collector_rests_while_a_program_is_imported_and_leaves_it_out(
+    tmp_path, monkeypatch
+):
+    """What is imported later is looked through as ever, and so it is after a failure."""
+    code = 'import gc\nWAS_ON = gc.isenabled()\n'
+    (tmp_path / 'program_of_a_test.py').write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = gc.get_freeze_count()
+    assert not child.imported('program_of_a_test').WAS_ON
+    left_out = gc.get_freeze_count()
+    assert gc.isenabled()
+    assert left_out > before
+    child.imported('program_of_a_test')  # it is there
+    assert gc.get_freeze_count() == left_out
+    with pytest.raises(ModuleNotFoundError):
+        child.imported('no_program_of_a_test')
+    assert gc.isenabled()
