@@ -254,7 +254,7 @@ def sensed_torque(plant: PlantSettings, now: PlantState, i: int, held: float) ->
     """Return what the torque sensor of a joint shows [N m]; the drives have `held` the arm."""
     torque = held if now.sample[0] == 0.0 else now.elastic.transmitted[i]
     noise = plant.transmission.sensor_noise[i] * now.drives.sensed[i]
-    return shown(plant.transmission, i, torque) + noise
+    return float(shown(plant.transmission, i, torque) + noise)
 
 
 @inner
