@@ -22,7 +22,7 @@ PD or PID on the model of the URDF along the reference, without learning, each a
 the same observer by torque sensors.
 
 `pairs`: random arms of the study `monte_carlo_elastic_*`, each with and without observer.
-Besides, their sensors have offsets, friction changes, and something pushes them.  A row has
+Besides, the sensors of every other arm err, and friction changes or something pushes.  A row has
 the ratios of both runs: rms and largest error, in motion (4 to 8 s) and afterwards.
 
 `declarations`: of `margins`, arms that are as declared; whose encoders are at the motors; and
@@ -279,6 +279,8 @@ def loops() -> Iterator[list[str]]:
 
 STUDIES = 'monte_carlo_elastic_panda', 'monte_carlo_elastic_fr3'
 OFFSET = 1.0  # N m, largest offset of sensors in large joints; in wrists a fifth
+SCALE = 0.03  # largest error of their scale
+NOISE = 0.05  # N m, rms in large joints
 LARGE = (True,) * 4 + (False,) * 3
 SPANS = {'in motion': (4.0, PICK_UP), 'from the load on': (PICK_UP, SECONDS)}
 
@@ -314,10 +316,22 @@ def events_of(
     return f'{kind} {1.0 + change_by:.2f}', events
 
 
-def errors_of(
-    config: ControllerConfig, plant: PlantConfig, offset: np.ndarray
-) -> np.ndarray:
-    """Return rms and largest true error (spans, 2) [mrad] of a law whose sensors have offsets."""
+def sensor_errors_of(rng: np.random.Generator) -> dict[str, Any]:
+    """Return what joint torque sensors see wrongly; the loop of the drives sees it as well."""
+    size = np.where(LARGE, 1.0, 0.2)
+    return {
+        'sensor.torque_offset': (
+            OFFSET * size * rng.uniform(-1.0, 1.0, size.shape)
+        ).tolist(),
+        'sensor.torque_factor': (
+            1.0 + SCALE * rng.uniform(-1.0, 1.0, size.shape)
+        ).tolist(),
+        'sensor.torque_noise': (NOISE * size).tolist(),
+    }
+
+
+def errors_of(config: ControllerConfig, plant: PlantConfig) -> np.ndarray:
+    """Return rms and largest true error (spans, 2) [mrad] of a law."""
     controller, arm = controller_of(config), plant_of(plant)
     n = len(config.joints)
     dt = config.sample_time
@@ -326,7 +340,6 @@ def errors_of(
     errors = np.zeros((round(SECONDS / dt), n))
     for k, error in enumerate(errors):
         measurement[:] = arm.measure()
-        measurement[2 * n :] += offset
         torque = controller.update(k * dt, dt, measurement)
         error[:] = controller.sample.xi1
         controller.perceive(dt)
@@ -350,15 +363,12 @@ def pair(study_name: str, number: int) -> Pair:
     )
     label, events = events_of(rng, *friction)
     plant = change(plant, {'duration': SECONDS, **events})
-    size = np.where(LARGE, OFFSET, 0.2 * OFFSET)
-    offset = size * rng.uniform(-1.0, 1.0, len(size))
     if number % 2:
-        label = f'{label}, offsets'
-    else:
-        offset *= 0.0
+        label = f'{label}, sensors err'
+        plant = change(plant, sensor_errors_of(rng))
     n = len(study.controller.joints)
     both = [
-        errors_of(_with_bandwidth(study.controller, L, n), plant, offset)
+        errors_of(_with_bandwidth(study.controller, L, n), plant)
         for L in (0.0, BANDWIDTH)
     ]
     return Pair(number, label, *both)

@@ -16,8 +16,9 @@ builds up with the stiffness of the spring (Dahl, 1968):
 Drives with a joint torque sensor close a loop around the spring, with a lag from the
 right-hand side to u:
 
-    u = tau + k_T (tau - s) - k_S ds/dt
+    u = tau + k_T (tau - s') - k_S ds'/dt,              s' = f s + offset
 
+where s' is what the sensor shows, with its error of scale f.
 A joint without stiffness is rigid: M has its motor, u and the friction act on its link.
 A base that gives way has coordinates of its own before those of the links, on springs
 and dampers that carry the arm's weight without a deflection.
@@ -41,6 +42,7 @@ from sim_plant.kernels import (
     limited,
     observe,
     plant_views,
+    shown,
 )
 from sim_plant.layout import PlantSettings, PlantState
 from sim_plant.motion import dry_friction, put, subtract_tip_torque, update_loads
@@ -216,8 +218,9 @@ def close_loop(plant: PlantSettings, now: PlantState) -> None:
         torque = now.drives.whole[i]
         if springs.loop_gain > 0.0:
             rate = state.dtheta[i] - state.dq[plant.mounts + i]
-            rate *= springs.stiffness[i] * memory.touches[i]
-            missing = torque - now.drives.eased[i] - memory.spring[i]
+            rate *= springs.sensor_factor[i] * springs.stiffness[i] * memory.touches[i]
+            sensed = shown(springs, i, memory.spring[i])
+            missing = torque - now.drives.eased[i] - sensed
             torque += springs.loop_gain * missing - springs.loop_damping * rate
             torque = limited(torque, springs.loop_limit[i])
             torque += springs.loop_decay * (state.torque[i] - torque)
@@ -355,7 +358,7 @@ def rest(arm: RigidArm, plant: PlantSettings, now: PlantState) -> None:
 def truth(plant: PlantSettings, now: PlantState, out: Array) -> None:
     """Write the truth [P, tau_dist, q, dq] (p + 3n,) of this sample, as commands see it.
 
-    A torque loop makes the friction of the motors smaller by its gain.
+    A torque loop makes the friction of the motors smaller by its gain, but follows its sensors.
     """
     n, state = plant.n, now.elastic
     update_loads(plant, now)
@@ -371,7 +374,9 @@ def truth(plant: PlantSettings, now: PlantState, out: Array) -> None:
         if plant.transmission.stiffness[i] > 0.0:
             passed = state.transmitted[i]
         own = friction(plant, now, i, state.dtheta[i], passed)
-        own /= 1.0 + plant.transmission.loop_gain
+        loop = plant.transmission.loop_gain
+        own += loop * (shown(plant.transmission, i, passed) - passed)
+        own /= 1.0 + loop
         out[plant.p + i] = torque[plant.mounts + i] + own
         out[plant.p + n + i] = now.x[i]
         out[plant.p + 2 * n + i] = now.x[n + i]

@@ -35,6 +35,7 @@ from sim_plant.layout import (
     Encoders,
     PlantSettings,
     PlantState,
+    Springs,
     settings_of,
     state_of,
 )
@@ -60,16 +61,17 @@ def generator(seed: int) -> np.random.Generator:
 
 
 def drawn(plant: PlantSettings) -> slice:
-    """Return which of the 3n random numbers of a reading are drawn at all.
+    """Return which of the 4n random numbers of a reading are drawn at all.
 
-    They are those of positions and velocities, then those of the torques.
+    They are those of positions and velocities, of the torques, and of torque sensors.
     """
     encoders = plant.encoders
     sensed = encoders.position_noise > 0.0 or encoders.velocity_noise > 0.0
     n = plant.n
-    return slice(
-        0 if sensed else 2 * n, 3 * n if plant.drives.torque_noise > 0.0 else 2 * n
-    )
+    last = 3 * n if plant.drives.torque_noise > 0.0 else 2 * n
+    if np.any(plant.transmission.sensor_noise > 0.0):
+        last = 4 * n
+    return slice(0 if sensed else 2 * n, last)
 
 
 @inner
@@ -218,14 +220,13 @@ def is_due(plant: PlantSettings, now: PlantState) -> bool:
 def observe(
     plant: PlantSettings, now: PlantState, noise: Array, measurement: Array
 ) -> None:
-    """Write [q, dq, effort] (3n,) of this sample, with its standard normal noise (3n,).
+    """Write [q, dq, effort] (3n,) of this sample, with its standard normal noise (4n,).
 
     `effort` is the torque applied over the last interval [N m], as a whole, with a torque
-    loop, that of its sensors; before the first interval, what the drives hold the arm with.
+    loop, what its sensors show; before the first interval, what the drives hold the arm with.
     Reading a sample again gives the same numbers.
     """
     n = plant.n
-    has_sensors = plant.transmission.loop_gain > 0.0 and now.sample[0] > 0.0
     if now.sample[0] == 0.0:
         update_loads(plant, now)
         compensate(plant, now)
@@ -234,17 +235,32 @@ def observe(
             now.reading.noise[i] = noise[i]
         for i in range(n):
             now.drives.noise[i] = noise[2 * n + i]
+            now.drives.sensed[i] = noise[3 * n + i]
         update_loads(plant, now)
         sense(plant, now)
     for i in range(n):
         measurement[i] = now.reading.position[i]
         measurement[n + i] = now.reading.velocity[i]
-        measurement[2 * n + i] = now.drives.applied[i]
+        effort = now.drives.applied[i]
         if plant.drives.effort_is_whole == 1:
-            measurement[2 * n + i] += now.drives.added[i]
-            if has_sensors:
-                measurement[2 * n + i] = now.elastic.transmitted[i]
-        measurement[2 * n + i] *= plant.drives.effort_scale
+            effort += now.drives.added[i]
+            if plant.transmission.loop_gain > 0.0:
+                effort = sensed_torque(plant, now, i, effort)
+        measurement[2 * n + i] = effort * plant.drives.effort_scale
+
+
+@inner
+def sensed_torque(plant: PlantSettings, now: PlantState, i: int, held: float) -> float:
+    """Return what the torque sensor of a joint shows [N m]; the drives have `held` the arm."""
+    torque = held if now.sample[0] == 0.0 else now.elastic.transmitted[i]
+    noise = plant.transmission.sensor_noise[i] * now.drives.sensed[i]
+    return float(shown(plant.transmission, i, torque) + noise)
+
+
+@inner
+def shown(springs: Springs, i: int, torque: float) -> float:
+    """Return the torque [N m] of a joint as its sensor shows it, without noise."""
+    return float(springs.sensor_factor[i] * torque + springs.sensor_offset[i])
 
 
 @inner

@@ -66,6 +66,10 @@ class Springs(NamedTuple):
     loop_damping: float  # s
     loop_decay: float  # of the loop's lag in half a step
     loop_limit: Annotated[Array, 'springs']  # of the motors, N m; 0: none
+    # of the joint torque sensors, which loop and reading share
+    sensor_factor: Annotated[Array, 'springs']
+    sensor_offset: Annotated[Array, 'springs']  # N m
+    sensor_noise: Annotated[Array, 'springs']  # of the reading, N m
 
 
 class Base(NamedTuple):
@@ -169,6 +173,7 @@ class DriveState(NamedTuple):
     applied: Annotated[Array, 'n']  # mean over the sample, N m
     added: Annotated[Array, 'n']  # by the drives, N m
     eased: Annotated[Array, 'n']  # of it, against friction, N m
+    sensed: Annotated[Array, 'n']  # noise of the torque sensors, standard normal
     whole: Annotated[Array, 'n']  # torque at the joints, N m
     memory: Annotated[Array, 'memory_size']  # BodyMotion
 

@@ -62,7 +62,7 @@ class Plant:
         self._measurement = np.zeros(3 * self.joints)
         self._truth = np.zeros(settings.p + 3 * self.joints)
         self._seed = seed
-        self._noise = np.zeros(3 * self.joints)
+        self._noise = np.zeros(4 * self.joints)
         self.rng = generator(seed)
         if settings.springs > 0:
             self._now.acting.sample[0] = -1.0
@@ -136,14 +136,14 @@ class Plant:
         return self._measurement
 
     def noise_of(self, samples: int) -> np.ndarray:
-        """Draw the noise (samples, 3n) of this sample and of those that follow.
+        """Draw the noise (samples, 4n) of this sample and of those that follow.
 
         It is for a compiled loop. A reading that is made already, or repeated, has none.
         """
         k = self.sample + np.arange(samples)
         is_new = k != self._now.reading.sample[0]
         due = is_new & ~is_repeat(self._settings.encoders, k)
-        noise = np.zeros((samples, 3 * self.joints))
+        noise = np.zeros((samples, 4 * self.joints))
         columns = drawn(self._settings)
         shape = np.count_nonzero(due), columns.stop - columns.start
         noise[due, columns] = self.rng.standard_normal(shape)

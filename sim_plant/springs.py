@@ -89,7 +89,20 @@ def on_base(bodies: RigidBodies, mass: float) -> RigidBodies:
 def rigid(steps: int) -> Elasticity:
     """Return the settings of an arm without springs."""
     empty = np.zeros(0)
-    springs = Springs(empty, empty, empty, empty, empty, 0.0, 0.0, 0.0, empty)
+    springs = Springs(
+        stiffness=empty,
+        damping=empty,
+        play=empty,
+        hysteresis=empty,
+        mobility=empty,
+        loop_gain=0.0,
+        loop_damping=0.0,
+        loop_decay=0.0,
+        loop_limit=empty,
+        sensor_factor=empty,
+        sensor_offset=empty,
+        sensor_noise=empty,
+    )
     return Elasticity(steps, 0, 0, 0, springs, Base(np.zeros((0, 0)), np.zeros((0, 0))))
 
 
@@ -127,6 +140,9 @@ def elastic(
         loop_damping=actuator.loop_damping,
         loop_decay=lag(actuator.loop_lag, half)[0],
         loop_limit=actuator.loop_limit * np.array(actuator.torque_limit),
+        sensor_factor=np.array(config.sensor.torque_factor or np.ones(n)),
+        sensor_offset=np.array(config.sensor.torque_offset or np.zeros(n)),
+        sensor_noise=np.array(config.sensor.torque_noise or np.zeros(n)),
     )
     mounts = mounts_of(config)
     return Elasticity(steps, blocks, n, mounts, springs, _base_of(config, M))

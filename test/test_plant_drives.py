@@ -404,7 +404,7 @@ def test_noise_of_a_span_is_that_of_its_readings(
         single.measure()
     noise = span.noise_of(20)
     for k in range(20):
-        expected = np.zeros(6)
+        expected = np.zeros(8)
         before = single.rng.bit_generator.state
         single.measure()
         if single.rng.bit_generator.state != before:

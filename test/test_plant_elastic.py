@@ -73,10 +73,18 @@ class Written:
     """The equations of one joint as on paper, for scipy."""
 
     def __init__(
-        self, viscous=0.0, coulomb=0.0, share=0.0, play=0.0, loop=(), most=0.0
+        self,
+        viscous=0.0,
+        coulomb=0.0,
+        share=0.0,
+        play=0.0,
+        loop=(),
+        most=0.0,
+        sensor=(1.0, 0.0),
     ):
         self.viscous, self.coulomb, self.share = viscous, coulomb, share
         self.play, self.loop, self.most = play, loop, most
+        self.factor, self.offset = sensor
 
     def spring(self, q, dq, theta, dtheta):
         """Return the torque by the twist, its rate, and that of the damper."""
@@ -100,7 +108,8 @@ class Written:
         motor = torque
         if self.loop:
             gain, damping, lag = self.loop
-            wanted = torque + gain * (torque - spring) - damping * rate
+            shown = self.factor * spring + self.offset
+            wanted = torque + gain * (torque - shown) - damping * self.factor * rate
             du, motor = (wanted - u) / lag, u
         load = WEIGHT * np.cos(q)
         return dq, (s - load) / M, dtheta, (motor - friction - s) / ROTOR, du, dz
@@ -143,10 +152,20 @@ def start_of(play=0.0):
             },
             Written(loop=(4.0, 8e-3, 3e-4)),
         ),
+        (
+            {
+                'actuator__loop_gain': 4.0,
+                'actuator__loop_damping': 8e-3,
+                'actuator__loop_lag': 3e-4,
+                'sensor__torque_factor': [0.8],
+                'sensor__torque_offset': [-1.0],
+            },
+            Written(loop=(4.0, 8e-3, 3e-4), sensor=(0.8, -1.0)),
+        ),
         ({'joint__backlash': [2e-3]}, Written(play=1e-3)),
         ({'joint__hysteresis': [2.0]}, Written(most=2.0)),
     ],
-    ids=['spring', 'friction', 'torque loop', 'backlash', 'hysteresis'],
+    ids=['spring', 'friction', 'torque loop', 'sensor', 'backlash', 'hysteresis'],
 )
 def test_joint_with_a_spring_moves_as_an_independent_integration_says(given, written):
     """To a thousandth of the largest excursion of each quantity: the steps are 25 us."""
@@ -385,6 +404,50 @@ def test_torque_loop_hides_the_friction_of_the_motor():
     assert arm.measure()[2] == pytest.approx(0.0, abs=1e-9)  # at the springs' sensors
 
 
+SENSORS = {
+    'robot__effort': 'whole',
+    'actuator__loop_gain': 4.0,
+    'actuator__loop_damping': 8e-3,
+}
+
+
+def test_torque_sensor_shows_the_spring_with_its_errors():
+    """Noise is of the reading alone: it moves nothing, and is as large as it is said to be."""
+    exact, wrong = {}, {'sensor__torque_factor': [1.0], 'sensor__torque_noise': [0.2]}
+    arms = [pendulum(**SENSORS, **given) for given in (exact, wrong)]
+    noise = []
+    for torque in step_torques(1000):
+        shown = [arm.measure().copy() for arm in arms]
+        np.testing.assert_array_equal(shown[0][:2], shown[1][:2])
+        noise.append(shown[1][2] - shown[0][2])
+        for arm in arms:
+            arm.step(torque)
+    assert np.std(noise) == pytest.approx(0.2, rel=0.1)
+    assert np.mean(noise) == pytest.approx(0.0, abs=0.02)
+
+
+def test_what_a_torque_sensor_sees_too_much_its_loop_takes_off():
+    """The command that holds the weight w is ((1 + k_T f) w + k_T offset) / (1 + k_T)."""
+    factor, offset, gain = 1.05, 0.7, 4.0
+    arm = pendulum(
+        **SENSORS,
+        sensor__torque_factor=[factor],
+        sensor__torque_offset=[offset],
+    )
+    weight = WEIGHT * np.cos(0.4)
+    command = ((1.0 + gain * factor) * weight + gain * offset) / (1.0 + gain)
+    for _ in range(300):
+        arm.step(np.array([command]))
+    q = arm.truth()[-2]
+    assert q == pytest.approx(0.4, abs=1e-4)
+    *_, disturbance, _, _ = arm.truth()
+    assert disturbance == pytest.approx(
+        command - weight, rel=1e-3
+    )  # as commands see it
+    shown = factor * weight + offset
+    assert arm.measure()[2] == pytest.approx(shown, rel=1e-3)
+
+
 def swaying(config, samples):
     """Return the motion of the base (samples, 4), pushed in the first ten samples."""
     arm = plant_of(config)
@@ -418,6 +481,7 @@ def test_configuration_says_what_springs_need():
         (PANDA | {'actuator.loop_gain': 4.0}, 'joint.stiffness above 0 for every'),
         (PANDA | {'actuator.loop_damping': 0.01}, 'actuator.loop_gain'),
         (PANDA | {'joint.backlash': [1e-3] * 7}, 'give joint.stiffness'),
+        (PANDA | {'sensor.torque_noise': [0.1] * 7}, 'give actuator.loop_gain'),
         (
             PANDA | {'truth.rotor_factor': 2.0, 'truth.rotor_inertia': [0.2] * 7},
             'one of them',
@@ -435,6 +499,8 @@ def test_run_repeats_after_a_reset_and_goes_on_after_a_restore():
         joint__stiffness=[1e4] * 7,
         joint__backlash=[4e-4] * 7,
         joint__hysteresis=[0.5] * 7,
+        robot__effort='whole',
+        sensor__torque_noise=[0.05] * 7,
         actuator__loop_gain=4.0,
         actuator__loop_damping=8e-3,
         actuator__delay=2,

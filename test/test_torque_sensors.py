@@ -260,11 +260,22 @@ PUSHED = {
 }
 
 
+ERRONEOUS = {  # but sensors, which the loop of the drives sees as well
+    'sensor.torque_offset': [0.8, -0.8, 0.6, -0.8, 0.15, -0.15, 0.15],  # N m
+    'sensor.torque_factor': [1.03, 0.97, 1.02, 0.98, 0.97, 1.03, 0.98],
+    'sensor.torque_noise': [0.1, 0.1, 0.1, 0.1, 0.03, 0.03, 0.03],  # N m
+}
+
+
+@pytest.mark.parametrize('errors', [{}, ERRONEOUS], ids=['exact', 'erroneous'])
 @pytest.mark.parametrize('preset', ['panda', 'fr3', 'fr3_direct'])
-def test_sensors_of_an_arm_that_starts_with_a_load_and_is_pushed_are_left_alone(preset):
+def test_sensors_of_an_arm_that_starts_with_a_load_and_is_pushed_are_left_alone(
+    preset, errors
+):
     """It holds 2 kg that nobody declared, puts them down, is pushed, and picks up its payload."""
     payload = load_loop(preset).controller.robot.payload
-    loop = loop_of(preset, 4.0, **PUSHED, **{'events.payload': [2.0, 0.0, payload]})
+    loads = {'events.payload': [2.0, 0.0, payload]}
+    loop = loop_of(preset, 4.0, **PUSHED, **loads, **errors)
     record = simulate(loop.controller, loop.plant)
     assert said(record) == ([], [])
     state = record.controller.state

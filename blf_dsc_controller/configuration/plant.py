@@ -244,6 +244,18 @@ class Sensor:
     eccentricity: PerJoint = _omitted(
         'error of each encoder, once per turn; empty: none', 'rad'
     )
+    torque_offset: PerJoint = _fixed(
+        (),
+        'what joint torque sensors, and the loop at them, see too much; empty: none',
+        'N m',
+        omittable=True,
+    )
+    torque_factor: PerJoint = _omitted(
+        'what they show, relative to the torque; empty: 1'
+    )
+    torque_noise: PerJoint = _omitted(
+        'rms of the white noise on their readings; empty: none', 'N m'
+    )
     repeat_every: int = _magnitude(
         0, 'after so many samples, a reading is sent again with a new stamp; 0: never'
     )
@@ -424,6 +436,13 @@ class PlantConfig(ArmConfig):
                 'actuator.loop_gain: a loop around the springs: give joint.stiffness '
                 'above 0 for every joint'
             )
+        if not actuator.loop_gain:
+            for name in ('torque_offset', 'torque_factor', 'torque_noise'):
+                if getattr(self.sensor, name):
+                    yield (
+                        f'sensor.{name}: of the joint torque sensors of a loop: give '
+                        'actuator.loop_gain'
+                    )
         springs = joint.stiffness or (0.0,) * len(self.joints)
         for name in ('backlash', 'hysteresis'):
             given = getattr(joint, name) or springs
