@@ -190,9 +190,11 @@ def test_bounds_that_are_too_fine_or_become_wider():
 
 
 def test_errors_to_expect_and_gains_that_nobody_measured():
+    # with a motor so light, the joint that slides is held by far the softest
+    drives = {'robot.urdf': URDF, 'robot.rotor_inertia': [4.0, 0.1]}
     assert re.fullmatch(
-        r'\d+ mm by friction, .*; \d+ mm of sliding when 3 kg are picked up in motion',
-        expectation(arm()),
+        r'\d+ mm by friction and .*; \d+ mm of sliding when 3 kg are picked up in motion',
+        expectation(build(ControllerConfig, {'joints': list(JOINTS), **drives})),
     )
     damping = np.array([2.0, 1.0])
     settings = SimpleNamespace(feedback=SimpleNamespace(gain=damping))

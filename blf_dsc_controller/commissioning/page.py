@@ -131,7 +131,7 @@ def _of_states(found: Commissioned) -> Iterator[str]:
     if not np.isnan(arm.drive_lag):
         yield (
             f'a torque takes {1e3 * arm.drive_lag:.2g} ms to its motion, sampling included, and '
-            f'velocities are {1e3 * arm.velocity_lag:.2g} ms old'
+            f'velocities are {max(round(1e3 * arm.velocity_lag, 2), 0.0):.2g} ms old'
         )
 
 
