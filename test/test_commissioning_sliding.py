@@ -144,7 +144,12 @@ def test_scara_has_the_units_of_each_joint(tmp_path, capsys):
     ):
         if not unit.startswith(('ms', ' ')):
             slides = name == 'quill'
-            assert re.match(r'(m|N|kg|mm)( |$)' if slides else r'(rad|N m|kg m)', unit)
+            own = r'(m|N|kg|mm)( (?!m\b)|$)' if slides else r'(rad|N m|kg m)'
+            assert re.match(own, unit)
+    assert re.search(r'with [\d.]+ mrad and [\d.]+ mm at most', text)
+    told = re.sub(r'\n(# )?', ' ', text)
+    assert re.search(r'gains: [\d.]+ mrad and [\d.]+ mm by friction', told)
+    assert re.search(r'mrad of (shoulder|elbow) and [\d.]+ mm of quill when 3 kg', told)
 
 
 def robot_of(text, **given):

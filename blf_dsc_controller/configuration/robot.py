@@ -235,7 +235,7 @@ class Robot:
         weight = self._weight_at_reach(chain)
         slides = np.array([joint.kind == 'prismatic' for joint in chain.joints])
         of_kind = [weight[slides == each].max(initial=0.0) for each in slides]
-        return _by_kind(_PLACEHOLDER, chain) * of_kind
+        return np.asarray(_by_kind(_PLACEHOLDER, chain) * of_kind)
 
     def carried(self, chain: Chain) -> float:
         """Return the mass [kg] that the strongest joint holds at full reach.
@@ -275,7 +275,7 @@ class Robot:
         known = self.known_rotors(chain)
         if len(known) == len(chain.joints):
             return np.array(known)
-        return self.efforts(chain) / _by_kind(_DRIVE_ACCELERATION, chain)
+        return np.asarray(self.efforts(chain) / _by_kind(_DRIVE_ACCELERATION, chain))
 
     def unknown_rotors(self, chain: Chain) -> np.ndarray:
         """Return what drives may have beyond `rotors` (n,) [kg m^2] if these are guesses.
