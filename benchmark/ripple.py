@@ -2,10 +2,15 @@
 """Periods of torque ripple that `identify` finds in 20 s of motion, and those that are not there.
 
     python -m benchmark ripple --arms 10
+    python -m benchmark ripple --arms 10 --references
 
 Presets with wrong URDFs, friction and noise follow random motions by a PD, recorded at 250 Hz.
 Drives have a ripple of 0.8 % of their rated torque for each N, or none.  Amplitudes are
 over the true ones.
+
+`--references`: random arms with elastic joints (`monte_carlo_elastic_*`) follow the reference of
+their study, or the slow motion that does not repeat which a commissioning names, with the ripple of
+their drives and without.  A list is right if each N is within 3 %.
 """
 
 from __future__ import annotations
@@ -19,13 +24,21 @@ import numpy as np
 from random_arm import Reference, recording_of, reference_of
 
 from benchmark.harness import print_table
+from benchmark.studies import load_study
+from blf_dsc_controller.commissioning.slow_motion import slow_frequencies
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.identification.identify import ripples_left
 from blf_dsc_controller.identification.problem import problem_of
+from blf_dsc_controller.identification.recording import Recording, resampled
 from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.ripple import Ripples, listed_cycles
-from blf_dsc_controller.run import Floats
+from blf_dsc_controller.run import Floats, Run
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.monte_carlo import draw, plant_with
 from sim_plant.plant import plant_of
 
 _SECONDS = 20.0
@@ -35,6 +48,9 @@ _RAMP = 2.0  # s, in which the motion begins
 _MOST_EFFORT = 100.0  # N m, that scales the PD
 _GAINS = 8.0, 0.48  # 1/rad and s/rad, times the effort
 _RIGHT = 0.03  # of N
+_STUDIES = 'ur5e', 'panda', 'fr3'
+_FIRST = 3  # number of a random arm
+_LENGTHS = 15.0, 30.0, 60.0  # s
 
 
 class Case(NamedTuple):
@@ -64,10 +80,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the number of arms of each case, and which cases."""
     parser.add_argument('--arms', type=int, default=1, help='of each case')
     parser.add_argument('--cases', type=int, nargs='*', help='numbers from 0 (all)')
+    parser.add_argument(
+        '--references', action='store_true', help='of random arms, in a closed loop'
+    )
 
 
 def main(options: argparse.Namespace) -> None:
     """Print the table."""
+    if options.references:
+        _print_references(options.arms)
+        return
     rows = []
     for case in [_CASES[k] for k in options.cases or range(len(_CASES))]:
         found, right, wrong = [], 0, 0
@@ -98,6 +120,69 @@ def main(options: argparse.Namespace) -> None:
     print_table(('case', 'found', 'wrong', 'amplitude', 'ripple_cycles'), rows)
 
 
+def _print_references(arms: int) -> None:
+    """Print what is found of random arms along their references."""
+    rows = []
+    for name in _STUDIES:
+        study = load_study(f'monte_carlo_elastic_{name}')
+        slow = change(
+            study.controller,
+            {'reference.frequency': list(slow_frequencies(study.controller))},
+        )
+        for motion, controller in (('own', study.controller), ('slow', slow)):
+            lists: dict[tuple[float, bool], list[Sequence[float]]] = {}
+            for number in range(_FIRST, _FIRST + arms):
+                plant = plant_with(study, draw(study, number))
+                true = plant.actuator.ripple_cycles
+                for has in (True, False):
+                    run = _alone(controller, plant, has_ripple=has)
+                    for seconds in _LENGTHS:
+                        found = listed_cycles(found_along(run, controller, seconds))
+                        lists.setdefault((seconds, has), []).append(found)
+            for seconds in _LENGTHS:
+                right = [
+                    bool(each) and all(abs(N / true - 1.0) < _RIGHT for N in each)
+                    for each in lists[seconds, True]
+                ]
+                named = sum(map(bool, lists[seconds, True])) - sum(right)
+                wrong = sum(map(bool, lists[seconds, False]))
+                rows.append((
+                    name, motion, f'{seconds:g}', f'{sum(right)} of {arms}', f'{named}',
+                    f'{wrong} of {arms}',
+                ))  # fmt: skip
+    print_table(
+        ('arms', 'motion', 'for [s]', 'right', 'wrong', 'wrong without ripple'), rows
+    )
+
+
+def _alone(
+    controller: ControllerConfig, plant: PlantConfig, *, has_ripple: bool
+) -> Run:
+    """Return a run of an arm without events, with the ripple of its drives or none."""
+    values: dict[str, object] = {
+        'duration': max(_LENGTHS),
+        'events.begin': (),
+        'events.duration': (),
+        'events.payload': (),
+        'truth.rotor_factor': 1.0,  # motors are drawn, which leaves nothing to scale
+    }
+    if not has_ripple:
+        values['actuator.ripple'] = 0.0
+    return simulate(controller, change(plant, values)).run()
+
+
+def found_along(
+    run: Run, controller: ControllerConfig, seconds: float = np.inf
+) -> Sequence[Ripples]:
+    """Return what is found in the first seconds of a run, in which the arm carries nothing."""
+    rows = np.flatnonzero(run.time <= seconds)[::_EVERY]
+    turning = np.zeros(len(run.joints), dtype=bool)
+    recording = resampled(
+        run.joints, run.stamp[rows], run.position[rows], run.torque[rows], '', turning
+    )
+    return found_in(recording, controller.robot)
+
+
 def config_of(preset: str, seed: int, **events: Sequence[float]) -> PlantConfig:
     """Return an arm without a ripple of its own; `events` are a load."""
     plant: dict[str, object] = {'actuator.ripple': 0.0, 'truth.seed': seed}
@@ -116,13 +201,21 @@ def found_of(
     """Return what is found of an arm with N `cycles` of each joint; a load comes at that time [s].
 
     Friction is fitted as viscous and Coulomb friction: terms are not selected, which takes long.
+    So it is in `found_in`.
     """
     states = moved(config, cycles, reference, pace)[::_EVERY]
     recording = recording_of(states, config.joints, _EVERY * config.sample_time)
-    problem = problem_of(recording, config.robot, 'torque', load, find_signs=False)
+    return found_in(recording, config.robot, load)
+
+
+def found_in(
+    recording: Recording, robot: Robot, load: float | None = None
+) -> Sequence[Ripples]:
+    """Return what is found in a recording; a load comes at that time [s]."""
+    problem = problem_of(recording, robot, 'torque', load, find_signs=False)
     prior = problem.prior.only([])
     fit = fitted(problem.rows, problem.windows.moving, problem.G, prior)
-    return ripples_left(problem, np.zeros(len(cycles)), fit)
+    return ripples_left(problem, np.zeros(len(recording.joints)), fit)
 
 
 def amplitudes_of(config: PlantConfig) -> Floats:

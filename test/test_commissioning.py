@@ -1009,6 +1009,27 @@ def test_friction_is_measured_and_told():
     assert not any('more friction than' in each for each in shown)
 
 
+def test_page_says_how_torque_ripple_is_found():
+    """Tones of half the pace and up to 0.65 of it, with no period; none of an arm that holds."""
+    seen = found()
+    (told,) = (each for each in sentences(seen) if 'ripple' in each)
+    assert told.endswith(
+        'that does not repeat show it: give its bag to blf_dsc identify, and the '
+        'learning.ripple_cycles that it prints to this file'
+    )
+    moves = {
+        'reference.type': 'sinusoids',
+        'reference.amplitude': [0.1, 0.05, 0.1, 0.05],
+        'reference.frequency': [1.0, 2.0],
+        'reference.phase': [0.0, 0.0],
+    }
+    along = seen._replace(before=change(CONFIG, moves))
+    (told,) = (each for each in sentences(along) if 'ripple' in each)
+    assert 'by reference.frequency: [0.5, 1.19] in a copy of the file' in told
+    known = change(CONFIG, {'learning.ripple_cycles': [30.0]})
+    assert 'ripple' not in '\n'.join(sentences(seen._replace(before=known)))
+
+
 def test_joint_whose_inertia_friction_hides_is_not_trusted():
     seen = found()
     hidden = seen.findings._replace(inertia=np.array([np.nan, 1.0]))

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from random_arm import reference_of
 
-from benchmark.ripple import amplitudes_of, config_of, found_of
+from benchmark.ripple import amplitudes_of, config_of, found_along, found_of
+from blf_dsc_controller.commissioning.slow_motion import slow_frequencies
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.identification.ripple import (
     NOTHING,
     Ripple,
@@ -17,6 +21,7 @@ from blf_dsc_controller.identification.ripple import (
     listed_cycles,
 )
 from blf_dsc_controller.identification.summary import ripple_table
+from blf_dsc_controller.simulation.loop import simulate
 
 LOAD = {'begin': [10.0], 'duration': [100.0], 'payload': [3.0]}
 
@@ -77,6 +82,40 @@ def test_a_load_that_is_picked_up_does_not_hide_a_ripple():
     check(found, amplitudes, [[30.0]])
 
 
+@cache
+def along_reference(preset, *, slow, ripple):
+    """Return what is found of an arm in its closed loop, for 30 s without a load."""
+    nothing = {f'events.{name}': () for name in ('begin', 'duration', 'payload')}
+    given = {'duration': 30.0, 'actuator.ripple': ripple, **nothing}
+    loop = load_loop(preset, {PLANT: given})
+    controller = loop.controller
+    if slow:
+        rates = list(slow_frequencies(controller))
+        controller = change(controller, {'reference.frequency': rates})
+    return found_along(simulate(controller, loop.plant).run(), controller)
+
+
+def test_slow_motion_that_does_not_repeat_shows_the_true_ripple():
+    """A motion of 5 s gives 29.6 for 30."""
+    found = along_reference('ur5e', slow=True, ripple=0.008)
+    assert listed_cycles(found) == pytest.approx((30.0,), rel=3e-3)
+    assert not any(own.repeats for own in found)
+    # slow enough for the limits of the reference
+    reference = load_loop('ur5e').controller.reference
+    slow = slow_frequencies(load_loop('ur5e').controller)
+    assert max(np.divide(slow, reference.frequency)) <= 0.65
+    hold = change(load_loop('ur5e').controller, {'reference.type': 'hold'})
+    assert slow_frequencies(hold) == ()
+
+
+def test_motion_that_repeats_is_told():
+    """An FR3's drives compensate friction, not exactly: that repeats, and passes for ripples."""
+    found = along_reference('fr3', slow=False, ripple=0.0)
+    assert listed_cycles(found)
+    assert all(own.repeats for own in found)
+    assert listed_cycles(along_reference('fr3', slow=True, ripple=0.0)) == ()
+
+
 def test_an_arm_that_hardly_moves_shows_no_ripple():
     found, _ = found_in([[30.0]], reach=0.02)
     assert found == (NOTHING,) * 6
@@ -111,6 +150,12 @@ def test_the_table_has_units_and_the_line_to_paste():
     )
     arm = SimpleNamespace(chain=SimpleNamespace(joints=joints), ripples=ripples)
     (text,) = ripple_table(arm)
+    # a motion that repeats has one line more
+    arm.ripples = (ripples[0]._replace(repeats=True), *ripples[1:])
+    (warned,) = ripple_table(arm)
+    first, last = warned.rsplit('\n', 1)
+    assert first == text
+    assert last.startswith('the motion repeats, ')
     lines = [' '.join(line.split()) for line in text.splitlines()]
     assert lines[1:] == [
         'turns 1.2 +- 0.039 N m at 29.98 +- 0.098',

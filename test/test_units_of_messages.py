@@ -36,6 +36,7 @@ from blf_dsc_controller.supervision.bound_warnings import width_warnings
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.contact import contact_of
+from blf_dsc_controller.supervision.digits import largest_error
 from blf_dsc_controller.supervision.expected_errors import expectation
 from blf_dsc_controller.supervision.gear_warnings import gear_warnings
 from blf_dsc_controller.supervision.not_sensors import text_of
@@ -191,9 +192,14 @@ def test_bounds_that_are_too_fine_or_become_wider():
 
 def test_errors_to_expect_and_gains_that_nobody_measured():
     assert re.fullmatch(
-        r'\d+ mm by friction, .*; \d+ mm of sliding when 3 kg are picked up in motion',
+        r'\d+ mrad and \d+ mm by friction, .*; \d+ mrad of turning and \d+ mm of sliding '
+        'when 3 kg are picked up in motion',
         expectation(arm()),
     )
+    unlike = [TURNING, SLIDING, TURNING]
+    assert largest_error(np.array([3e-3, 1e-3, 2e-3]), unlike) == '3 mrad and 1 mm'
+    alike = largest_error(np.array([3e-3, 4e-3]), [SLIDING] * 2, JOINTS)
+    assert alike == '4 mm of sliding'
     damping = np.array([2.0, 1.0])
     settings = SimpleNamespace(feedback=SimpleNamespace(gain=damping))
     (soft,) = gear_warnings(arm(), settings)

@@ -25,7 +25,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import inf
+from math import inf, isfinite
 from sys import float_info
 from typing import NamedTuple
 
@@ -77,6 +77,13 @@ class Joint(NamedTuple):
     held: np.ndarray  # (4, 4) pseudo-inertia of what joints held at position 0 carry
     acceleration: float = inf  # limit, also of deceleration, rad/s^2 or m/s^2
 
+    @property
+    def length(self) -> float:
+        """Length [m] from the previous joint, pulled out as far as a joint that slides may be."""
+        ends = [abs(each) for each in (self.lower, self.upper) if isfinite(each)]
+        stroke = max(ends, default=0.0) if self.kind == 'prismatic' else 0.0
+        return float(np.linalg.norm(self.placement[:3, 3])) + stroke
+
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -95,11 +102,8 @@ class Chain:
     @property
     def reach(self) -> float:
         """Length [m] of the stretched arm, from its first joint to the tip."""
-        placements = [joint.placement for joint in self.joints[1:]]
-        return sum(
-            float(np.linalg.norm(each[:3, 3]))
-            for each in (*placements, self.tip_placement)
-        )
+        to_tip = float(np.linalg.norm(self.tip_placement[:3, 3]))
+        return sum(joint.length for joint in self.joints[1:]) + to_tip
 
     @property
     def gripper(self) -> str:

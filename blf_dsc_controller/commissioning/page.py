@@ -21,6 +21,7 @@ from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
+from blf_dsc_controller.commissioning.slow_motion import SECONDS, slow_frequencies
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
@@ -105,6 +106,7 @@ def sentences(found: Commissioned, *, is_simulated: bool = False) -> Iterator[st
     if found.has_margin:
         yield f'errors to expect with these gains: {expectation(found.config)}'
         yield from _of_bound(found)
+        yield from _of_ripple(found.config)
     yield (
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'
@@ -131,7 +133,7 @@ def _of_states(found: Commissioned) -> Iterator[str]:
     if not np.isnan(arm.drive_lag):
         yield (
             f'a torque takes {1e3 * arm.drive_lag:.2g} ms to its motion, sampling included, and '
-            f'velocities are {1e3 * arm.velocity_lag:.2g} ms old'
+            f'velocities are {max(round(1e3 * arm.velocity_lag, 2), 0.0):.2g} ms old'
         )
 
 
@@ -277,6 +279,19 @@ def _of_bound(found: Commissioned) -> Iterator[str]:
             'friction, grow by as much; a bound that was given for the stiffer gains may be too '
             'narrow'
         )
+
+
+def _of_ripple(config: ControllerConfig) -> Iterator[str]:
+    """Yield by which motion and command the torque ripple of the drives is found."""
+    if config.learning.ripple_cycles:
+        return
+    slow = ', '.join(f'{each:g}' for each in slow_frequencies(config))
+    how = f', by reference.frequency: [{slow}] in a copy of the file' if slow else ''
+    yield (
+        'torque ripple of the drives is not looked for: the arm moved too little. '
+        f'{SECONDS:g} s of a slow motion that does not repeat show it{how}: give its bag to '
+        'blf_dsc identify, and the learning.ripple_cycles that it prints to this file'
+    )
 
 
 def _wider(found: Commissioned) -> dict[str, list[str]]:

@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, design
 from blf_dsc_controller.configuration.plausibility import hint_at_degrees
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.run import TURNING, JointUnits
+from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
 from blf_dsc_controller.supervision.reference_load import along
 
 Floats = NDArray[np.float64]
@@ -27,7 +27,7 @@ TRAVEL = 0.01
 POSTURES = 3
 """Postures of the reference in which an arm is measured, if nothing else is asked for."""
 
-_FROM_LIMITS = 0.05  # rad
+_FROM_LIMITS = {TURNING: 0.05, SLIDING: 2.0 * TRAVEL}  # rad or m
 
 
 class Planned(NamedTuple):
@@ -63,7 +63,7 @@ def postures_of(
         if here is None:
             raise BlfDscError(
                 'reference.type: got hold, with which the arm stays where it begins: give the '
-                'postures in which to measure it (--posture ANGLE ... [rad]), or a reference '
+                'postures in which to measure it (--posture, in rad or m), or a reference '
                 'that moves'
             )
         return here[None]
@@ -139,7 +139,8 @@ def _check_posture(config: ControllerConfig, posture: Floats) -> None:
         strict=True,
     )
     for joint, units, at, lower, upper in limits:
-        if not lower + _FROM_LIMITS <= at <= upper - _FROM_LIMITS:
+        away = _FROM_LIMITS[units]
+        if not lower + away <= at <= upper - away:
             raise BlfDscError(
                 f'posture: {joint} would be at {at:.4g} {units.position}, '
                 f'{_beyond(float(at), lower, upper, units)}'
@@ -151,6 +152,6 @@ def _beyond(at: float, lower: float, upper: float, units: JointUnits) -> str:
     unit = units.position
     limits = f'its limits, {lower:g} to {upper:g} {unit}'
     if lower <= at <= upper:
-        return f'less than {_FROM_LIMITS:g} {unit} from {limits}'
+        return f'less than {_FROM_LIMITS[units]:g} {unit} from {limits}'
     hint = hint_at_degrees(at, lower, upper) if units == TURNING else ''
     return f'beyond {limits}{hint}'

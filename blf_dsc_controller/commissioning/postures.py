@@ -205,9 +205,10 @@ class PostureByPosture(ABC):
         joint = int(np.abs(after - before).argmax())
         moved = float(after[joint] - before[joint])
         if abs(moved) > AT_REST * _PAUSE:
+            unit = self._config.units[joint].position
             raise BlfDscError(
-                f'{self._config.joints[joint]} moves by {moved:+.2g} rad in {_PAUSE:g} s: let go '
-                'of the arm, end what else moves it, and start again when it rests'
+                f'{self._config.joints[joint]} moves by {moved:+.2g} {unit} in {_PAUSE:g} s: let '
+                'go of the arm, end what else moves it, and start again when it rests'
             )
         return after
 

@@ -21,6 +21,7 @@ from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
 from blf_dsc_controller.configuration.robot import ArmConfig, Robot
 from blf_dsc_controller.configuration.schema import suggestion
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
+from blf_dsc_controller.run import joint_units
 
 CHECKED = (
     'torque.limit',
@@ -121,14 +122,14 @@ def _refused(doubts: Iterable[_Doubt], insist: Sequence[str]) -> Iterator[str]:
 
 def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
     """Check torques against the efforts of the drives."""
-    strongest = max(UNKNOWN_EFFORT, config.robot.largest_effort(chain))
-    for joint, (_, unit, _), limit in zip(
-        chain.joints, config.units, config.torque.limit, strict=True
+    strongest = config.robot.largest_efforts(chain).clip(UNKNOWN_EFFORT).tolist()
+    for joint, (_, unit, _), limit, most in zip(
+        chain.joints, config.units, config.torque.limit, strongest, strict=True
     ):
         allowed = joint.effort
         source = 'the URDF gives its drive'
         if math.isinf(allowed):
-            allowed = strongest
+            allowed = most
             source = 'no drive of an arm of this weight has more than'
         if limit > _ROUNDED * allowed:
             text = f'got {limit:g} {unit} for {joint.name}, but {source} {allowed:.4g} {unit}'
@@ -249,10 +250,11 @@ def _of_robot(robot: Robot, chain: Chain) -> Iterator[_Doubt]:
             chain.joints, given, most.tolist(), strict=False
         ):
             if value > allowed:
+                own = joint_units(joint.kind).of(unit)
                 yield _Doubt(
                     f'robot.{name}',
-                    f'got {value:g} {unit} for {joint.name}, which its drive could hardly move: '
-                    f'its effort allows {allowed:.3g} {unit}',
+                    f'got {value:g} {own} for {joint.name}, which its drive could hardly move: '
+                    f'its effort allows {allowed:.3g} {own}',
                 )
 
 

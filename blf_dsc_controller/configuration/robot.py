@@ -41,6 +41,7 @@ from blf_dsc_controller.configuration.schema import (
     suggestion,
 )
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.run import SLIDING, TURNING, JointUnits, joint_units
 
 _BUILT = 'arm and law are built once, when the node starts'
 _fixed = partial(parameter, read_only=_BUILT)
@@ -55,11 +56,13 @@ TOPIC = 'topic://'
 
 _MOMENTS = 4  # inertial parameters that gravity shows: mass and first moments
 _GRAVITY = 9.81  # m/s^2, where robot.gravity is zero
-_DRIVE_ACCELERATION = 400.0  # rad/s^2, of an unloaded drive at its rated torque
-# times the weight of the arm at its full reach: the strongest drives have 1
-_PLACEHOLDER = 4.0
-# of that torque, where efforts are placeholders: no arm stretches every link
-_NEEDED = 0.5
+# rad/s^2 or m/s^2, of an unloaded drive at its rated torque
+_DRIVE_ACCELERATION = {TURNING: 400.0, SLIDING: 100.0}
+# times the torque of the weight at full reach, of which the strongest drives have 1; times the
+# weight that slides, which linear motors accelerate by some g, and screws push far harder
+_PLACEHOLDER = {TURNING: 4.0, SLIDING: 40.0}
+# of what the weight takes, where efforts are placeholders: no arm stretches every link
+_NEEDED = {TURNING: 0.5, SLIDING: 1.0}
 _MOST_FRICTION = 0.25  # of the effort
 UNKNOWN_FRICTION = 0.05
 """Friction to expect where none is known, over the rated torque: its standard deviation."""
@@ -209,7 +212,7 @@ class Robot:
         They follow from the weight where the URDF has placeholders.
         """
         efforts = np.array([joint.effort for joint in chain.joints])
-        needed = _NEEDED * self._weight_at_reach(chain)
+        needed = _by_kind(_NEEDED, chain) * self._weight_at_reach(chain)
         known = (
             efforts
             if not self.placeholder_efforts(chain)
@@ -219,14 +222,20 @@ class Robot:
 
     def placeholder_efforts(self, chain: Chain) -> tuple[str, ...]:
         """Return the joints whose effort no drive of such an arm has."""
-        most = self.largest_effort(chain)
         return tuple(
-            joint.name for joint in chain.joints if most < joint.effort < math.inf
+            joint.name
+            for joint, most in zip(
+                chain.joints, self.largest_efforts(chain).tolist(), strict=True
+            )
+            if most < joint.effort < math.inf
         )
 
-    def largest_effort(self, chain: Chain) -> float:
-        """Return what no drive of an arm of this weight exceeds [N m]."""
-        return _PLACEHOLDER * float(self._weight_at_reach(chain).max())
+    def largest_efforts(self, chain: Chain) -> np.ndarray:
+        """Return what no drive of an arm of this weight exceeds (n,) [N m or N]."""
+        weight = self._weight_at_reach(chain)
+        slides = np.array([joint.kind == 'prismatic' for joint in chain.joints])
+        of_kind = [weight[slides == each].max(initial=0.0) for each in slides]
+        return np.asarray(_by_kind(_PLACEHOLDER, chain) * of_kind)
 
     def carried(self, chain: Chain) -> float:
         """Return the mass [kg] that the strongest joint holds at full reach.
@@ -234,13 +243,15 @@ class Robot:
         It is 0 without a reach or an effort limit.
         """
         weight = float(np.linalg.norm(self.gravity)) or _GRAVITY
-        efforts = [each.effort for each in chain.joints if math.isfinite(each.effort)]
-        if chain.reach == 0.0:
-            return 0.0
-        return max(efforts, default=0.0) / (weight * chain.reach)
+        held = [
+            joint.effort / (weight * arm)
+            for joint in chain.joints
+            if (arm := 1.0 if joint.kind == 'prismatic' else chain.reach) > 0.0
+        ]
+        return max(filter(math.isfinite, held), default=0.0)
 
     def _weight_at_reach(self, chain: Chain) -> np.ndarray:
-        """Return torques (n,) [N m] of the weight beyond each joint at full reach."""
+        """Return what the weight beyond each joint takes at full reach (n,) [N m or N]."""
         weight = float(np.linalg.norm(self.gravity)) or _GRAVITY
         force = self.payload * weight
         torque = force * (
@@ -251,8 +262,8 @@ class Robot:
             m, *first = joint.inertia[:4] * weight
             torque = torque + float(np.linalg.norm(first))
             force = force + m
-            needed.append(torque)
-            torque += force * float(np.linalg.norm(joint.placement[:3, 3]))
+            needed.append(force if joint.kind == 'prismatic' else torque)
+            torque += force * joint.length
         return np.array(needed[::-1])
 
     def known_rotors(self, chain: Chain) -> tuple[float, ...]:
@@ -260,11 +271,11 @@ class Robot:
         return self.rotor_inertia or rotors_of(self.text, chain)
 
     def rotors(self, chain: Chain) -> np.ndarray:
-        """Return drive inertias (n,) [kg m^2]: given, or rated torque / 400 rad/s^2."""
+        """Return drive inertias (n,) [kg m^2 or kg]: given, or guessed from rated torques."""
         known = self.known_rotors(chain)
         if len(known) == len(chain.joints):
             return np.array(known)
-        return self.efforts(chain) / _DRIVE_ACCELERATION
+        return np.asarray(self.efforts(chain) / _by_kind(_DRIVE_ACCELERATION, chain))
 
     def unknown_rotors(self, chain: Chain) -> np.ndarray:
         """Return what drives may have beyond `rotors` (n,) [kg m^2] if these are guesses.
@@ -273,6 +284,11 @@ class Robot:
         """
         counts = not (self.torque_loop or self.known_rotors(chain))
         return HEAVIER_DRIVE * self.rotors(chain) * counts
+
+
+def _by_kind(values: Mapping[JointUnits, float], chain: Chain) -> np.ndarray:
+    """Return the value (n,) of each joint, as it turns or slides."""
+    return np.array([values[joint_units(joint.kind)] for joint in chain.joints])
 
 
 @lru_cache(maxsize=16)

@@ -56,6 +56,7 @@ _LISTED = 3
 _FELT = 0.35  # of the rms torque that is left without it, least amplitude that is told
 _ROUNDING = 2e-3  # of N, that makes no difference
 _ALIKE = 0.5  # of a lobe, by which N of two joints may differ
+_TWINS = 0.02  # of the range, by which passes of a motion that repeats differ at most
 _TABLE = 4096  # frequencies
 _AT_ONCE = 1_000_000  # numbers of a block
 _TINY = 1e-12
@@ -78,6 +79,8 @@ class Ripples(NamedTuple):
     seen: tuple[float, float]
     least: float  # amplitude that would have been found for most N, N m or N
     torque: float  # rms of what model and friction leave, N m or N
+    # whether the motion repeats: then whatever errs alike in each pass looks like a ripple
+    repeats: bool = False
 
     @property
     def is_known(self) -> bool:
@@ -213,6 +216,16 @@ class _Passes(NamedTuple):
         counts = np.diff(np.append(self.begins, self.rows.size))
         return np.repeat(values, counts, axis=-1)
 
+    def repeat(self, q: Floats, travel: float) -> bool:
+        """Return whether most passes have a twin: from and to the same q (K,), as long."""
+        ends = np.append(self.begins[1:], self.rows.size) - 1
+        rows = np.column_stack((q[self.begins], q[ends])) / (_TWINS * travel)
+        length = ends - self.begins
+        apart = np.abs(rows[:, None] - rows).max(axis=-1)
+        longer = np.abs(np.subtract.outer(length, length)) > 1 + 0.1 * length
+        is_twin = (apart < 1.0) & ~longer & ~np.eye(length.size, dtype=bool)
+        return bool(is_twin.any(axis=1).mean() > 0.5)
+
     def parts(self) -> Iterator[NDArray[np.bool_]]:
         """Yield the passes (G,) of both directions, and of both halves."""
         first = self.time < np.median(self.time)
@@ -297,8 +310,13 @@ class _Search(NamedTuple):
     """Which N of a joint are searched."""
 
     middle: float  # of its range, rad
-    lobe: float  # of N, within which ripples look alike
+    travel: float  # from one end of its range to the other, rad
     seen: tuple[float, float]
+
+    @property
+    def lobe(self) -> float:
+        """The N within which ripples look alike."""
+        return float(2.0 * np.pi / self.travel)
 
     @property
     def grid(self) -> Floats:
@@ -318,7 +336,7 @@ def _search_of(passes: _Passes, q: Floats, dq: Floats, share: _Share) -> _Search
     last = min(_LARGEST, fastest, first + _GRID * lobe / _PER_LOBE)
     if last < first + lobe:
         return None
-    return _Search(0.5 * (low + high), lobe, (first, last))
+    return _Search(0.5 * (low + high), high - low, (first, last))
 
 
 def _of_joint(
@@ -336,7 +354,10 @@ def _of_joint(
     found.sort(key=lambda each: -each.amplitude)
     told = tuple(each for each in found if each.amplitude > _FELT * torque)
     certain_from = float(np.median(_least(without, search.grid.size / _PER_LOBE)))
-    return Ripples(told, search.seen, max(certain_from, _FELT * torque), torque)
+    repeats = passes.repeat(q, search.travel)
+    return Ripples(
+        told, search.seen, max(certain_from, _FELT * torque), torque, repeats
+    )
 
 
 def _robust(joint: _Joint, left: Floats) -> tuple[_Joint, Floats]:

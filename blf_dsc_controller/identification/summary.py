@@ -44,6 +44,10 @@ _OF_OFFSETS = (
     ', for which a URDF has no place: calibrate the torque sensors, or let the controller learn '
     'them (learning.bias)'
 )
+_OF_REPEATED = (
+    'the motion repeats, and with it whatever model and friction err by, which may look like a '
+    'ripple: use only what a minute of motion that does not repeat shows, too'
+)
 _OF_POOR = (
     ' are not explained: do not trust the values there before sign, unit and zero are those of '
     'the URDF'
@@ -182,6 +186,8 @@ def ripple_table(found: Identified) -> Iterator[str]:
             'the controller learns to compensate it with this parameter:',
             f'learning.ripple_cycles: [{", ".join(map(str, cycles))}]',
         ]
+        if any(each.found and each.repeats for each in found.ripples):
+            lines.append(_OF_REPEATED)
     yield '\n'.join(lines)
 
 

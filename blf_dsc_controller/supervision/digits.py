@@ -13,7 +13,18 @@ def two_digits(value: float) -> str:
     return f'{float(f"{value:.2g}"):g}'
 
 
-def largest_error(errors: Floats, units: Sequence[JointUnits]) -> str:
-    """Return the largest of errors (n,) [rad or m] with its unit, mrad or mm."""
-    worst = int(errors.argmax())
-    return f'{two_digits(1e3 * errors[worst])} {units[worst].of("mrad")}'
+def largest_error(
+    errors: Floats, units: Sequence[JointUnits], joints: Sequence[str] = ()
+) -> str:
+    """Return the largest of errors (n,) [rad or m] in mrad or mm, or in each if both occur.
+
+    With names of the joints it says whose they are.
+    """
+    told = []
+    for kind in dict.fromkeys(units):
+        worst = max(
+            (i for i, each in enumerate(units) if each == kind), key=errors.__getitem__
+        )
+        owner = f' of {joints[worst]}' if joints else ''
+        told.append(f'{two_digits(1e3 * errors[worst])} {kind.of("mrad")}{owner}')
+    return ' and '.join(told)

@@ -152,11 +152,11 @@ def expectation(config: ControllerConfig) -> str:
     errors = expected_errors(config, settings_of_config(config))
     if errors.is_endless:
         return 'none can be told, since errors grow from sample to sample: give lower gains'
-    usual, most = (largest_error(each, config.units) for each in errors)
-    joint = config.joints[int(errors.pick_up.argmax())]
+    usual = largest_error(errors.unmodelled, config.units)
+    most = largest_error(errors.pick_up, config.units, config.joints)
     sensed = config.disturbance.observer_bandwidth > 0.0
     return (
-        f'{usual} by {_causes(config)}; {most} of {joint} when '
+        f'{usual} by {_causes(config)}; {most} when '
         f'{config.robot.payload:g} kg are picked up in motion'
         + (', less what joint torque sensors show in time' if sensed else '')
     )

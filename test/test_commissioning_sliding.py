@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms with joints that slide: their drives, and commissioning them."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.commissioning.own_loop import Commissioning
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
+from blf_dsc_controller.configuration.robot import Robot
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+
+
+def joint(name, kind, parent, axis, place, limits, effort, mass):
+    """Return a joint of a URDF and the link that it moves, a ball of 10 cm."""
+    lower, upper = limits
+    inertia = ' '.join(f'{each}="{4e-3 * mass:g}"' for each in ('ixx', 'iyy', 'izz'))
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}" />'
+        f'<child link="{name}_link" /><origin xyz="{place}" /><axis xyz="{axis}" />'
+        f'<limit lower="{lower}" upper="{upper}" effort="{effort}" velocity="2" /></joint>'
+        f'<link name="{name}_link"><inertial><mass value="{mass}" />'
+        f'<inertia {inertia} ixy="0" ixz="0" iyz="0" /></inertial></link>'
+    )
+
+
+def urdf(*joints):
+    return f'<robot name="arm"><link name="base" />{"".join(joints)}</robot>'
+
+
+# Axes meet in a point, so that no link has a length.
+GANTRY = urdf(
+    joint('x', 'prismatic', 'base', '1 0 0', '0 0 1', (-0.6, 0.6), 600, 30),
+    joint('y', 'prismatic', 'x_link', '0 1 0', '0 0 0', (-0.4, 0.4), 400, 12),
+    joint('z', 'prismatic', 'y_link', '0 0 1', '0 0 0', (-0.3, 0.0), 300, 5),
+)
+SCARA = urdf(
+    joint('shoulder', 'revolute', 'base', '0 0 1', '0 0 0.4', (-2.3, 2.3), 120, 6),
+    joint('elbow', 'revolute', 'shoulder_link', '0 0 1', '0.3 0 0', (-2.5, 2.5), 60, 4),
+    joint('quill', 'prismatic', 'elbow_link', '0 0 1', '0.25 0 0', (-0.2, 0.0), 200, 2),
+)
+# Screws for the gantry; the quill of the SCARA likewise.  Stiff: above 150 Hz.
+ARMS = {
+    'gantry': {
+        'urdf': GANTRY,
+        'rotors': [30.0, 20.0, 15.0],  # kg
+        'coulomb': [25.0, 15.0, 10.0],  # N
+        'springs': [2e7, 2e7, 2e7],  # N/m
+        'start': [0.0, 0.0, -0.15],
+        'amplitude': [0.2, 0.1, 0.08],
+    },
+    'scara': {
+        'urdf': SCARA,
+        'rotors': [1.0, 0.4, 15.0],
+        'coulomb': [2.5, 1.5, 8.0],
+        'springs': [3e4, 2e4, 2e7],
+        'start': [0.3, 0.9, -0.1],
+        'amplitude': [0.4, 0.4, 0.05],
+    },
+}
+
+
+def files_of(name, folder):
+    """Write the parameters of an arm and its simulated truth; return their path."""
+    arm = ARMS[name]
+    path = folder / f'{name}.yaml'
+    path.with_suffix('.urdf').write_text(arm['urdf'])
+    robot = {
+        'robot.urdf': f'{name}.urdf',
+        'robot.rotor_inertia': arm['rotors'],
+        'robot.coulomb': arm['coulomb'],
+        'robot.joint_stiffness': arm['springs'],
+    }
+    plant = {
+        'truth.mass_deviation': 0.2,
+        'truth.rotor_inertia': arm['rotors'],
+        'disturbance.coulomb': arm['coulomb'],
+        'disturbance.coulomb_velocity': 0.01,  # rad/s or m/s
+        'joint.stiffness': arm['springs'],
+        'sensor.resolution': 1e-6,  # rad or m
+        'actuator.delay': 1,
+        'actuator.time_constant': 0.002,  # s
+        'actuator.torque_noise': 0.005,
+        'initial.position': arm['start'],
+    }
+    reference = {
+        'reference.type': 'sinusoids',
+        'reference.offset': arm['start'],
+        'reference.amplitude': arm['amplitude'],
+        'reference.frequency': [1.5],  # rad/s
+        'reference.phase': [0.3],
+    }
+    dump(path, {'/**': robot, PLANT: plant, CONTROLLER: reference})
+    return path
+
+
+def commission(name, folder, capsys):
+    """Commission a simulated arm by the command; return what it wrote and printed."""
+    out = folder / 'commissioned.yaml'
+    config = files_of(name, folder)
+    assert main(['commission', '--config', str(config), '--out', str(out)]) == 0
+    sections = yaml.safe_load(out.read_text())
+    values = {}
+    for section in sections.values():
+        values |= section['ros__parameters']
+    return values, capsys.readouterr().out + out.read_text().split('/**:')[0]
+
+
+def largest(text, unit):
+    """Return the largest error of the simulated arm with its new gains."""
+    (found,) = re.findall(
+        rf'follows its own motion for 30 s, with ([\d.]+) {unit} at most', text
+    )
+    return float(found)
+
+
+def test_stiff_gantry_gets_stiff_gains_in_newtons(tmp_path, capsys):
+    values, text = commission('gantry', tmp_path, capsys)
+    # a critically damped mass of 80, 50 or 25 kg at 1 Hz has as much
+    stiffness = np.array(values['feedback.joint_stiffness'])
+    assert (stiffness > np.array([80.0, 50.0, 25.0]) * (2.0 * np.pi) ** 2).all()
+    assert largest(text, 'mm') < 2.5  # friction of 30 N by 1.5e4 N/m
+    for unit in ('kg', 'N s/m', 'N/m', ' N ', ' mm'):
+        assert unit in text
+    assert not re.search(r'\b(m?rad|N m|kg m\^2)\b', text)
+
+
+def test_scara_has_the_units_of_each_joint(tmp_path, capsys):
+    values, text = commission('scara', tmp_path, capsys)
+    # as above, 18 kg
+    assert values['feedback.joint_stiffness'][2] > 18.0 * (2.0 * np.pi) ** 2
+    for unit in ('kg m^2 or kg', 'N m/rad or N/m', 'N m s/rad or N s/m', 'N m or N'):
+        assert unit in text
+    # of one joint, a unit alone
+    for name, unit in re.findall(
+        r'\b(shoulder|elbow|quill) [\d.e+-]+ ([^\d;.,]+)', text
+    ):
+        if not unit.startswith(('ms', ' ')):
+            slides = name == 'quill'
+            own = r'(m|N|kg|mm)( (?!m\b)|$)' if slides else r'(rad|N m|kg m)'
+            assert re.match(own, unit)
+    assert re.search(r'with [\d.]+ mrad and [\d.]+ mm at most', text)
+    told = re.sub(r'\n(# )?', ' ', text)
+    assert re.search(r'gains: [\d.]+ mrad and [\d.]+ mm by friction', told)
+    assert re.search(r'mrad of (shoulder|elbow) and [\d.]+ mm of quill when 3 kg', told)
+
+
+def robot_of(text, **given):
+    robot = Robot(urdf=text, **given)
+    names = tuple(re.findall(r'joint name="(\w+)"', text))
+    return robot, robot.chain(names)
+
+
+def test_drives_of_a_gantry_are_no_placeholders():
+    """They push 12, 20 and 38 times 1 m/s^2 and more: 40 times the weight is too much."""
+    robot, chain = robot_of(GANTRY)
+    assert robot.placeholder_efforts(chain) == ()
+    np.testing.assert_array_equal(robot.efforts(chain), [600.0, 400.0, 300.0])
+    # drives that reach 100 m/s^2 alone
+    np.testing.assert_allclose(robot.rotors(chain), [6.0, 4.0, 3.0])
+    weight = 9.81 * np.array([50.0, 20.0, 8.0])  # with 3 kg
+    strong, chain = robot_of(GANTRY.replace('"300"', f'"{41.0 * weight[0]:.0f}"'))
+    assert strong.placeholder_efforts(chain) == ('z',)
+    np.testing.assert_allclose(
+        strong.efforts(chain), np.minimum([600.0, 400.0, np.inf], weight)
+    )
+    unknown, chain = robot_of(GANTRY.replace('"400"', '"0"'))
+    np.testing.assert_allclose(unknown.efforts(chain), [600.0, weight[1], 300.0])
+
+
+def test_what_slides_out_has_a_lever():
+    """A shoulder that pans a slide of 0.6 m; nothing else is away from its axis."""
+    text = urdf(
+        joint('pan', 'revolute', 'base', '0 0 1', '0 0 0', (-2, 2), 0, 4),
+        joint('out', 'prismatic', 'pan_link', '1 0 0', '0 0 0', (-0.1, 0.6), 0, 2),
+    )
+    robot, chain = robot_of(text, payload=0.0)
+    assert chain.reach == pytest.approx(0.6)
+    turns, slides = robot.efforts(chain)
+    assert turns == pytest.approx(0.5 * 2.0 * 9.81 * 0.6)
+    assert slides == pytest.approx(2.0 * 9.81)
+    # half a turn of the lever more, and what a drive of 300 N holds
+    _, chain = robot_of(text.replace('effort="0"', 'effort="300"'))
+    assert robot.carried(chain) == pytest.approx(300.0 / (9.81 * 0.6))
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'text'),
+    [
+        ('rotor_inertia', 700.0, 'got 700 kg for x, .* its effort allows 600 kg;'),
+        ('coulomb', 700.0, 'got 700 N for x, .* its effort allows 600 N;'),
+        ('viscous', 700.0, 'got 700 N s/m for x, .* its effort allows 600 N s/m;'),
+    ],
+)
+def test_what_no_drive_that_slides_could_move(name, value, text):
+    given = {'robot.urdf': GANTRY, f'robot.{name}': [value, 1.0, 1.0]}
+    with pytest.raises(ConfigurationError, match=text):
+        build(ControllerConfig, given)
+
+
+def test_postures_of_a_joint_that_slides_may_be_2_cm_from_its_limits():
+    config = build(ControllerConfig, {'robot.urdf': SCARA})
+    (motion,) = Commissioning(config, [[0.3, 0.9, -0.021]]).motions
+    assert motion.excitation.travel <= 0.01
+    with pytest.raises(BlfDscError, match=r'at -0.019 m, less than 0.02 m from its'):
+        _ = Commissioning(config, [[0.3, 0.9, -0.019]]).motions
+    with pytest.raises(BlfDscError, match=r'at 2.26 rad, less than 0.05 rad from its'):
+        _ = Commissioning(config, [[2.26, 0.9, -0.1]]).motions
