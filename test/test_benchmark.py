@@ -31,12 +31,12 @@ def contestants(rows):
 
 
 def test_growth_is_written_as_a_table(monkeypatch, tmp_path):
-    offline = tiny(monkeypatch, 'offline', _UPDATES=2, _GROWTH_ROUNDS=1, _FULL=7.5)
+    offline = tiny(monkeypatch, 'offline', _UPDATES=2, _GROWTH_ROUNDS=1, FULL=7.5)
     assert main(['bench', 'growth', '--out', str(tmp_path)]) == 0
     text = (tmp_path / 'RESULTS.md').read_text()
     row = 'panda: n = 7 joints, p = 62 unknowns (48 of the arm + 14 of disturbances)'
     assert f'\n| {row} | **' in text
-    monkeypatch.setattr(offline, '_FULL', 1.0)
+    monkeypatch.setattr(offline, 'FULL', 1.0)
     with pytest.raises(RuntimeError, match=r'p = 5 .* nothing is learned in 1 s'):
         offline.updates('recommended')
 
@@ -48,7 +48,7 @@ def test_cost_of_tool_bound_and_contacts_is_measured_in_turns(monkeypatch):
         for name in ('bound at the tool', 'contacts', 'both')
         for part in ('until the torque', 'whole')
     ]
-    monkeypatch.setattr(guarded, '_FULL', 1.0)
+    monkeypatch.setattr(guarded, 'FULL', 1.0)
     with pytest.raises(RuntimeError, match='nothing is learned in 1 s'):
         guarded.Contestant({})
 

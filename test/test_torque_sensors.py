@@ -198,6 +198,16 @@ def test_joint_that_shows_it_is_named_with_its_own_difference():
     assert joint_of(law, config.joints) == joint
 
 
+def test_efforts_may_be_off_by_the_weight_that_drives_add():
+    """fr3_direct reads whole torques, with the weight of what Desk declares; a panda adds none."""
+    text = 'or the drives compensate another load than robot.drive_payload, 0 kg'
+    for preset, is_named in (('fr3_direct', True), ('panda', False)):
+        config = load_loop(preset).controller
+        law = controller_of(config)
+        law.state.sensors.fault[0] = OFF
+        assert (text in text_of(law, config)) == is_named
+
+
 def loop_of(preset, seconds, **plant):
     """Return the loop of a preset whose arm may be another."""
     return load_loop(preset, {PLANT: {'duration': seconds, **plant}})

@@ -37,10 +37,11 @@ _TEXTS = {
     ),
     OFF: (
         'the effort of joint {joint!r} is off {off:+.3g} {unit} from what is commanded while the '
-        f'arm follows: a sensor is stuck, dead or in another unit; {_ALONE}. Mend it, or set '
-        f'robot.effort to unknown{_DRIVER}'
+        f'arm follows: a sensor is stuck, dead or in another unit{{load}}; {_ALONE}. Mend it, or '
+        f'set robot.effort to unknown{_DRIVER}'
     ),
 }
+_LOAD = ', or the drives compensate another load than robot.drive_payload, {:g} kg'
 
 
 def fault_of(controller: Controller) -> int:
@@ -61,7 +62,10 @@ def text_of(controller: Controller, config: ControllerConfig) -> str:
     i = int(controller.state.sensors.joint[0])
     off = float(controller.signals.sensors.differences[0, i])
     unit = config.units[i].torque
-    return _TEXTS[fault].format(joint=config.joints[i], off=off, unit=unit)
+    robot = config.robot
+    adds_weight = robot.effort == 'whole' and robot.drive_compensates != 'none'
+    load = _LOAD.format(robot.drive_payload) if adds_weight else ''
+    return _TEXTS[fault].format(joint=config.joints[i], off=off, unit=unit, load=load)
 
 
 def joint_of(controller: Controller, joints: Sequence[str]) -> str:
