@@ -3,7 +3,9 @@
 
 They are k = lambda w, with the largest lambda for which the tool keeps its bound at every
 posture.  w are the errors to expect of the joints, so all joints use about the same part of
-their bounds, which leaves the most room.
+their bounds, which leaves the most room.  A joint that hardly moves the tool, as the last one
+whose axis goes through it, gets more than that: up to `_SPARE` of the bound if it were alone,
+but not beyond `_MOST` times its share.
 
 d is the torque that the model lacks: friction and the residual floor, or the rated payload.  It
 includes the friction that a commissioning has measured, and the inertia that it did not see;
@@ -42,6 +44,9 @@ _FRICTION, _UNSEEN = 'commissioning.friction', 'commissioning.unseen_inertia'
 _POSTURES = 40
 _REVERSAL = 0.75
 """Of Coulomb friction, an error of it: half of it too much at breakaway, with either sign."""
+
+_SPARE = 0.05
+_MOST = 5.0
 
 _MEAN = 0.5
 """Of the limit of acceleration, on average: an error of soft gains takes time to grow."""
@@ -145,13 +150,21 @@ def _region(
 
 
 def _scaled(tool: Tool, w: Floats, bounds: tuple[float, float]) -> Floats:
-    """Return the largest lambda w (n,) that keeps the bounds [m, rad], 0 for none."""
-    scales = [
-        bound / used
-        for bound, used in zip(bounds, tool.everywhere(w).tolist(), strict=True)
-        if bound > 0.0 and used > 0.0
-    ]
-    return np.asarray(min(scales, default=0.0) * w)
+    """Return joint bounds (n,) of w (n,) that keep the bounds [m, rad], 0 for none."""
+    k = w / _used(tool, w, bounds)
+    alone = np.array([_used(tool, each, bounds) for each in np.diag(k)])
+    k *= np.clip(_SPARE / np.maximum(alone, _SPARE / _MOST), 1.0, _MOST)
+    return np.asarray(k / _used(tool, k, bounds))
+
+
+def _used(tool: Tool, k: Floats, bounds: tuple[float, float]) -> float:
+    """Return which part of the bounds [m, rad], 0 for none, joint bounds k (n,) use at most."""
+    everywhere: list[float] = tool.everywhere(k).tolist()
+    return max(
+        used / bound
+        for used, bound in zip(everywhere, bounds, strict=True)
+        if bound > 0.0
+    )
 
 
 @lru_cache(maxsize=16)
