@@ -285,6 +285,34 @@ def test_r_is_within_its_limits():
     np.testing.assert_allclose(run(state, work, [900.0, -900.0], 1.0), [40.0, -6.0])
 
 
+def test_r_takes_over_what_is_learned_no_longer_beyond_its_limit_until_it_needs_less():
+    """So d^3 gets nothing of it, which would stay when the load goes."""
+    state, work = settled()
+    learned = np.array([0.0, 2.0, 2.0, 0.0])  # 5 and 9 N m
+    before, after = THETA + learned, THETA
+    sensed = X[:, :P] @ (LINKS + 1.5 * learned[:P])
+    torque = X @ before + run(state, work, sensed, 1.0, theta=before)
+    d3 = np.zeros(N)
+    disturbance.transfer_learned(d3, X, after, before)
+    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
+    r = run(state, work, sensed, DT)
+    np.testing.assert_allclose(d3, 0.0, atol=1e-9)
+    np.testing.assert_allclose(X @ after + r, torque, rtol=1e-9)
+    assert r[1] == pytest.approx(13.5)  # of 6 N m
+    for load, shown in ((2.0, 13.5), (1.0, 9.0), (1.5, 9.0), (0.1, 0.9), (1.5, 6.0)):
+        r = run(state, work, X[:, :P] @ (LINKS + load * learned[:P]), 1.0)
+        assert r[1] == pytest.approx(shown, rel=1e-6)
+
+
+def test_observer_that_is_off_takes_nothing_over():
+    off = SETTINGS._replace(most=np.zeros(N))
+    state, work = settled(off)
+    d3 = np.zeros(N)
+    load_observer.transfer_learned(off, state, d3, THETA, THETA + 1.0, NOTHING, NOTHING)
+    np.testing.assert_array_equal(d3, 0.0)
+    np.testing.assert_array_equal(run(state, work, [9.0, 9.0], 0.5, settings=off), 0.0)
+
+
 def test_offset_of_a_sensor_stays_out_of_r():
     """3 N m, where the model is known to 0.5 N m: three deviations are 1.5.
 

@@ -19,7 +19,8 @@ which vanishes for the right inertia M_l, and is stable for any M > 0 as long as
 
 T being the response of the drives: positive feedback below 1 makes a heavy arm light, and
 a pole L below that of the drives leaves no phase for a light one.  |r| is at most
-a half of the torque limit, as for a load in the safe torque.
+a half of the torque limit, as for a load in the safe torque; beyond that, r takes over what is
+learned no longer, until it needs less.
 
 *Bias.*  In the first `_SETTLING` / L, r is zero.  What is seen then is subtracted; it fades
 within 10 / L if the prior explains it.  A joint whose sensor shows more than `_SIGMAS`
@@ -83,6 +84,8 @@ class State(NamedTuple):
     calmed: Annotated[Array, 'n * observer.enabled']
     slow: Annotated[Array, 'n * observer.enabled']  # r behind a slow lag, N m
     elapsed: Cell  # s, since the first interval
+    # beyond the largest |r|, since what it takes over was learned, N m
+    over: Annotated[Array, 'n * observer.enabled']
     # what r lacks of a changed estimate, since it is late; it fades, N m
     handover: Annotated[Array, 'n * observer.enabled']
 
@@ -149,8 +152,17 @@ def load_torque(
     if not has_settled(settings, state):
         return 0.0
     r = residual(settings, state, i, estimate, absorbed) - state.bias[i]
-    most = settings.most[i]
+    most = settings.most[i] + state.over[i]
     return float((1.0 - state.faded[0]) * clip(r, -most, most))
+
+
+@inner
+def excess(
+    settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
+) -> float:
+    """Return by how much r of joint i would be beyond its largest [N m]; negative: within."""
+    r = residual(settings, state, i, estimate, absorbed) - state.bias[i]
+    return float(abs(r) - settings.most[i])
 
 
 @inner
@@ -178,6 +190,9 @@ def update(
     slowly = filter_gain(_SLOW, dt)
     for i in range(state.torque.size):
         state.handover[i] -= passed * state.handover[i]
+        if state.over[i] > 0.0:
+            needed = excess(settings, state, i, estimate, absorbed)
+            state.over[i] = clip(needed, 0.0, state.over[i])
         r = load_torque(settings, state, i, estimate, absorbed)
         state.slow[i] += slowly * (r - state.slow[i])
         fast = r - state.slow[i]
@@ -246,6 +261,10 @@ def transfer_learned(
     """
     for i in range(state.torque.size):
         given_up = load_torque(settings, state, i, before, absorbed_before)
+        needed = excess(settings, state, i, theta, absorbed)
+        taken = needed - excess(settings, state, i, before, absorbed_before)
+        if taken > 0.0 and settings.most[i] > 0.0:
+            state.over[i] = clip(needed, 0.0, state.over[i] + taken)
         given_up -= load_torque(settings, state, i, theta, absorbed)
         disturbance[i] += given_up
         state.slow[i] -= given_up
