@@ -262,6 +262,12 @@ def test_configuration_with_its_joint_bounds_can_be_read_again(tmp_path):
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 POSITION = {'barrier.tool_bound': 0.001}
+ON_ITS_AXIS = """<robot name="wheel"><link name="base"/>
+  <link name="tip"><inertial><mass value="1"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="tip"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="80" velocity="5"/></joint>
+</robot>"""
 MISTAKES = {
     'negative': (
         PANDA | {'barrier.tool_bound': -0.001},
@@ -303,6 +309,10 @@ MISTAKES = {
             'barrier.tool_angle_bound is 0.01 rad: drop barrier.bound, which then follows from '
             'it, or drop barrier.tool_angle_bound'
         ),
+    ),
+    'unmoved': (
+        {'robot.urdf': ON_ITS_AXIS, 'robot.tip': 'tip', 'joints': ['turn']} | POSITION,
+        'barrier.tool_bound: no joint moves tip, the tool: give another robot.tip',
     ),
     'unreachable': (
         PANDA | {'barrier.tool_bound': 1e-7},

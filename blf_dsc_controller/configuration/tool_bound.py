@@ -151,7 +151,10 @@ def _region(
 
 def _scaled(tool: Tool, w: Floats, bounds: tuple[float, float]) -> Floats:
     """Return joint bounds (n,) of w (n,) that keep the bounds [m, rad], 0 for none."""
-    k = w / _used(tool, w, bounds)
+    used = _used(tool, w, bounds)
+    if used == 0.0:  # no joint moves the tool
+        return np.zeros_like(w)
+    k = w / used
     alone = np.array([_used(tool, each, bounds) for each in np.diag(k)])
     k *= np.clip(_SPARE / np.maximum(alone, _SPARE / _MOST), 1.0, _MOST)
     return np.asarray(k / _used(tool, k, bounds))
@@ -160,11 +163,12 @@ def _scaled(tool: Tool, w: Floats, bounds: tuple[float, float]) -> Floats:
 def _used(tool: Tool, k: Floats, bounds: tuple[float, float]) -> float:
     """Return which part of the bounds [m, rad], 0 for none, joint bounds k (n,) use at most."""
     everywhere: list[float] = tool.everywhere(k).tolist()
-    return max(
+    shares = [
         used / bound
         for used, bound in zip(everywhere, bounds, strict=True)
         if bound > 0.0
-    )
+    ]
+    return max(shares, default=0.0)
 
 
 @lru_cache(maxsize=16)
@@ -230,7 +234,9 @@ def problems(config: Checked) -> Iterator[str]:
     if not traits_of(config).has_barrier:
         yield f'{name}: the law {config.law} keeps no bound: choose blf_dsc, or remove {name}'
     least = min(barrier.bound)
-    if least < _FINEST:
+    if least == 0.0:
+        yield f'{name}: no joint moves {config.robot.tip}, the tool: give another robot.tip'
+    elif least < _FINEST:
         k = barrier.bound.index(least)
         unit = config.units[k].position
         yield (
