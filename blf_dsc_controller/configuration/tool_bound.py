@@ -120,6 +120,7 @@ def joint_bounds(
     )
     k = _scaled(
         _tool(chain, lower, upper),
+        _levers(chain, lower, upper),
         np.array(expected),
         (values.get(POSITION, 0.0), values.get(ANGLE, 0.0)),
     )
@@ -149,26 +150,31 @@ def _region(
     return tuple((offset - reach).tolist()), tuple((offset + reach).tolist())
 
 
-def _scaled(tool: Tool, w: Floats, bounds: tuple[float, float]) -> Floats:
+@lru_cache(maxsize=16)
+def _levers(chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]) -> Floats:
+    """Return what each joint alone moves the tool by (n, 2) [m/rad, rad/rad], at most."""
+    tool = _tool(chain, lower, upper)
+    return np.array([tool.everywhere(each) for each in np.eye(len(chain.joints))])
+
+
+def _scaled(
+    tool: Tool, levers: Floats, w: Floats, bounds: tuple[float, float]
+) -> Floats:
     """Return joint bounds (n,) of w (n,) that keep the bounds [m, rad], 0 for none."""
-    used = _used(tool, w, bounds)
+    used = _used(tool.everywhere(w), bounds)
     if used == 0.0:  # no joint moves the tool
         return np.zeros_like(w)
     k = w / used
-    alone = np.array([_used(tool, each, bounds) for each in np.diag(k)])
+    alone = _used(k[:, np.newaxis] * levers, bounds)
     k *= np.clip(_SPARE / np.maximum(alone, _SPARE / _MOST), 1.0, _MOST)
-    return np.asarray(k / _used(tool, k, bounds))
+    return np.asarray(k / _used(tool.everywhere(k), bounds))
 
 
-def _used(tool: Tool, k: Floats, bounds: tuple[float, float]) -> float:
-    """Return which part of the bounds [m, rad], 0 for none, joint bounds k (n,) use at most."""
-    everywhere: list[float] = tool.everywhere(k).tolist()
-    shares = [
-        used / bound
-        for used, bound in zip(everywhere, bounds, strict=True)
-        if bound > 0.0
-    ]
-    return max(shares, default=0.0)
+def _used(errors: Floats, bounds: tuple[float, float]) -> Floats:
+    """Return which part (...) of the bounds [m, rad], 0 for none, errors (..., 2) use."""
+    given = np.array(bounds)
+    shares = errors / np.where(given > 0.0, given, np.inf)
+    return np.asarray(shares.max(axis=-1))
 
 
 @lru_cache(maxsize=16)
