@@ -45,8 +45,8 @@ _POSTURES = 40
 _REVERSAL = 0.75
 """Of Coulomb friction, an error of it: half of it too much at breakaway, with either sign."""
 
-_SPARE = 0.05
-_MOST = 5.0
+_SPARE = 0.05  # of the bound at the tool, by one joint alone
+_MOST = 5.0  # times the share of a joint by its errors to expect
 
 _MEAN = 0.5
 """Of the limit of acceleration, on average: an error of soft gains takes time to grow."""
