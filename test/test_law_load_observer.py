@@ -304,6 +304,18 @@ def test_r_takes_over_what_is_learned_no_longer_beyond_its_limit_until_it_needs_
         assert r[1] == pytest.approx(shown, rel=1e-6)
 
 
+@pytest.mark.parametrize('left_out', ['unsettled', 'faded'])
+def test_r_that_is_left_out_takes_nothing_over(left_out):
+    state, work = new() if left_out == 'unsettled' else settled()
+    run(state, work, X[:, :P] @ LINKS, 0.01)
+    state.faded[0] = float(left_out == 'faded')
+    d3, before = np.zeros(N), THETA + np.array([0.0, 20.0, 20.0, 0.0])
+    load_observer.transfer_learned(SETTINGS, state, d3, THETA, before, NOTHING, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, before, THETA, NOTHING, NOTHING)
+    np.testing.assert_array_equal(state.over, 0.0)
+    np.testing.assert_array_equal(d3, 0.0)
+
+
 def test_observer_that_is_off_takes_nothing_over():
     off = SETTINGS._replace(most=np.zeros(N))
     state, work = settled(off)

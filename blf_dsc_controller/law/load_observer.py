@@ -145,24 +145,27 @@ def residual(
 
 
 @inner
-def load_torque(
-    settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
-) -> float:
-    """Return r of joint i [N m] for an `estimate` theta (m,), P_f (p,) `absorbed`."""
+def load_torque(settings: Settings, state: State, i: int, shown: float) -> float:
+    """Return r of joint i [N m] for what is `shown` beyond the model and the bias [N m]."""
     if not has_settled(settings, state):
         return 0.0
-    r = residual(settings, state, i, estimate, absorbed) - state.bias[i]
     most = settings.most[i] + state.over[i]
-    return float((1.0 - state.faded[0]) * clip(r, -most, most))
+    return float((1.0 - state.faded[0]) * clip(shown, -most, most))
 
 
 @inner
-def excess(
-    settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
-) -> float:
-    """Return by how much r of joint i would be beyond its largest [N m]; negative: within."""
-    r = residual(settings, state, i, estimate, absorbed) - state.bias[i]
-    return float(abs(r) - settings.most[i])
+def take_over(
+    settings: Settings, state: State, i: int, shown: float, before: float
+) -> None:
+    """Let r go beyond its largest by what is learned no longer.
+
+    Beyond the model and the bias `shown` [N m] are seen, and `before` [N m] with what was learned.
+    """
+    takes_over = has_settled(settings, state) and state.faded[0] == 0.0
+    taken = abs(shown) - abs(before)
+    if takes_over and taken > 0.0 and settings.most[i] > 0.0:
+        beyond = abs(shown) - settings.most[i]
+        state.over[i] = clip(beyond, 0.0, state.over[i] + taken)
 
 
 @inner
@@ -190,10 +193,9 @@ def update(
     slowly = filter_gain(_SLOW, dt)
     for i in range(state.torque.size):
         state.handover[i] -= passed * state.handover[i]
-        if state.over[i] > 0.0:
-            needed = excess(settings, state, i, estimate, absorbed)
-            state.over[i] = clip(needed, 0.0, state.over[i])
-        r = load_torque(settings, state, i, estimate, absorbed)
+        shown = residual(settings, state, i, estimate, absorbed) - state.bias[i]
+        state.over[i] = clip(abs(shown) - settings.most[i], 0.0, state.over[i])
+        r = load_torque(settings, state, i, shown)
         state.slow[i] += slowly * (r - state.slow[i])
         fast = r - state.slow[i]
         state.torque[i] = r - state.calmed[i] * fast + state.handover[i]
@@ -260,12 +262,11 @@ def transfer_learned(
     That is by a change of theta (m,), and of what it has `absorbed` (p,).
     """
     for i in range(state.torque.size):
-        given_up = load_torque(settings, state, i, before, absorbed_before)
-        needed = excess(settings, state, i, theta, absorbed)
-        taken = needed - excess(settings, state, i, before, absorbed_before)
-        if taken > 0.0 and settings.most[i] > 0.0:
-            state.over[i] = clip(needed, 0.0, state.over[i] + taken)
-        given_up -= load_torque(settings, state, i, theta, absorbed)
+        was = residual(settings, state, i, before, absorbed_before) - state.bias[i]
+        shown = residual(settings, state, i, theta, absorbed) - state.bias[i]
+        given_up = load_torque(settings, state, i, was)
+        take_over(settings, state, i, shown, was)
+        given_up -= load_torque(settings, state, i, shown)
         disturbance[i] += given_up
         state.slow[i] -= given_up
 
