@@ -17,9 +17,7 @@ out = Path(tempfile.mkdtemp())
 table, urdf, tip = (*sys.argv[1:4], '', '', '')[:3]
 if not table:
     run, table, urdf, tip = out / 'run', str(out / 'run.csv'), 'ur5e.urdf', 'tool0'
-    main(
-        ['run', '--config', 'ur5e', '--offline', '--duration', '12', '--out', str(run)]
-    )
+    main(['run', '--config', 'ur5e', '--offline', '--duration', '8', '--out', str(run)])
     main(['export', str(run / 'bag'), '--out', table])
 
 # the columns, by patterns: `doc/identify.md` has all rules
