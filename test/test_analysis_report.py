@@ -213,7 +213,10 @@ def test_logarithmic_error_panel_shows_small_and_large_errors(run):
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('level', [0.0001, np.nan])
-def test_constant_series_on_a_logarithmic_axis_is_drawn(run, tmp_path, level):
+def test_constant_series_on_a_logarithmic_axis_is_drawn(
+    run, tmp_path, level, monkeypatch
+):
+    monkeypatch.setattr(figures, '_draw_motion', lambda *_: None)
     learning = run.monitor
     values = learning.values.copy()
     values[:, learning.names.index('lambda_min')] = level
@@ -402,7 +405,7 @@ def test_absurd_numbers_and_characters_missing_from_the_font_cause_no_warning(
 ):
     """Warnings are errors here: numpy's and matplotlib's would be seen beside the page."""
     monkeypatch.setattr(recorded_run, 'JOINTS', ('关节', 'elbow'))
-    made = Synthetic(4000)
+    made = Synthetic(400)
     made.position[50, 0] = made.error[100, 1] = made.reference[70, 0] = value
     made.error[200:, 0] = made.torque[:, 1] = made.estimate[:, 1] = value
     made.disturbance[100:, 0] = made.latched[:] = value
