@@ -47,10 +47,11 @@ from blf_dsc_controller.compiled.layout import (
     Array,
     Cell,
     Passed,
+    _view_arguments,
+    _view_lines,
     filled,
     pack,
     size_of,
-    source_of,
     view_of,
 )
 from blf_dsc_controller.configuration import nodes
@@ -465,20 +466,22 @@ def test_layout_is_filled_with_parameters_of_the_same_names():
 
 
 def test_generated_view_can_be_read():
-    assert source_of(State) == (
-        'def view(_vector, _sizes):\n'
-        '    _at = 0\n'
-        '    count = _part(_vector, _at, (1,))\n'
-        '    _at += (1)\n'
-        '    ring = _part(_vector, _at, (_sizes.motor.delay, _sizes.joints,))\n'
-        '    _at += (_sizes.motor.delay) * (_sizes.joints)\n'
-        '    motor_limit = _part(_vector, _at, (_sizes.joints,))\n'
-        '    _at += (_sizes.joints)\n'
-        '    motor_delay = int(_vector[_at])\n'
-        '    _at += 1\n'
-        '    return _reference(State(count=count, ring=ring, '
-        'motor=motor_Motor(limit=motor_limit, delay=motor_delay)))\n'
-    )
+    assert _view_arguments(State) == '_vector, _sizes'
+    assert _view_lines(State) == [
+        '_at = 0',
+        'count = _part(_vector, _at, (1,))',
+        '_at += (1)',
+        'ring = _part(_vector, _at, (_sizes.motor.delay, _sizes.joints,))',
+        '_at += (_sizes.motor.delay) * (_sizes.joints)',
+        'motor_limit = _part(_vector, _at, (_sizes.joints,))',
+        '_at += (_sizes.joints)',
+        'motor_delay = int(_vector[_at])',
+        '_at += 1',
+        (
+            'return _reference(State(count=count, ring=ring, '
+            'motor=motor_Motor(limit=motor_limit, delay=motor_delay)))'
+        ),
+    ]
 
 
 SHOW = """

@@ -117,12 +117,6 @@ def view_of(layout: type[T]) -> Callable[..., T]:
     return inner_as(defined, in_kernels)
 
 
-def source_of(layout: type) -> str:
-    """Return the Python source of the layout's view, which is generated: to be read."""
-    lines = (f'    {line}\n' for line in _view_lines(layout))
-    return f'def view({_view_arguments(layout)}):\n{"".join(lines)}'
-
-
 def _view_arguments(layout: type) -> str:
     passed = [name for name, hint in _hints(layout).items() if not _is_part(hint)]
     if any('_sizes' in line for line in _view_lines(layout)):
