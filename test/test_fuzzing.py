@@ -77,7 +77,10 @@ def _watch(event, arguments):
         _opened.append(str(arguments[0]))
 
 
-sys.addaudithook(_watch)
+@functools.cache
+def watch():
+    """Note from now on which files are opened: no other test of this process is to pay for it."""
+    sys.addaudithook(_watch)
 
 
 class HangError(BaseException):
@@ -97,6 +100,7 @@ def status_of(name):
 @contextlib.contextmanager
 def bounded():
     """Run the tested code within limits."""
+    watch()
     before = set(sys.modules)
     _opened.clear()
     limits = resource.getrlimit(resource.RLIMIT_AS)

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import inf
-from types import SimpleNamespace
 
+import law_part
 import numpy as np
 import pytest
 
-from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.law import external_torque
 from blf_dsc_controller.law.external_torque import (
     EXPLAINED,
@@ -40,10 +40,7 @@ SETTINGS = Settings(
 N, M = 2, 3  # joints, entries of theta
 
 
-def part(layout):
-    """An empty state, or scratch."""
-    sizes = SimpleNamespace(n=N, m=M, contact=SETTINGS)
-    return view_of(layout)(np.zeros(size_of(layout)(sizes)), sizes)
+part = partial(law_part.part, n=N, m=M, contact=SETTINGS)
 
 
 @pytest.fixture
