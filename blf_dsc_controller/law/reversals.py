@@ -272,19 +272,15 @@ def learned(
     ss = sums[_SS, i] + share * latest[_SS, i] + pull
     sb = sums[_SB, i] + share * latest[_SB, i]
     bb = sums[_BB, i] + share * latest[_BB, i] + _STRIBECK_PRIOR * pull
-    determinant = ss * bb - sb * sb
+    # c and c k, times the determinant of the equations, which the pull keeps positive
+    coulomb = se * bb - be * sb
+    stribeck = be * ss - se * sb
     k = 0.0
-    if determinant > 0.0:
-        coulomb = se * bb - be * sb
-        stribeck = be * ss - se * sb
-        if coulomb > 0.0:
-            k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
-        elif stribeck > 0.0:
-            k = _MOST_STRIBECK
-    total = ss + 2.0 * k * sb + k * k * bb
-    if total <= 0.0:
-        return settings.initial[i], 0.0
-    return (se + k * be) / total, k
+    if coulomb > 0.0:
+        k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
+    elif stribeck > 0.0:
+        k = _MOST_STRIBECK
+    return (se + k * be) / (ss + 2.0 * k * sb + k * k * bb), k
 
 
 @inner
