@@ -62,9 +62,8 @@ def add(state, energy, friction, push=0.0):
     A `push` [N m] is as large beside the step of friction.
     """
     s = np.sqrt(energy)
-    return reversals.add_row(
-        SETTINGS, state, 0, s, 0.0, friction * s + push, 1.0, 0.0, 0.01
-    )
+    row = reversals.Row(s, 0.0, friction * s + push, 1.0)
+    return reversals.add_row(SETTINGS, state, 0, row, 0.0, 0.01)
 
 
 def test_reversal_shows_its_friction_once():

@@ -169,13 +169,15 @@ def weigh(
         state.weighing,
         signals.weighing,
         Prior(settings.initial_estimate, settings.row_information),
-        signals.row.Xu,
-        signals.weighing.shapes,
-        state.friction.shape_lags[0, 2],
-        signals.dqr,
-        int(state.samples[0]),
-        state.change.changes[0],
-        dt,
+        weighing.Sample(
+            signals.row.Xu,
+            signals.weighing.shapes,
+            state.friction.shape_lags[0, 2],
+            signals.dqr,
+            int(state.samples[0]),
+            state.change.changes[0],
+            dt,
+        ),
     )
 
 

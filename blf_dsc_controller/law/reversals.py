@@ -60,6 +60,15 @@ class Settings(NamedTuple):
     most: Annotated[Array, 'n']
 
 
+class Row(NamedTuple):
+    """A row of one joint behind the high pass."""
+
+    s: float  # s_h
+    b: float  # b_h
+    e: float  # e_h, N m
+    weight: float  # p dt
+
+
 class Shown(NamedTuple):
     """What reversals have shown."""
 
@@ -107,36 +116,35 @@ def add_row(
     settings: Settings,
     state: State,
     i: int,
-    s: float,
-    b: float,
-    e: float,
-    weight: float,
+    row: Row,
     k: float,
     dt: float,
 ) -> bool:
-    """Add s_h, b_h and e_h of a row of joint i to its present reversal, by their weight p dt.
+    """Add a row of joint i, `dt` [s] after the last, to its present reversal.
 
-    Return whether that shows its friction since this row, `dt` [s] after the last.  k is k^.
+    Return whether that shows its friction since this row.  k is k^.
     """
     now = state.shown.present
+    s, b, e, weight = row
     was_shown = counted(settings, state, i, k) > 0.0
     now[_SE, i] += weight * s * e
     now[_BE, i] += weight * b * e
     now[_SS, i] += weight * s * s
     now[_SB, i] += weight * s * b
     now[_BB, i] += weight * b * b
-    add_torque(state, i, s * s, e * e, weight, dt)
+    add_torque(state, i, row, dt)
     return find_last(settings, state, i, k, was_shown)
 
 
 @inner
-def add_torque(
-    state: State, i: int, ss: float, ee: float, weight: float, dt: float
-) -> None:
+def add_torque(state: State, i: int, row: Row, dt: float) -> None:
     """Add e_h^2 of joint i to the torque around its reversal, from `_NEAR` before it to after it.
 
-    The row's `weight` is p dt, with `dt` [s]; away from reversals e_h is noise.
+    Away from reversals e_h is noise.
     """
+    weight = row.weight
+    ss = row.s * row.s
+    ee = row.e * row.e
     recent, usual, shown = state.recent, state.usual, state.shown
     reversed_before = recent[0, i] > _TOUCHED
     fade(recent, i, _NEAR, dt)

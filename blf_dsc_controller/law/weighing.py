@@ -99,6 +99,18 @@ class State(NamedTuple):
     load: Annotated[Array, 8]
 
 
+class Sample(NamedTuple):
+    """What it reads of a sample."""
+
+    Xu: Array  # [X | u] (n, m + 1)
+    shapes: Array  # of breakaway (n,), filtered and weighted as the row
+    signs: Array  # s of the motion (n,), filtered alone
+    dqr: Array  # (n,) rad/s
+    samples: int  # number of samples so far
+    changes: float  # of the arm that were found so far
+    dt: float  # s
+
+
 class Work(NamedTuple):
     """Scratch of one row."""
 
@@ -119,31 +131,20 @@ def add_row(
     state: State,
     work: Work,
     prior: Prior,
-    given: Array,
-    shapes: Array,
-    signs: Array,
-    dqr: Array,
-    samples: int,
-    changes: float,
-    dt: float,
+    sample: Sample,
 ) -> None:
-    """Add the row of this sample if one is due, and solve for the load ten times a second.
-
-    The row that is `given` is [X | u] (n, m + 1), the `shapes` (n,) of breakaway are
-    filtered and weighted as it is, the `signs` s (n,) of the motion filtered alone.  dqr (n,) is
-    the velocity of the reference [rad/s], `samples` the number of samples of `dt` [s],
-    `changes` that of the changes of the arm found so far.
-    """
+    """Add the row of this sample if one is due, and solve for the load ten times a second."""
+    samples, dqr = sample.samples, sample.dqr
     if samples % settings.row_interval != settings.row_interval // 2:
         return
-    period = settings.row_interval * dt
-    has_changed = changes != state.changes[0]
-    state.changes[0] = changes
+    period = settings.row_interval * sample.dt
+    has_changed = sample.changes != state.changes[0]
+    state.changes[0] = sample.changes
     if not is_first(state):
         state.age[0] += period
     row = work.row
     find_held(settings, state, work.held)
-    extend_row(given, shapes, signs, work.held, row)
+    extend_row(sample, work.held, row)
     weight_row(row, dqr)
     if samples <= settings.row_interval:
         begin(settings, state, work, prior, period)
@@ -186,10 +187,9 @@ def find_held(settings: Settings, state: State, held: Array) -> None:
 
 
 @inner
-def extend_row(
-    given: Array, shapes: Array, signs: Array, held: Array, row: Array
-) -> None:
+def extend_row(sample: Sample, held: Array, row: Array) -> None:
     """Write [X | u] (n, m + 1) with columns of b, then of k, to `row`."""
+    given, shapes, signs = sample.Xu, sample.shapes, sample.signs
     n = shapes.size
     m = row.shape[1] - 1 - 2 * n
     for i in range(n):
