@@ -22,11 +22,11 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import (
     disturbance,
-    learning,
+    joint_sensors,
     load_observer,
     motor_friction,
 )
-from blf_dsc_controller.law.load_observer import Settings, State, Work
+from blf_dsc_controller.law.load_observer import Links, Settings, State, Work
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.runs import run_chunk
 from blf_dsc_controller.supervision.calming import softened
@@ -47,6 +47,11 @@ THETA = np.array([1.0, -2.0, 0.75, 5.0])
 LINKS = THETA[:P] - SETTINGS.rotors
 NOTHING = np.zeros(P)
 CERTAIN = np.diag([1e6] * M)  # 1e-3 of each parameter
+
+
+def links(theta, absorbed=NOTHING):
+    """What is learned of the links, for theta^."""
+    return Links(theta, SETTINGS.rotors, absorbed)
 
 
 def new(settings=SETTINGS):
@@ -71,7 +76,8 @@ def run(
         sensed = effort(k * DT) if callable(effort) else effort
         for i in range(N):
             load_observer.filter_interval(settings, state, i, X[i], sensed[i], DT)
-        load_observer.update(settings, state, work, theta, absorbed, information, DT)
+        now = links(theta, absorbed)
+        load_observer.update(settings, state, work, now, information, DT)
     return state.torque.copy()
 
 
@@ -112,8 +118,7 @@ def test_r_is_the_load_of_a_known_mass_on_an_arm_at_rest():
                 settings.observer,
                 state,
                 work,
-                theta,
-                np.zeros(settings.p),
+                Links(theta, settings.observer.rotors, np.zeros(settings.p)),
                 settings.information,
                 DT,
             )
@@ -156,7 +161,7 @@ def test_what_is_learned_fades_from_r_and_changes_no_torque():
     d3 = np.array([1.0, 2.0])
     before, after = THETA.copy(), THETA + learned
     disturbance.transfer_learned(d3, X, after, before)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(before))
     r = run(state, work, sensed, DT, theta=after)
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
@@ -177,8 +182,8 @@ def test_what_d3_gives_up_only_since_r_is_late_fades():
     d3 = np.array([1.0, 2.0])
     torque = r + d3 + H @ before
     disturbance.transfer_learned(d3, H, after, before)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
-    load_observer.hand_over(SETTINGS, state, d3, H, after, before)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(before))
+    load_observer.hand_over(SETTINGS, state, d3, H, links(after), links(before))
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
     r = run(state, work, sensed, DT, theta=after)
     late = H[:, :P] @ learned[:P] - X[:, :P] @ learned[:P]
@@ -195,7 +200,8 @@ def test_r_that_is_left_out_hands_nothing_over():
     run(state, work, X[:, :P] @ LINKS, 1.0)
     state.faded[0] = 1.0
     d3 = np.zeros(N)
-    load_observer.hand_over(SETTINGS, state, d3, 2.0 * X, THETA + 1.0, THETA)
+    after, before = links(THETA + 1.0), links(THETA)
+    load_observer.hand_over(SETTINGS, state, d3, 2.0 * X, after, before)
     np.testing.assert_array_equal(d3, 0.0)
 
 
@@ -220,7 +226,7 @@ def test_calmed_r_gives_up_at_once_what_is_learned():
     d3 = np.zeros(N)
     after = THETA + learned
     disturbance.transfer_learned(d3, X, after, THETA)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, THETA, NOTHING, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(THETA))
     r = run(state, work, sensed, DT, theta=after)
     np.testing.assert_allclose(r, 0.0, atol=1e-6)
     np.testing.assert_allclose(d3, 0.0, atol=1e-6)
@@ -243,7 +249,7 @@ def test_friction_is_sensed_once_sensors_are_read_and_while_they_are_trusted(
     state.faded[0] = faded
     motors = SimpleNamespace(rows=np.array([rows]))
     given = SimpleNamespace(observer=state, motors=motors)
-    assert learning.senses_friction(settings, given) == senses
+    assert joint_sensors.shows_friction(settings, given) == senses
 
 
 def test_readings_are_missing_if_one_is():
@@ -294,7 +300,7 @@ def test_r_takes_over_what_is_learned_no_longer_beyond_its_limit_until_it_needs_
     torque = X @ before + run(state, work, sensed, 1.0, theta=before)
     d3 = np.zeros(N)
     disturbance.transfer_learned(d3, X, after, before)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(before))
     r = run(state, work, sensed, DT)
     np.testing.assert_allclose(d3, 0.0, atol=1e-9)
     np.testing.assert_allclose(X @ after + r, torque, rtol=1e-9)
@@ -310,8 +316,8 @@ def test_r_that_is_left_out_takes_nothing_over(left_out):
     run(state, work, X[:, :P] @ LINKS, 0.01)
     state.faded[0] = float(left_out == 'faded')
     d3, before = np.zeros(N), THETA + np.array([0.0, 20.0, 20.0, 0.0])
-    load_observer.transfer_learned(SETTINGS, state, d3, THETA, before, NOTHING, NOTHING)
-    load_observer.transfer_learned(SETTINGS, state, d3, before, THETA, NOTHING, NOTHING)
+    for now, earlier in ((THETA, before), (before, THETA)):
+        load_observer.transfer_learned(SETTINGS, state, d3, links(now), links(earlier))
     np.testing.assert_array_equal(state.over, 0.0)
     np.testing.assert_array_equal(d3, 0.0)
 
@@ -320,7 +326,7 @@ def test_observer_that_is_off_takes_nothing_over():
     off = SETTINGS._replace(most=np.zeros(N))
     state, work = settled(off)
     d3 = np.zeros(N)
-    load_observer.transfer_learned(off, state, d3, THETA, THETA + 1.0, NOTHING, NOTHING)
+    load_observer.transfer_learned(off, state, d3, links(THETA), links(THETA + 1.0))
     np.testing.assert_array_equal(d3, 0.0)
     np.testing.assert_array_equal(run(state, work, [9.0, 9.0], 0.5, settings=off), 0.0)
 
@@ -377,7 +383,8 @@ def test_torque_is_the_same_while_it_becomes_known_what_is_absorbed():
     sensed = X[:, :P] @ LINKS + [1.0, 0.5]
     before = run(state, work, sensed, 1.0)
     share, d3 = np.array([0.05, 0.1, 0.0]), np.zeros(N)
-    load_observer.transfer_learned(SETTINGS, state, d3, THETA, THETA, share, NOTHING)
+    now = links(THETA, share)
+    load_observer.transfer_learned(SETTINGS, state, d3, now, links(THETA))
     after = run(state, work, sensed, DT, absorbed=share)
     assert np.abs(after - before).max() > 0.1
     np.testing.assert_allclose(after + d3, before, atol=1e-9)
@@ -397,7 +404,7 @@ def test_torque_is_the_same_while_the_law_lets_what_is_absorbed_follow():
     now = SimpleNamespace(
         observer=state, motors=absorbed, disturbance=np.zeros(N), estimate=THETA
     )
-    learning.follow_absorbed(
+    joint_sensors.follow_absorbed(
         SimpleNamespace(observer=SETTINGS, adaptation=gains),
         now,
         SimpleNamespace(motors=scratch),

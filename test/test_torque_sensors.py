@@ -152,7 +152,7 @@ def off(difference, speed, seconds):
     state, work = new()
     for _ in range(round(seconds / DT)):
         work.differences[0] = difference
-        now = torque_sensors.follow_commands(state, work, LIMIT, speed, MOVES, DT)
+        now = torque_sensors.watch_following(state, work, LIMIT, speed, MOVES, DT)
     return state.fault[0], now
 
 
