@@ -440,21 +440,21 @@ class Controller:
         """Whether the external torque is found, and the arm has rested for long enough."""
         if not self.settings.contact.enabled:
             return False
-        return bool(self.state.contact.resting[0] >= self.tare_rest)
+        return bool(self.state.external.resting[0] >= self.tare_rest)
 
     @property
     def tare_rest(self) -> float:
         """How long an arm rests before a tare [s]."""
-        return external_torque.settling_time(self.settings.contact)
+        return external_torque.settling_time(self.settings.external)
 
     @property
     def is_tared(self) -> bool:
         """Whether a tare is in force."""
-        return bool(self.state.contact.tared[0])
+        return bool(self.state.external.tared[0])
 
     def tare(self) -> None:
         """Take the external torque of an arm at rest for zero: see `external_torque`."""
-        external_torque.tare(self.state.contact, self.state.change.changes[0])
+        external_torque.tare(self.state.external, self.state.change.changes[0])
 
     def take_over(self, torque: Array, q: Array) -> None:
         """Continue from a command (n,) [N m] that acts on an arm at q (n,) [rad].

@@ -157,7 +157,7 @@ def filter_external_torque(
             settings.friction, state.friction, state.estimate, i
         )
         external_torque.filter_interval(
-            settings.contact, state.contact, i, signals.row.Xu[i], extra, dt
+            settings.external, state.external, i, signals.row.Xu[i], extra, dt
         )
 
 

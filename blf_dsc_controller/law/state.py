@@ -22,6 +22,7 @@ from blf_dsc_controller.law import (
     barrier,
     change,
     columns,
+    contact,
     disturbance,
     excitation,
     external_torque,
@@ -76,7 +77,8 @@ class Settings(NamedTuple):
     window: window.Settings
     excitation: excitation.Settings
     adaptation: adaptation.Settings
-    contact: external_torque.Settings
+    external: external_torque.Settings
+    contact: contact.Settings
     friction: friction.Settings
     rotors: apparent_inertia.Settings
     weighing: weighing.Settings
@@ -99,7 +101,8 @@ class State(NamedTuple):
     sensors: torque_sensors.State
     latch: excitation.State
     change: change.State
-    contact: external_torque.State
+    external: external_torque.State
+    contact: contact.State
     friction: friction.State
     rotors: apparent_inertia.State
     weighing: weighing.State
@@ -150,7 +153,8 @@ class Signals(NamedTuple):
     latch: excitation.Work
     change: change.Work
     adaptation: adaptation.Work
-    contact: external_torque.Work
+    external: external_torque.Work
+    contact: contact.Work
     friction: friction.Work
     rotors: apparent_inertia.Work
     weighing: weighing.Work
