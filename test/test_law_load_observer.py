@@ -407,7 +407,7 @@ def test_torque_is_the_same_while_the_law_lets_what_is_absorbed_follow():
     joint_sensors.follow_absorbed(
         SimpleNamespace(observer=SETTINGS, adaptation=gains),
         now,
-        SimpleNamespace(motors=scratch),
+        SimpleNamespace(scratch=SimpleNamespace(motors=scratch)),
         DT,
     )
     np.testing.assert_allclose(absorbed.absorbed, absorbed.solution)

@@ -35,7 +35,9 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
     for i in range(settings.n):
         load_observer.filter_interval(of, now, i, row[i], signals.effort[i], dt)
     links = Links(state.estimate, of.rotors, state.motors.absorbed)
-    load_observer.update(of, now, signals.observer, links, settings.information, dt)
+    load_observer.update(
+        of, now, signals.scratch.observer, links, settings.information, dt
+    )
     motor_friction.pass_poles(settings.motors, state.motors, now.late, dt)
     torque_sensors.follow_applied(
         state.sensors, row, settings.m, of.observer_bandwidth, dt
@@ -115,7 +117,7 @@ def follow_absorbed(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Let P_f follow, as P^ does; d^3 takes what r loses."""
-    now, work = state.motors, signals.motors
+    now, work = state.motors, signals.scratch.motors
     of, rotors = settings.adaptation, settings.observer.rotors
     motor_friction.follow(now, work, of.weight, of.adaptation_gain, dt)
     load_observer.transfer_learned(

@@ -77,12 +77,12 @@ def check_excitation(
     settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
     """Latch the window at time t [s] if it suffices."""
-    sliding = Window(settings.window, state.window, signals.window)
+    sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.initial_estimate, settings.information)
     excitation.update_excitation(
         settings.excitation,
         state.latch,
-        signals.latch,
+        signals.scratch.latch,
         sliding,
         prior,
         settings.model,
@@ -95,7 +95,7 @@ def check_excitation(
         motor_friction.solve(
             settings.motors,
             state.motors,
-            signals.motors,
+            signals.scratch.motors,
             settings.information,
         )
 
@@ -220,12 +220,12 @@ def detect_change(
     of friction, only what reversals have shown of late is taken back.
     """
     of, latch, row = settings.excitation, state.latch, signals.row.Xu
-    sliding = Window(settings.window, state.window, signals.window)
+    sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.initial_estimate, settings.row_information)
     if change.is_predicted(sliding):
         has_changed = change.compare_with_rows(
             state.change,
-            signals.change,
+            signals.scratch.change,
             sliding,
             prior,
             row,
@@ -236,7 +236,7 @@ def detect_change(
         )
     else:
         has_changed = change.compare_with_solution(
-            of, state.change, signals.change, latch, row, dt
+            of, state.change, signals.scratch.change, latch, row, dt
         )
     if not has_changed:
         return
@@ -260,7 +260,7 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
     friction of the sensors, if there are any.
     """
     senses = joint_sensors.shows_friction(settings, state)
-    before = signals.adaptation.tracked  # scratch here
+    before = signals.scratch.adaptation.tracked  # scratch here
     for j in range(settings.m):
         before[j] = state.estimate[j]
         is_sensed = senses and settings.p <= j < settings.motors.size
@@ -297,7 +297,7 @@ def adapt(
             follow_disturbance(settings, state, signals, dt)
         transfer_friction(settings, state, signals)
         return
-    of, work = settings.adaptation, signals.adaptation
+    of, work = settings.adaptation, signals.scratch.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
     adaptation.fill_prediction_error(of, work, latch, estimate)
     if latch.latched[0] == 1.0:
@@ -354,7 +354,7 @@ def follow_disturbance(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF."""
-    work = signals.disturbance
+    work = signals.scratch.disturbance
     disturbance.fill_step(
         settings.disturbance, work, state.disturbance, signals.xi2, dt
     )
@@ -370,7 +370,7 @@ def scale_by_inertia(
     settings: Settings, state: State, signals: Signals, x: Array
 ) -> None:
     """Replace x (n,) by (M(q, P^(0)) + J~) x / m."""
-    momentum = signals.momentum
+    momentum = signals.scratch.momentum
     for i in range(settings.n):
         x[i] /= settings.joint_inertia[i]
     settings.model.momentum_regressor(signals.q, x, momentum.Yp, momentum.Yr)

@@ -70,7 +70,7 @@ def update_external_torque(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> float:
     """Find r of the last sample and whether it is a contact; return its distance from none."""
-    part, now, work = settings.external, state.external, signals.external
+    part, now, work = settings.external, state.external, signals.scratch.external
     update_covariance(settings, state)
     fill_coulomb(settings, state, work.coulomb)
     external_torque.update_torque(now, state.estimate)
@@ -95,10 +95,10 @@ def update_contact(
     tip = settings.weighing
     mass, deviation = weighing.held_mass(state.weighing)
     load = TipLoad(tip.columns, tip.scale, mass, deviation)
-    r, white = state.external, signals.external.white
+    r, white = state.external, signals.scratch.external.white
     seen = Seen(r.filtered, r.spread, white, distance)
     return contact.update(
-        settings.contact, state.contact, signals.contact, seen, load, dt
+        settings.contact, state.contact, signals.scratch.contact, seen, load, dt
     )
 
 
@@ -111,7 +111,7 @@ def fill_sample(
     sample: Sample,
 ) -> None:
     """Write r with its interval, and the contact, to the telemetry sample."""
-    now, work = state.external, signals.external
+    now, work = state.external, signals.scratch.external
     for i in range(now.torque.size):
         sample.external[i] = now.torque[i]
         deviation = sqrt(external_torque.variance_of(settings.external, now, work, i))
@@ -163,7 +163,7 @@ def fill_breakaway(settings: Settings, state: State, signals: Signals) -> None:
     """Compute the shapes of breakaway, filtered and weighted as the row."""
     for i in range(settings.n):
         weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        signals.weighing.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
+        signals.scratch.weighing.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
 
 
 @kernel
@@ -184,11 +184,11 @@ def weigh(
     weighing.add_row(
         settings.weighing,
         state.weighing,
-        signals.weighing,
+        signals.scratch.weighing,
         Prior(settings.initial_estimate, settings.row_information),
         weighing.Sample(
             signals.row.Xu,
-            signals.weighing.shapes,
+            signals.scratch.weighing.shapes,
             state.friction.shape_lags[0, 2],
             signals.dqr,
             int(state.samples[0]),
