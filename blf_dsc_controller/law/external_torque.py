@@ -323,11 +323,11 @@ def whiten_torque(state: State, work: Work) -> float:
 
 @inner
 def is_settled(state: State, dt: float) -> bool:
-    """Whether theta^ has settled since the first window, and s^2 is measured."""
+    """Whether theta^ has settled since the first window, from which on s^2 is measured."""
     seen = 0.0
     for k in range(3):
         seen += state.samples[k, 0]
-    return bool(state.latch_time[0] > 0.0 and seen * dt >= _FIRST)
+    return bool(seen * dt >= _FIRST)
 
 
 @inner
