@@ -31,6 +31,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
+from blf_dsc_controller.law.innovation import LATE
 from blf_dsc_controller.law.lag import filter_gain
 
 _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
@@ -38,7 +39,6 @@ _SHOWN = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its frictio
 _PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
-_LATE = 0.15  # s, by which a change of the arm is found
 _NEAR = 0.1  # s around a reversal in which its torque is compared with friction's
 _USUAL = 4.0  # s, of what is away from reversals: its noise
 _CHANCE = 2.0  # times its mean square
@@ -86,7 +86,7 @@ class State(NamedTuple):
     """What it keeps from one row to the next."""
 
     shown: Shown
-    earlier: Shown  # some `_LATE` ago or less
+    earlier: Shown  # some `LATE` ago or less
     earliest: Shown  # one to two times as long ago
     since_kept: Cell  # s
     # p int of s_h^2, e_h^2 [(N m)^2] and 1 dt, faded by `_NEAR`
@@ -293,9 +293,9 @@ def learned(
 
 @inner
 def keep(state: State, dt: float) -> None:
-    """Keep what reversals have shown, each `_LATE`, and what was kept before; `dt` [s] later."""
+    """Keep what reversals have shown, each `LATE`, and what was kept before; `dt` [s] later."""
     state.since_kept[0] += dt
-    if state.since_kept[0] > _LATE:
+    if state.since_kept[0] > LATE:
         state.since_kept[0] = 0.0
         copy(state.earlier, state.earliest)
         copy(state.shown, state.earlier)

@@ -17,7 +17,7 @@ The rows before are those of the first window, or of less if they contradict eac
 weighed, too.  Where later rows contradict the solution, something else is held.  If
 what was held until then is clearly less than nothing, the arm held a load before: what
 is lightest is taken for nothing.  If it was nothing, its rows are added to those before
-until they make a window.  Rows are kept apart until they are 0.15 to 0.3 s old, so that
+until they make a window.  Rows are kept apart for `innovation.LATE`, and then once more, so that
 those of a change that has not been found yet can be discarded.
 
 Rows of slow joints count little, since they may stick.  Friction must not be taken for a load,
@@ -48,8 +48,6 @@ from blf_dsc_controller.law.prediction import SETTLED, moving_share, moving_squa
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _FEWEST = 0.5  # s of motion that a part has
-# s, for which the latest rows are kept apart, and then those of them again
-_APART = 0.15
 _CHANGING = 20.0  # s, until the variance of e has grown
 # rad/s or m/s, below which friction is least like its columns, and rows count less
 _SLOW = 0.1
@@ -167,7 +165,7 @@ def refresh(
     """Use the rows that are old enough, and solve for the load, each when it is due."""
     if is_first(state) and rows_before(state) >= settings.window:
         state.complete[0] = 1.0
-    if rows % max(1, round(_APART / period)) == 0:
+    if rows % max(1, round(innovation.LATE / period)) == 0:
         promote(settings, state)
     if rows % max(1, round(innovation.REFRESH / period)) == 0:
         solve(settings, state, work, prior, period)
