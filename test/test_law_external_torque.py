@@ -71,6 +71,7 @@ def test_distance_is_that_of_the_covariance_by_theta_and_noise(state):
     factor = A.copy()
     cholesky_factor(factor)
     external_torque.update_covariance(state, factor, 0.04, 7.0)
+    assert state.latch_time[0] == 7.0
     state.filtered[:, :M] = X
     state.noise[:] = [[0.3, 0.2], [5.0, 6.0], [8.0, 9.0]]  # fast, slow, at rest
     state.reversing[1] = 0.1
@@ -139,6 +140,28 @@ def test_noise_is_a_mean_at_first_and_that_of_the_last_window_later(state):
     for _ in range(window):
         update_noise(state, work)
     assert state.noise[0, 0] == pytest.approx(1.0 + (mean - 1.0) / np.e, rel=1e-3)
+
+
+def test_noise_is_what_the_covariance_by_theta_leaves_up_to_four_times_what_it_was(
+    state,
+):
+    """A hundredth of a window is assumed, and a tenth of slow motion and rest.
+
+    They count for one window, and for four.
+    """
+    window = SETTINGS.window * SETTINGS.row_interval
+    state.covariance[:] = np.diag([0.1, 0.1])
+    for k, (slow, resting) in enumerate(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))):
+        state.reversing[:], state.resting[0] = slow, resting
+        assumed = (0.01, 0.1, 0.1)[k] * window
+        last = (1.0, 4.0, 4.0)[k] * window
+        for r, left in ((0.5, 0.15), (0.2, 0.0), (9.0, 1.2)):
+            for samples, count in ((0.0, assumed + 1.0), (9.0 * window, last)):
+                state.noise[:], state.samples[:] = 0.3, samples
+                state.torque[:] = r
+                update_noise(state, part(Work))
+                expected = 0.3 + (left - 0.3) / count
+                np.testing.assert_allclose(state.noise[k], expected, rtol=1e-9)
 
 
 def test_noise_is_measured_from_the_first_window_on(state):
@@ -233,6 +256,16 @@ def test_tare_is_zero_where_the_arm_rests(tared):
         np.sqrt(external_torque.variance_of(SETTINGS, state, work, i)) for i in range(N)
     ]
     np.testing.assert_allclose(deviations, 0.1 * SETTINGS.unmodelled)  # the least
+
+
+def test_tare_after_a_tare_is_of_the_whole_torque(state):
+    state.filtered[:, M] = -3.0, 1.0
+    for u in ([-3.0, 1.0], [-5.0, 4.0]):
+        state.filtered[:, M] = u
+        external_torque.update_torque(state, np.zeros(M))
+        external_torque.tare(state, 0.0)
+        external_torque.update_torque(state, np.zeros(M))
+        np.testing.assert_allclose(state.torque, 0.0, atol=1e-12)
 
 
 def test_tare_says_of_r_what_their_covariance_says(tared):

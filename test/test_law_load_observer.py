@@ -182,8 +182,9 @@ def test_what_d3_gives_up_only_since_r_is_late_fades():
     d3 = np.array([1.0, 2.0])
     torque = r + d3 + H @ before
     disturbance.transfer_learned(d3, H, after, before)
-    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(before))
-    load_observer.hand_over(SETTINGS, state, d3, H, links(after), links(before))
+    motors = SimpleNamespace(absorbed=NOTHING)
+    law = SimpleNamespace(observer=state, disturbance=d3, estimate=after, motors=motors)
+    joint_sensors.transfer_learned(SimpleNamespace(observer=SETTINGS), law, H, before)
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
     r = run(state, work, sensed, DT, theta=after)
     late = H[:, :P] @ learned[:P] - X[:, :P] @ learned[:P]
@@ -310,6 +311,41 @@ def test_r_takes_over_what_is_learned_no_longer_beyond_its_limit_until_it_needs_
         assert r[1] == pytest.approx(shown, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ('shown', 'before', 'over', 'expected'),
+    [
+        (60.0, 50.0, 0.0, 10.0),  # only what was learned before: 10 of 20 N m
+        (-60.0, 50.0, 0.0, 10.0),
+        (60.0, 50.0, 12.0, 20.0),  # no more than is beyond 40 N m
+        (50.0, 60.0, 5.0, 5.0),  # more has been learned
+        (30.0, 10.0, 0.0, 0.0),  # it is within the limit
+    ],
+)
+def test_r_takes_over_no_more_than_was_learned(shown, before, over, expected):
+    state, _ = settled()
+    state.over[0] = over
+    load_observer.take_over(SETTINGS, state, 0, shown, before)
+    assert state.over[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ('shown', 'faded', 'over', 'expected'),
+    [
+        (30.0, 0.0, 0.0, 30.0),
+        (-90.0, 0.0, 0.0, -40.0),
+        (90.0, 0.0, 10.0, 50.0),
+        (90.0, 0.5, 10.0, 25.0),  # half of what is within the limit
+        (90.0, 1.0, 10.0, 0.0),
+    ],
+)
+def test_r_is_what_is_shown_within_its_limit_and_the_share_that_is_trusted(
+    shown, faded, over, expected
+):
+    state, _ = settled()
+    state.over[0], state.faded[0] = over, faded
+    assert load_observer.load_torque(SETTINGS, state, 0, shown) == expected
+
+
 @pytest.mark.parametrize('left_out', ['unsettled', 'faded'])
 def test_r_that_is_left_out_takes_nothing_over(left_out):
     state, work = new() if left_out == 'unsettled' else settled()
@@ -345,6 +381,24 @@ def test_offset_of_a_sensor_stays_out_of_r():
     np.testing.assert_allclose(r, [4.0 + 3.0 * exp(-4.0), 0.0], atol=1e-3)
 
 
+@pytest.mark.parametrize('f', [0.2, 0.5, 2.0])
+@pytest.mark.parametrize('prior', [1e-6, 0.01])  # variance of each parameter
+def test_bias_is_kept_beyond_three_deviations_of_prior_and_unmodelled_torque(f, prior):
+    settings = SETTINGS._replace(unmodelled=np.full(N, f))
+    information = np.eye(M) / prior
+    for i in range(N):
+        deviation = np.sqrt(prior * X[i, :P] @ X[i, :P] + f**2)
+        for sigmas in (2.9, 3.1, -2.9, -3.1):
+            state, work = new(settings)
+            state.filtered[:, :P] = X[:, :P]
+            state.filtered[:, P] = X[:, :P] @ LINKS
+            state.filtered[i, P] += sigmas * deviation
+            load_observer.find_bias(settings, state, work, links(THETA), information)
+            assert state.bias[i] == pytest.approx(sigmas * deviation)
+            assert state.keeps_bias[i] == float(abs(sigmas) > 3.0)
+            assert state.keeps_bias[1 - i] == 0.0
+
+
 def test_what_the_prior_explains_comes_into_r_without_a_step():
     """The model may be 1 N m off; r begins at zero 4 / L after the start."""
     state, work = new()
@@ -360,7 +414,10 @@ def test_what_the_prior_explains_comes_into_r_without_a_step():
 
 def test_law_that_continues_with_its_disturbance_does_not_have_it_twice():
     state, work = new()
+    load_observer.begin(state, np.zeros(N))
+    assert state.keeps_bias.tolist() == [0.0, 0.0]
     load_observer.begin(state, np.array([0.0, 2.0]))
+    assert state.keeps_bias.tolist() == [1.0, 1.0]  # of all joints
     sensed = X[:, :P] @ LINKS + [0.0, 2.0]
     r = run(state, work, sensed, 2.0, information=np.eye(M))
     np.testing.assert_allclose(r, [0.0, 2.0 * exp(-4.0)], atol=1e-3)
