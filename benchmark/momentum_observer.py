@@ -50,7 +50,7 @@ class MomentumObserver(NamedTuple):
         """Write the torque to `signals.demand`."""
         memory = memory_of(state.memory, settings)
         P0, H = settings.initial_estimate, signals.H
-        Yp, Yr = signals.momentum.Yp, signals.momentum.Yr
+        Yp, Yr = signals.scratch.momentum.Yp, signals.scratch.momentum.Yr
         q, dq, dqr = signals.q, signals.dq, signals.dqr
         settings.model.regressor(q, dq, dqr, signals.ddqr, H)
         settings.model.momentum_regressor(q, dq, Yp, Yr)

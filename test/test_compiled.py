@@ -61,8 +61,8 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.control import arm_controller
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import called_law
-from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.laws import for_law
+from blf_dsc_controller.law.step import update
 from blf_dsc_controller.numerics import elementary
 from blf_dsc_controller.numerics.algebra import independent_columns, inverse, product
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
@@ -83,7 +83,7 @@ def sources(*names):
 
 
 LAW = sources(
-    'law/barrier', 'law/prediction', 'law/controller', 'law/state', 'reference/terms'
+    'law/barrier', 'law/prediction', 'law/step', 'law/state', 'reference/terms'
 )
 PLANT = {f'sim_plant/{name}.py' for name in ('arm', 'kernels', 'motion')}
 ALWAYS = sources('compiled/layout', 'arms/two_link')
@@ -153,7 +153,7 @@ def test_kernel_of_a_law_depends_on_its_file_and_on_no_other_law(monkeypatch):
 
 FOLDERS = """
 from blf_dsc_controller.compiled import kernel_cache
-from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.law.step import update
 from blf_dsc_controller.law.perception import weigh
 from blf_dsc_controller.simulation.compiled_loop import run_loop
 from sim_plant.kernels import run_plant
@@ -491,7 +491,7 @@ from blf_dsc_controller.cli import run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.law.controller import update
+from blf_dsc_controller.law.step import update
 from sim_plant.kernels import run_plant
 
 if __name__ == '__main__':  # the command has processes of its own

@@ -23,7 +23,7 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError, TareError
 from blf_dsc_controller.factory.controller import controller_of
-from blf_dsc_controller.law.external_torque import absorb
+from blf_dsc_controller.law.contact import absorb
 from blf_dsc_controller.law.perception import CONTACT
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages import topics

@@ -149,7 +149,9 @@ def test_column_rejected_at_rest_is_readmitted_in_motion():
 def sliding_of(controller):
     """The sliding window of a controller."""
     return window.Window(
-        controller.settings.window, controller.state.window, controller.signals.window
+        controller.settings.window,
+        controller.state.window,
+        controller.signals.scratch.window,
     )
 
 
@@ -171,7 +173,7 @@ def accept(controller):
     return excitation.accept_window(
         settings.excitation,
         controller.state.latch,
-        controller.signals.latch,
+        controller.signals.scratch.latch,
         sliding_of(controller),
         prior_of(settings),
         settings.model,
@@ -327,13 +329,13 @@ def test_window_is_latched_up_to_four_times_the_least_residual(
     """An unusual residual pulls it to the anchor, by 3 (r^2 - 1.25 r^2_least) R."""
     controller, residual = learned
     signals = controller.signals
-    before = np.diag(signals.window.Phi).copy()
+    before = np.diag(signals.scratch.window.Phi).copy()
     controller.state.latch.least_residual[0] = residual / ratio
     assert accept(controller) == accepted
     information = np.diag(controller.settings.information)
     expected = 3.0 * (1.0 - 1.25 / ratio) * residual * information * pulled
     np.testing.assert_allclose(
-        np.diag(signals.window.Phi) - before, expected, rtol=1e-6, atol=1e-12
+        np.diag(signals.scratch.window.Phi) - before, expected, rtol=1e-6, atol=1e-12
     )
 
 

@@ -293,7 +293,7 @@ def test_erratum_3_integrand_belongs_to_the_integration_variable():
     ranks = set()
     for sample in closed_loop(printed, plant(), 8.0):
         if sample.k > 0 and sample.k % 10 == 0:
-            ranks.add(np.linalg.matrix_rank(printed.signals.window.Phi))
+            ranks.add(np.linalg.matrix_rank(printed.signals.scratch.window.Phi))
             assert abs(printed.state.latch.lambda_min[0]) < 1e-9
     list(closed_loop(corrected, plant(), 8.0))
     assert max(ranks) == 2

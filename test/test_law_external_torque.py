@@ -1,36 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of the external torque: its filter, covariance, phases, load and noise."""
+"""The parts of the external torque: its filter, covariance, tare and noise."""
 
 from __future__ import annotations
 
 from functools import partial
-from math import inf
+from types import SimpleNamespace
 
 import law_part
 import numpy as np
 import pytest
 
 from blf_dsc_controller.law import external_torque
-from blf_dsc_controller.law.external_torque import (
-    EXPLAINED,
-    QUIET,
-    TOUCHED,
-    Settings,
-    State,
-    TipLoad,
-    Work,
-    next_phase,
-)
+from blf_dsc_controller.law.external_torque import Settings, State, Work
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 
-H = 8.0  # threshold
 DT = 1e-3  # s
 SETTINGS = Settings(
-    enabled=1,
     bandwidth=30.0,
-    threshold=H,
-    loads=1,
-    freezes=1,
     window=500,
     row_interval=10,
     coulomb_velocity=0.02,
@@ -40,7 +26,12 @@ SETTINGS = Settings(
 N, M = 2, 3  # joints, entries of theta
 
 
-part = partial(law_part.part, n=N, m=M, contact=SETTINGS)
+part = partial(law_part.part, n=N, m=M, contact=SimpleNamespace(enabled=1))
+
+
+def update_noise(state, work, *, is_touched=False):
+    """Update s^2 by a sample."""
+    external_torque.update_noise(SETTINGS, state, work, is_touched)
 
 
 @pytest.fixture
@@ -51,82 +42,7 @@ def state():
     state.noise[:] = 1.0
     state.spread[:] = np.eye(N)
     cholesky_factor(state.spread)
-    external_torque.forget_load(state)
     return state
-
-
-@pytest.mark.parametrize(
-    ('phase', 'distance', 'remaining', 'calm', 'explained', 'expected'),
-    [
-        (QUIET, 0.9 * H, 0.9 * H, 9.0, 0.0, QUIET),
-        (QUIET, 1.1 * H, 1.1 * H, 0.0, 0.0, TOUCHED),  # no load explains it
-        (QUIET, 1.1 * H, 0.9 * H, 0.0, 0.0, EXPLAINED),
-        (EXPLAINED, 1.1 * H, 0.9 * H, 0.0, 0.0, EXPLAINED),
-        (EXPLAINED, 1.1 * H, 1.1 * H, 0.0, 0.0, TOUCHED),  # the load no longer does
-        (EXPLAINED, 0.9 * H, 0.9 * H, 0.001, 0.0, QUIET),
-        # a contact ends below half of the threshold, after 0.2 s
-        (TOUCHED, 0.6 * H, 0.6 * H, 0.0, 0.0, TOUCHED),
-        (TOUCHED, 0.4 * H, 0.4 * H, 0.19, 0.0, TOUCHED),
-        (TOUCHED, 0.4 * H, 0.4 * H, 0.21, 0.0, QUIET),
-        # or once a load has explained it for 0.5 s
-        (TOUCHED, 1.1 * H, 0.9 * H, 0.0, 0.49, TOUCHED),
-        (TOUCHED, 1.1 * H, 0.9 * H, 0.0, 0.51, EXPLAINED),
-        (TOUCHED, 1.1 * H, 1.1 * H, 0.0, 0.51, TOUCHED),
-    ],
-)
-def test_phase_follows_from_distances_and_times(
-    phase, distance, remaining, calm, explained, expected
-):
-    assert next_phase(phase, distance, remaining, calm, explained, H) == expected
-
-
-def update(state, r, load, seconds, settings=SETTINGS, dt=DT):
-    """Update the contact for some time of a constant r (n,)."""
-    work = part(Work)
-    state.torque[:] = r
-    for _ in range(round(seconds / dt)):
-        distance = external_torque.whiten_torque(state, work)
-        external_torque.update_contact(settings, state, work, load, distance, dt)
-
-
-def tip(mass, deviation):
-    """A load of z_0 kg that pulls joint 0 by 10 N m per kg, in theta_0."""
-    columns = np.zeros((M + 1, 10))
-    columns[0, 0] = 10.0
-    scale = np.zeros((4, 10))
-    scale[0, 0] = 1.0
-    return TipLoad(columns, scale, mass, deviation)
-
-
-@pytest.mark.parametrize(
-    ('mass', 'deviation', 'pull', 'expected'),
-    [
-        (0.0, 0.0, -10.0, EXPLAINED),  # 1 kg is picked up
-        (0.0, 0.0, 10.0, TOUCHED),  # no load is lighter than nothing
-        (2.0, 0.1, 10.0, EXPLAINED),  # 1 of 2 kg is put down
-        (0.2, 0.1, 10.0, TOUCHED),  # 1 of 0.2 kg, eight deviations less than nothing
-        (0.8, 0.1, 10.0, EXPLAINED),  # two deviations less
-        (0.0, inf, 10.0, EXPLAINED),  # it is unknown what is held
-    ],
-)
-def test_load_explains_no_more_than_is_held(state, mass, deviation, pull, expected):
-    """z_0 goes to 1 or -1, and the mass with it, within 2 s: 10 filters of 0.2 s."""
-    state.filtered[0, 0] = 1.0
-    update(state, [pull, 0.0], tip(mass, deviation), 2.0, dt=5.0 * DT)
-    assert state.phase[0] == expected
-    loads = SETTINGS._replace(loads=0)
-    update(state, [pull, 0.0], tip(mass, deviation), DT, loads)
-    assert external_torque.is_touched(state)
-
-
-def test_force_that_no_load_explains_is_a_contact_until_it_ends(state):
-    state.filtered[0, 0] = 1.0
-    update(state, [0.0, 10.0], tip(0.0, 0.0), DT)
-    assert external_torque.is_touched(state)
-    update(state, [0.0, 0.0], tip(0.0, 0.0), 0.19)
-    assert external_torque.is_touched(state)
-    update(state, [0.0, 0.0], tip(0.0, 0.0), 0.02)
-    assert not external_torque.is_touched(state)
 
 
 def test_arm_with_friction_at_breakaway_alone_has_no_external_torque():
@@ -153,6 +69,7 @@ def test_distance_is_that_of_the_covariance_by_theta_and_noise(state):
     factor = A.copy()
     cholesky_factor(factor)
     external_torque.update_covariance(state, factor, 0.04, 7.0)
+    assert state.latch_time[0] == 7.0
     state.filtered[:, :M] = X
     state.noise[:] = [[0.3, 0.2], [5.0, 6.0], [8.0, 9.0]]  # fast, slow, at rest
     state.reversing[1] = 0.1
@@ -192,16 +109,15 @@ def test_joint_counts_as_reversing_until_its_filter_has_settled():
     assert external_torque.regime(SETTINGS, state, 0) == 0
 
 
-@pytest.mark.parametrize('phase', [QUIET, EXPLAINED, TOUCHED])
-def test_noise_is_measured_while_nothing_touches(state, phase):
+@pytest.mark.parametrize('is_touched', [False, True])
+def test_noise_is_measured_while_nothing_touches(state, is_touched):
     """The mean square of r = 0.5 N m, within 10 % after a window: e^-1 of 1 % is assumed."""
     state.noise[:] = 0.3
-    state.phase[0] = phase
     state.torque[:] = 0.5
     work = part(Work)
     for _ in range(SETTINGS.window * SETTINGS.row_interval):
-        external_torque.update_noise(SETTINGS, state, work)
-    expected = 0.3 if phase == TOUCHED else pytest.approx(0.25, rel=0.1)
+        update_noise(state, work, is_touched=is_touched)
+    expected = 0.3 if is_touched else pytest.approx(0.25, rel=0.1)
     assert state.noise[0, 0] == expected
     assert state.noise[1, 0] == 0.3  # of reversals
 
@@ -214,24 +130,46 @@ def test_noise_is_a_mean_at_first_and_that_of_the_last_window_later(state):
     state.torque[:] = 0.5
     assumed, few = 0.01 * window, window // 10
     for _ in range(few):
-        external_torque.update_noise(SETTINGS, state, work)
+        update_noise(state, work)
     mean = (assumed * 0.9 + few * 0.25) / (assumed + few)
     assert state.noise[0, 0] == pytest.approx(mean)
     state.samples[:] = 10.0 * window
     state.torque[:] = 1.0
     for _ in range(window):
-        external_torque.update_noise(SETTINGS, state, work)
+        update_noise(state, work)
     assert state.noise[0, 0] == pytest.approx(1.0 + (mean - 1.0) / np.e, rel=1e-3)
+
+
+def test_noise_is_what_the_covariance_by_theta_leaves_up_to_four_times_what_it_was(
+    state,
+):
+    """A hundredth of a window is assumed, and a tenth of slow motion and rest.
+
+    They count for one window, and for four.
+    """
+    window = SETTINGS.window * SETTINGS.row_interval
+    state.covariance[:] = np.diag([0.1, 0.1])
+    for k, (slow, resting) in enumerate(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))):
+        state.reversing[:], state.resting[0] = slow, resting
+        assumed = (0.01, 0.1, 0.1)[k] * window
+        last = (1.0, 4.0, 4.0)[k] * window
+        for r, left in ((0.5, 0.15), (0.2, 0.0), (9.0, 1.2)):
+            for samples, count in ((0.0, assumed + 1.0), (9.0 * window, last)):
+                state.noise[:], state.samples[:] = 0.3, samples
+                state.torque[:] = r
+                update_noise(state, part(Work))
+                expected = 0.3 + (left - 0.3) / count
+                np.testing.assert_allclose(state.noise[k], expected, rtol=1e-9)
 
 
 def test_noise_is_measured_from_the_first_window_on(state):
     state.latch_time[0] = 0.0
-    external_torque.update_noise(SETTINGS, state, part(Work))
+    update_noise(state, part(Work))
     assert not state.samples.any()
     state.latch_time[0] = 1.0
     assert not external_torque.is_settled(state, DT)
     for _ in range(500):  # 0.5 s
-        external_torque.update_noise(SETTINGS, state, part(Work))
+        update_noise(state, part(Work))
     assert external_torque.is_settled(state, DT)
 
 
@@ -271,7 +209,7 @@ def test_noise_of_slow_motion_and_rest_is_at_least_a_share_of_friction(
     state.noise[:] = 1e-9
     work = part(Work)
     work.coulomb[:] = 10.0
-    external_torque.update_noise(SETTINGS, state, work)
+    update_noise(state, work)
     k = external_torque.regime(SETTINGS, state, 0)
     assert np.sqrt(state.noise[k, 0]) == pytest.approx(least)
 
@@ -318,6 +256,16 @@ def test_tare_is_zero_where_the_arm_rests(tared):
     np.testing.assert_allclose(deviations, 0.1 * SETTINGS.unmodelled)  # the least
 
 
+def test_tare_after_a_tare_is_of_the_whole_torque(state):
+    state.filtered[:, M] = -3.0, 1.0
+    for u in ([-3.0, 1.0], [-5.0, 4.0]):
+        state.filtered[:, M] = u
+        external_torque.update_torque(state, np.zeros(M))
+        external_torque.tare(state, 0.0)
+        external_torque.update_torque(state, np.zeros(M))
+        np.testing.assert_allclose(state.torque, 0.0, atol=1e-12)
+
+
 def test_tare_says_of_r_what_their_covariance_says(tared):
     """The conditional mean and covariance of Gaussian r given r_0, as numpy finds it."""
     state, estimate, A, X_0 = tared
@@ -354,6 +302,6 @@ def test_rest_after_a_tare_says_nothing_of_the_noise(tared):
     state.torque[:] = 3.0
     for resting in (1.0, 0.0):
         state.resting[0] = resting
-        external_torque.update_noise(SETTINGS, state, part(Work))
+        update_noise(state, part(Work))
         assert state.noise[2].tolist() == [0.04, 0.09]
         assert (state.noise[1] > [0.5, 0.6]).all() is np.bool_(not resting)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blf_dsc_controller.arms.friction import STRIBECK_SPEED
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.law import friction, reversals
 from blf_dsc_controller.law.friction import Settings, State, Work
@@ -146,16 +147,104 @@ def test_rows_of_a_change_show_no_friction(at, shown, kept):
     assert found.coulomb[0, 0] == pytest.approx(kept, abs=0.01)
 
 
-def test_drift_of_the_observer_is_counted_along_the_motion_until_the_joint_reverses():
+@pytest.mark.parametrize(('factor', 'extremes'), [(1.0, [0.0, 0.5]), (-1.0, [-0.5, 0])])
+def test_drift_of_the_observer_is_counted_along_the_motion_until_the_joint_reverses(
+    factor, extremes
+):
     state, work = part(State), part(Work)
     for sign, step in ((1.0, 0.3), (0.5, 0.2), (-0.5, 5.0), (-1.0, -0.4)):
         work.sign[:] = sign
         friction.follow_motion(SETTINGS, state, work)
-        friction.follow_observer(state, work, 0, step)
+        friction.follow_observer(state, work, 0, factor * step)
     # 0.3 and 0.2 N m along the first motion, nothing between, 0.4 along the second
-    assert state.observer_drift[0] == pytest.approx(0.4)
-    np.testing.assert_allclose(state.drift_extremes[:, 0], [0.0, 0.5])
+    assert state.observer_drift[0] == pytest.approx(factor * 0.4)
+    np.testing.assert_allclose(state.drift_extremes[:, 0], extremes)
     assert state.direction[0] == -1.0
+
+
+@pytest.mark.parametrize(('moved', 'is_closed'), [(0.0, False), (1.0, True)])
+def test_reversal_is_closed_as_the_next_begins(moved, is_closed):
+    """Not while its joint is slow."""
+    state, work = part(State), part(Work)
+    friction.begin(SETTINGS, state)
+    state.moves[:] = moved
+    state.reversals.shown.present[[0, 2], 0] = 3.0 * 0.125, 0.125
+    work.sign[:] = 0.5
+    friction.follow_motion(SETTINGS, state, work)
+    assert state.reversals.shown.past.any() == is_closed
+    assert state.reversals.shown.present.any() != is_closed
+    assert state.moves[0] == 0.0
+
+
+def test_friction_is_that_at_the_velocity_when_the_torque_acts():
+    """1.5 samples of 2 ms and half of 10 ms later: 8 ms."""
+    settings = SETTINGS._replace(viscous=1, first_viscous=0, lag=0.01)
+    state, work = learned_case(4.0)
+    dqr, ddqr, H = np.array([0.01]), np.array([1.0]), np.full((1, 2), 7.0)
+    theta = np.array([0.0, 4.0])
+    friction.fill_compensation(settings, state, work, theta, dqr, ddqr, H, 0.002)
+    np.testing.assert_allclose(H, [[0.018, 7.0]])
+    np.testing.assert_allclose(work.sign, np.tanh(0.018 / 0.02))
+    np.testing.assert_allclose(work.torque, 4.0 * np.tanh(0.018 / 0.02))
+
+
+def test_shapes_are_means_over_the_interval_behind_both_poles():
+    """As a row of the torque is, of a joint that begins to move, and then moves on."""
+    state, dt = part(State), 0.01
+    gain = 1.0 - np.exp(-20.0 * dt)
+    first, second = np.zeros(2), np.zeros(2)
+    for mean in (0.5, 1.0, 1.0):
+        friction.filter_shapes(SETTINGS, state, np.array([1.0]), dt)
+        b = np.exp(-((1.0 / STRIBECK_SPEED) ** 2))
+        first += gain * (mean * np.array([1.0, b]) - first)
+        second += gain * (first - second)
+        np.testing.assert_allclose(state.shape_lags[:, 0, 0], [1.0, b])
+        np.testing.assert_allclose(state.shape_lags[:, 2, 0], second)
+
+
+def test_high_pass_leaves_nothing_of_what_lasts_and_begins_at_rest():
+    lags, gain = np.zeros((2, 1)), 0.1
+    assert friction.high_pass(lags, 0, gain, 3.0, begins=True) == 0.0
+    assert friction.high_pass(lags, 0, gain, 4.0, begins=False) == pytest.approx(0.81)
+    for _ in range(300):
+        left = friction.high_pass(lags, 0, gain, 4.0, begins=False)
+    assert left == pytest.approx(0.0, abs=1e-9)
+    friction.high_pass(lags, 0, gain, 9.0, begins=False)
+    assert friction.high_pass(lags, 0, gain, 5.0, begins=True) == 0.0
+
+
+def test_what_is_unexplained_is_the_torque_less_all_but_the_own_column():
+    row, theta = np.array([2.0, 3.0, 5.0, 40.0]), np.array([1.0, 4.0, 2.0])
+    for own, expected in ((0, 18.0), (1, 28.0), (2, 26.0)):
+        assert friction.unexplained(row, theta, own) == expected
+
+
+def test_time_since_the_latch_is_that_of_the_window_that_is_latched():
+    state = part(State)
+    times = [friction.update_since_latch(state, now, 0.5) for now in (1, 1, 0, 0, 1)]
+    assert times == [0.5, 1.0, 0.0, 0.0, 0.5]
+
+
+@pytest.mark.parametrize(
+    ('shown', 'active', 'gain', 'expected'),
+    [
+        (5.0, 1.0, 2.0, (5.0, 0.0)),
+        (50.0, 1.0, 2.0, (9.0, 0.0)),  # the most that it can be
+        (-5.0, 1.0, 2.0, (1.0, 0.0)),  # the least
+        (5.0, 0.0, 2.0, (7.0, 0.3)),  # its column was rejected
+        (5.0, 1.0, 0.0, (7.0, 0.3)),  # it is not learned
+    ],
+)
+def test_estimate_returns_to_what_reversals_show(shown, active, gain, expected):
+    settings = SETTINGS._replace(gain=np.array([gain]))
+    state = part(State)
+    state.reversals.shown.past[[0, 2, 4], 0] = shown, 1.0, 1.0
+    state.breakaway[:] = 0.3
+    estimate = np.array([4.0, 7.0])
+    friction.return_estimate(settings, state, np.array([1.0, active]), estimate)
+    assert estimate[0] == 4.0
+    assert estimate[1] == pytest.approx(expected[0], abs=1e-3)
+    assert state.breakaway[0] == expected[1]
 
 
 def test_change_of_the_friction_is_taken_from_the_disturbance_estimate():
@@ -183,4 +272,9 @@ def test_learned_friction_moves_the_estimate_unless_its_column_was_rejected():
     friction.follow_reversals(SETTINGS, state, work, mask, estimate, rate)
     friction.adapt_breakaway(SETTINGS, state, work, 0.001)
     # back to k = 0, at a rate of 2 / s
-    assert state.breakaway[0] == pytest.approx(0.2 - 0.001 * 2.0 * 0.2)
+    left = 0.2 - 0.001 * 2.0 * 0.2
+    assert state.breakaway[0] == pytest.approx(left)
+    mask[1] = 0.0
+    friction.follow_reversals(SETTINGS, state, work, mask, estimate, rate)
+    friction.adapt_breakaway(SETTINGS, state, work, 0.001)
+    assert state.breakaway[0] == pytest.approx(left)

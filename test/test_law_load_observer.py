@@ -22,11 +22,11 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import (
     disturbance,
-    learning,
+    joint_sensors,
     load_observer,
     motor_friction,
 )
-from blf_dsc_controller.law.load_observer import Settings, State, Work
+from blf_dsc_controller.law.load_observer import Links, Settings, State, Work
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.runs import run_chunk
 from blf_dsc_controller.supervision.calming import softened
@@ -47,6 +47,11 @@ THETA = np.array([1.0, -2.0, 0.75, 5.0])
 LINKS = THETA[:P] - SETTINGS.rotors
 NOTHING = np.zeros(P)
 CERTAIN = np.diag([1e6] * M)  # 1e-3 of each parameter
+
+
+def links(theta, absorbed=NOTHING):
+    """What is learned of the links, for theta^."""
+    return Links(theta, SETTINGS.rotors, absorbed)
 
 
 def new(settings=SETTINGS):
@@ -71,7 +76,8 @@ def run(
         sensed = effort(k * DT) if callable(effort) else effort
         for i in range(N):
             load_observer.filter_interval(settings, state, i, X[i], sensed[i], DT)
-        load_observer.update(settings, state, work, theta, absorbed, information, DT)
+        now = links(theta, absorbed)
+        load_observer.update(settings, state, work, now, information, DT)
     return state.torque.copy()
 
 
@@ -112,8 +118,7 @@ def test_r_is_the_load_of_a_known_mass_on_an_arm_at_rest():
                 settings.observer,
                 state,
                 work,
-                theta,
-                np.zeros(settings.p),
+                Links(theta, settings.observer.rotors, np.zeros(settings.p)),
                 settings.information,
                 DT,
             )
@@ -156,7 +161,7 @@ def test_what_is_learned_fades_from_r_and_changes_no_torque():
     d3 = np.array([1.0, 2.0])
     before, after = THETA.copy(), THETA + learned
     disturbance.transfer_learned(d3, X, after, before)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(before))
     r = run(state, work, sensed, DT, theta=after)
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
@@ -177,8 +182,9 @@ def test_what_d3_gives_up_only_since_r_is_late_fades():
     d3 = np.array([1.0, 2.0])
     torque = r + d3 + H @ before
     disturbance.transfer_learned(d3, H, after, before)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
-    load_observer.hand_over(SETTINGS, state, d3, H, after, before)
+    motors = SimpleNamespace(absorbed=NOTHING)
+    law = SimpleNamespace(observer=state, disturbance=d3, estimate=after, motors=motors)
+    joint_sensors.transfer_learned(SimpleNamespace(observer=SETTINGS), law, H, before)
     np.testing.assert_allclose(d3, [1.0, 2.0], atol=1e-9)
     r = run(state, work, sensed, DT, theta=after)
     late = H[:, :P] @ learned[:P] - X[:, :P] @ learned[:P]
@@ -195,7 +201,8 @@ def test_r_that_is_left_out_hands_nothing_over():
     run(state, work, X[:, :P] @ LINKS, 1.0)
     state.faded[0] = 1.0
     d3 = np.zeros(N)
-    load_observer.hand_over(SETTINGS, state, d3, 2.0 * X, THETA + 1.0, THETA)
+    after, before = links(THETA + 1.0), links(THETA)
+    load_observer.hand_over(SETTINGS, state, d3, 2.0 * X, after, before)
     np.testing.assert_array_equal(d3, 0.0)
 
 
@@ -220,7 +227,7 @@ def test_calmed_r_gives_up_at_once_what_is_learned():
     d3 = np.zeros(N)
     after = THETA + learned
     disturbance.transfer_learned(d3, X, after, THETA)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, THETA, NOTHING, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(THETA))
     r = run(state, work, sensed, DT, theta=after)
     np.testing.assert_allclose(r, 0.0, atol=1e-6)
     np.testing.assert_allclose(d3, 0.0, atol=1e-6)
@@ -243,7 +250,7 @@ def test_friction_is_sensed_once_sensors_are_read_and_while_they_are_trusted(
     state.faded[0] = faded
     motors = SimpleNamespace(rows=np.array([rows]))
     given = SimpleNamespace(observer=state, motors=motors)
-    assert learning.senses_friction(settings, given) == senses
+    assert joint_sensors.shows_friction(settings, given) == senses
 
 
 def test_readings_are_missing_if_one_is():
@@ -294,7 +301,7 @@ def test_r_takes_over_what_is_learned_no_longer_beyond_its_limit_until_it_needs_
     torque = X @ before + run(state, work, sensed, 1.0, theta=before)
     d3 = np.zeros(N)
     disturbance.transfer_learned(d3, X, after, before)
-    load_observer.transfer_learned(SETTINGS, state, d3, after, before, NOTHING, NOTHING)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(before))
     r = run(state, work, sensed, DT)
     np.testing.assert_allclose(d3, 0.0, atol=1e-9)
     np.testing.assert_allclose(X @ after + r, torque, rtol=1e-9)
@@ -304,14 +311,49 @@ def test_r_takes_over_what_is_learned_no_longer_beyond_its_limit_until_it_needs_
         assert r[1] == pytest.approx(shown, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ('shown', 'before', 'over', 'expected'),
+    [
+        (60.0, 50.0, 0.0, 10.0),  # only what was learned before: 10 of 20 N m
+        (-60.0, 50.0, 0.0, 10.0),
+        (60.0, 50.0, 12.0, 20.0),  # no more than is beyond 40 N m
+        (50.0, 60.0, 5.0, 5.0),  # more has been learned
+        (30.0, 10.0, 0.0, 0.0),  # it is within the limit
+    ],
+)
+def test_r_takes_over_no_more_than_was_learned(shown, before, over, expected):
+    state, _ = settled()
+    state.over[0] = over
+    load_observer.take_over(SETTINGS, state, 0, shown, before)
+    assert state.over[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ('shown', 'faded', 'over', 'expected'),
+    [
+        (30.0, 0.0, 0.0, 30.0),
+        (-90.0, 0.0, 0.0, -40.0),
+        (90.0, 0.0, 10.0, 50.0),
+        (90.0, 0.5, 10.0, 25.0),  # half of what is within the limit
+        (90.0, 1.0, 10.0, 0.0),
+    ],
+)
+def test_r_is_what_is_shown_within_its_limit_and_the_share_that_is_trusted(
+    shown, faded, over, expected
+):
+    state, _ = settled()
+    state.over[0], state.faded[0] = over, faded
+    assert load_observer.load_torque(SETTINGS, state, 0, shown) == expected
+
+
 @pytest.mark.parametrize('left_out', ['unsettled', 'faded'])
 def test_r_that_is_left_out_takes_nothing_over(left_out):
     state, work = new() if left_out == 'unsettled' else settled()
     run(state, work, X[:, :P] @ LINKS, 0.01)
     state.faded[0] = float(left_out == 'faded')
     d3, before = np.zeros(N), THETA + np.array([0.0, 20.0, 20.0, 0.0])
-    load_observer.transfer_learned(SETTINGS, state, d3, THETA, before, NOTHING, NOTHING)
-    load_observer.transfer_learned(SETTINGS, state, d3, before, THETA, NOTHING, NOTHING)
+    for now, earlier in ((THETA, before), (before, THETA)):
+        load_observer.transfer_learned(SETTINGS, state, d3, links(now), links(earlier))
     np.testing.assert_array_equal(state.over, 0.0)
     np.testing.assert_array_equal(d3, 0.0)
 
@@ -320,7 +362,7 @@ def test_observer_that_is_off_takes_nothing_over():
     off = SETTINGS._replace(most=np.zeros(N))
     state, work = settled(off)
     d3 = np.zeros(N)
-    load_observer.transfer_learned(off, state, d3, THETA, THETA + 1.0, NOTHING, NOTHING)
+    load_observer.transfer_learned(off, state, d3, links(THETA), links(THETA + 1.0))
     np.testing.assert_array_equal(d3, 0.0)
     np.testing.assert_array_equal(run(state, work, [9.0, 9.0], 0.5, settings=off), 0.0)
 
@@ -339,6 +381,24 @@ def test_offset_of_a_sensor_stays_out_of_r():
     np.testing.assert_allclose(r, [4.0 + 3.0 * exp(-4.0), 0.0], atol=1e-3)
 
 
+@pytest.mark.parametrize('f', [0.2, 0.5, 2.0])
+@pytest.mark.parametrize('prior', [1e-6, 0.01])  # variance of each parameter
+def test_bias_is_kept_beyond_three_deviations_of_prior_and_unmodelled_torque(f, prior):
+    settings = SETTINGS._replace(unmodelled=np.full(N, f))
+    information = np.eye(M) / prior
+    for i in range(N):
+        deviation = np.sqrt(prior * X[i, :P] @ X[i, :P] + f**2)
+        for sigmas in (2.9, 3.1, -2.9, -3.1):
+            state, work = new(settings)
+            state.filtered[:, :P] = X[:, :P]
+            state.filtered[:, P] = X[:, :P] @ LINKS
+            state.filtered[i, P] += sigmas * deviation
+            load_observer.find_bias(settings, state, work, links(THETA), information)
+            assert state.bias[i] == pytest.approx(sigmas * deviation)
+            assert state.keeps_bias[i] == float(abs(sigmas) > 3.0)
+            assert state.keeps_bias[1 - i] == 0.0
+
+
 def test_what_the_prior_explains_comes_into_r_without_a_step():
     """The model may be 1 N m off; r begins at zero 4 / L after the start."""
     state, work = new()
@@ -354,7 +414,10 @@ def test_what_the_prior_explains_comes_into_r_without_a_step():
 
 def test_law_that_continues_with_its_disturbance_does_not_have_it_twice():
     state, work = new()
+    load_observer.begin(state, np.zeros(N))
+    assert state.keeps_bias.tolist() == [0.0, 0.0]
     load_observer.begin(state, np.array([0.0, 2.0]))
+    assert state.keeps_bias.tolist() == [1.0, 1.0]  # of all joints
     sensed = X[:, :P] @ LINKS + [0.0, 2.0]
     r = run(state, work, sensed, 2.0, information=np.eye(M))
     np.testing.assert_allclose(r, [0.0, 2.0 * exp(-4.0)], atol=1e-3)
@@ -377,7 +440,8 @@ def test_torque_is_the_same_while_it_becomes_known_what_is_absorbed():
     sensed = X[:, :P] @ LINKS + [1.0, 0.5]
     before = run(state, work, sensed, 1.0)
     share, d3 = np.array([0.05, 0.1, 0.0]), np.zeros(N)
-    load_observer.transfer_learned(SETTINGS, state, d3, THETA, THETA, share, NOTHING)
+    now = links(THETA, share)
+    load_observer.transfer_learned(SETTINGS, state, d3, now, links(THETA))
     after = run(state, work, sensed, DT, absorbed=share)
     assert np.abs(after - before).max() > 0.1
     np.testing.assert_allclose(after + d3, before, atol=1e-9)
@@ -397,10 +461,10 @@ def test_torque_is_the_same_while_the_law_lets_what_is_absorbed_follow():
     now = SimpleNamespace(
         observer=state, motors=absorbed, disturbance=np.zeros(N), estimate=THETA
     )
-    learning.follow_absorbed(
+    joint_sensors.follow_absorbed(
         SimpleNamespace(observer=SETTINGS, adaptation=gains),
         now,
-        SimpleNamespace(motors=scratch),
+        SimpleNamespace(scratch=SimpleNamespace(motors=scratch)),
         DT,
     )
     np.testing.assert_allclose(absorbed.absorbed, absorbed.solution)

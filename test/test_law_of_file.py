@@ -33,7 +33,6 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.called_law import called
-from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
 from blf_dsc_controller.law.state import (
     settings_of,
@@ -42,6 +41,7 @@ from blf_dsc_controller.law.state import (
     state_of,
     state_size,
 )
+from blf_dsc_controller.law.step import update
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.studies.monte_carlo import UNSEEN, load_study, torque_rows

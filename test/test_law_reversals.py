@@ -62,9 +62,131 @@ def add(state, energy, friction, push=0.0):
     A `push` [N m] is as large beside the step of friction.
     """
     s = np.sqrt(energy)
-    return reversals.add_row(
-        SETTINGS, state, 0, s, 0.0, friction * s + push, 1.0, 0.0, 0.01
+    row = reversals.Row(s, 0.0, friction * s + push, 1.0)
+    return reversals.add_row(SETTINGS, state, 0, row, 0.0, 0.01)
+
+
+@pytest.mark.parametrize('f', [0.3, 1.0, 1.5])
+def test_friction_is_that_of_least_squares_with_the_prior(f):
+    """c and c k, pulled by 0.015 (f / 1.5)^2 to 3 N m, and by a tenth of that to 0."""
+    settings = SETTINGS._replace(unmodelled=np.array([f]))
+    state = begun()
+    s, b = np.random.default_rng(3).uniform(0.1, 0.2, size=(2, 12))
+    e = 5.0 * s + 2.0 * b + 0.05 * np.arange(12)
+    state.shown.past[:, 0] = s @ e, b @ e, s @ s, s @ b, b @ b
+    pull = 0.015 * (f / 1.5) ** 2
+    A = np.array([[s @ s + pull, s @ b], [s @ b, b @ b + 0.1 * pull]])
+    c, ck = np.linalg.solve(A, [s @ e + pull * 3.0, b @ e])
+    assert 0.0 < ck / c < 1.0
+    found = reversals.learned(settings, state, 0, 0.0)
+    np.testing.assert_allclose(found, [c, ck / c], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('be', 'k'),
+    [(-1.0, 0.0), (0.0, 0.0), (4.0, 1.0), (9.0, 1.0)],  # it would have the other sign
+)
+def test_breakaway_is_within_its_limits_also_where_it_is_all_of_the_friction(be, k):
+    """c is then that for this k: (s e + k b e) / (s^2 + 2 k s b + k^2 b^2)."""
+    state = begun()
+    state.shown.past[:, 0] = 1.0, be, 1.0, 0.25, 0.25
+    c, stribeck = reversals.learned(SETTINGS, state, 0, 0.0)
+    assert stribeck == k
+    expected = (1.0 + k * be) / (1.0 + 0.5 * k + 0.25 * k * k)
+    assert c == pytest.approx(expected, abs=1e-3)
+
+
+def test_breakaway_stays_where_two_reversals_overrule_the_sums():
+    """They have shown 4 and 5 N m, the sums 3 N m with a half of it in excess."""
+    state = begun()
+    ss, sb, bb = 1.0, 0.25, 0.25
+    se, be = 3.0 * ss + 1.5 * sb, 3.0 * sb + 1.5 * bb
+    state.shown.past[:, 0] = se, be, ss, sb, bb
+    state.shown.coulomb[:, 0] = 4.0, 5.0
+    reversals.overrule(SETTINGS, state, 0)
+    found = reversals.learned(SETTINGS, state, 0, 0.0)
+    np.testing.assert_allclose(found, [4.5, 0.5], atol=1e-3)
+
+
+def test_energy_of_a_reversal_is_that_of_friction_with_breakaway():
+    """(s + k b)^2, summed over rows."""
+    state = begun()
+    s, b = np.random.default_rng(4).uniform(size=(2, 5))
+    state.shown.present[[SS, SB, BB], 0] = s @ s, s @ b, b @ b
+    for k in (0.0, 0.3, 1.0):
+        energy = reversals.energy(state.shown, 0, k)
+        assert energy == pytest.approx(np.sum((s + k * b) ** 2))
+
+
+@pytest.mark.parametrize(('c', 'allowed'), [(0.0, 1.0), (3.0, np.hypot(1.0, 6.0))])
+def test_trust_is_a_half_where_the_misfit_is_what_the_shape_may_be_wrong_by(c, allowed):
+    """a: half of the unmodelled 2 N m, and twice the friction that is known."""
+    settings = SETTINGS._replace(unmodelled=np.array([2.0]), initial=np.array([c]))
+    state = begun()
+    state.shown.present[[SE, SS], 0] = 5.0 * 0.1, 0.1
+    for misfit, trust in ((0.0, 1.0), (1.0, 0.5), (3.0, 0.1)):
+        state.shown.torque[:] = 5.0**2 * 0.1 + misfit**2 * allowed**2 * 0.1
+        found = reversals.trust(settings, state, 0, 0.0)
+        assert found == pytest.approx(trust)
+
+
+def test_twice_the_noise_is_no_misfit():
+    """Of 1.5 N m rms, over 0.2 of p int dt; ten times that, 4.5, is one: a^2 is 36, of 0.1."""
+    state = begun()
+    state.usual[:, 0] = 1.5**2 * 7.0, 7.0
+    state.shown.present[[SE, SS], 0] = 5.0 * 0.1, 0.1
+    state.shown.span[:] = 0.2
+    for times, trust in ((1.0, 1.0), (2.0, 1.0), (12.0, 3.6 / (3.6 + 4.5))):
+        state.shown.torque[:] = 5.0**2 * 0.1 + times * 1.5**2 * 0.2
+        found = reversals.trust(SETTINGS, state, 0, 0.0)
+        assert found == pytest.approx(trust, rel=1e-3)
+
+
+def test_torque_before_a_reversal_counts_less_the_earlier_it_was():
+    """It fades by a tenth of a second; rows are 0.01 s apart."""
+    for rows in (1, 5, 20):
+        state = begun()
+        for k in range(rows + 1):
+            e = 3.0 if k == 0 else 0.0
+            row = reversals.Row(1.0 if k == rows else 0.0, 0.0, e, 1.0)
+            reversals.add_torque(state, 0, row, 0.01)
+        assert state.shown.torque[0] == pytest.approx(9.0 * np.exp(-0.1 * rows))
+        span = np.exp(-0.1 * np.arange(rows + 1)).sum()
+        assert state.shown.span[0] == pytest.approx(span)
+
+
+def test_noise_is_that_of_the_last_seconds_away_from_reversals():
+    """Of 1 N m, and then of 2 N m for 20 s; e^-5 of the first is left after 4 s each."""
+    state = begun()
+    for e in (1.0, 2.0):
+        for _ in range(2000):
+            reversals.add_torque(state, 0, reversals.Row(0.0, 0.0, e, 0.01), 0.01)
+    noise = state.usual[0, 0] / state.usual[1, 0]
+    assert noise == pytest.approx(4.0 - 3.0 * np.exp(-5.0), rel=1e-3)
+    assert not state.shown.torque.any()
+
+
+def test_one_reversal_that_is_more_than_all_replaces_them():
+    state = begun()
+    state.shown.past[[SE, SS], 0] = 3.0 * 0.5, 0.5
+    state.shown.coulomb[:] = 3.0
+    state.shown.present[[SE, SS], 0] = 3.02 * 2.0, 2.0
+    share = reversals.counted(SETTINGS, state, 0, 0.0)
+    reversals.close(SETTINGS, state, 0, 0.0)
+    np.testing.assert_allclose(
+        state.shown.past[[SE, SS], 0], [share * 6.04, share * 2.0]
     )
+
+
+def test_reversal_that_is_over_leaves_nothing_to_the_next():
+    state = begun()
+    for _ in range(10):
+        add(state, 0.008, 4.0)
+    assert state.shown.torque[0] > 0.0
+    reversals.close(SETTINGS, state, 0, 0.0)
+    assert state.shown.past[SS, 0] == pytest.approx(0.08, rel=0.1)
+    for part in ('present', 'torque', 'span'):
+        assert not getattr(state.shown, part).any()
 
 
 def test_reversal_shows_its_friction_once():

@@ -177,19 +177,10 @@ class Arm:
             torque = row[:, :INERTIAL] @ theta[:INERTIAL]
             signs = np.sign(torque)
             row[:, M] += lost * torque
-            weighing.add_row(
-                SETTINGS,
-                self.state,
-                self.work,
-                PRIOR,
-                row,
-                np.zeros(N),
-                signs,
-                velocity,
-                self.samples,
-                self.changes,
-                DT,
+            sample = weighing.Sample(
+                row, np.zeros(N), signs, velocity, self.samples, self.changes, DT
             )
+            weighing.add_row(SETTINGS, self.state, self.work, PRIOR, sample)
         return self.state.load[MASS]
 
     @property
@@ -209,7 +200,8 @@ def test_row_has_columns_of_its_own_for_breakaway_and_lost_torque_of_each_joint(
     np.testing.assert_allclose(held, state.solution[:INERTIAL] + load)
     signs = np.array([0.9, -0.4])
     for carried in (held, -held):  # friction does not drive where the gear pulls
-        weighing.extend_row(given, np.array([0.7, -0.2]), signs, carried, row)
+        sample = weighing.Sample(given, np.array([0.7, -0.2]), signs, SWIFT, 0, 0, DT)
+        weighing.extend_row(sample, carried, row)
         torque = given[:, :INERTIAL] @ carried
         shapes = np.append([0.7, -0.2], np.abs(torque) * signs)
         (expected,) = with_friction(

@@ -154,7 +154,8 @@ def excited_case(seed):
 
 def sliding_of(case):
     """The sliding window of settings, state and signals."""
-    return window.Window(*(each.window for each in case))
+    settings, state, signals = case
+    return window.Window(settings.window, state.window, signals.scratch.window)
 
 
 def prior_of(settings):
@@ -168,7 +169,7 @@ def update_excitation(case, t):
     excitation.update_excitation(
         settings.excitation,
         state.latch,
-        signals.latch,
+        signals.scratch.latch,
         sliding_of(case),
         prior_of(settings),
         settings.model,
@@ -188,7 +189,10 @@ def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
     """Never below it (a Rayleigh quotient cannot be), and close once the window has filled."""
     law = controller(quick())
     evaluations = [
-        (law.state.latch.lambda_min[0], np.linalg.eigvalsh(law.signals.window.Phi)[0])
+        (
+            law.state.latch.lambda_min[0],
+            np.linalg.eigvalsh(law.signals.scratch.window.Phi)[0],
+        )
         for sample in closed_loop(law, plant(), 4.0)
         if sample.k > 0 and sample.k % law.settings.window.interval == 0
     ]
@@ -340,10 +344,12 @@ def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
     assert all(name.startswith('cos 1 rad/s') for name in rejected)
     np.testing.assert_allclose(law.state.estimate[~on], 0.0, atol=1e-12)
     Phi, b = means(law.state.window.ring[:, :, np.append(on, True)])
-    np.testing.assert_allclose(law.signals.window.Phi[np.ix_(on, on)], Phi, atol=1e-10)
-    np.testing.assert_allclose(law.signals.window.b[on], b, atol=1e-10)
-    np.testing.assert_array_equal(law.signals.window.Phi[np.ix_(~on, on)], 0.0)
-    np.testing.assert_array_equal(law.signals.window.b[~on], 0.0)
+    np.testing.assert_allclose(
+        law.signals.scratch.window.Phi[np.ix_(on, on)], Phi, atol=1e-10
+    )
+    np.testing.assert_allclose(law.signals.scratch.window.b[on], b, atol=1e-10)
+    np.testing.assert_array_equal(law.signals.scratch.window.Phi[np.ix_(~on, on)], 0.0)
+    np.testing.assert_array_equal(law.signals.scratch.window.b[~on], 0.0)
     assert np.linalg.eigvalsh(Phi)[0] >= law.settings.excitation.excitation_threshold
 
 
@@ -422,9 +428,9 @@ def test_excitation_is_relative_to_the_information_to_which_the_prior_pulls(seed
 
     pulled = replaced(settings, prior_weight=0.5), state, signals
     window.find_excitation(sliding_of(pulled), prior_of(settings), active, 1)
-    np.testing.assert_allclose(signals.window.Phi, Phi + 0.5 * R, rtol=1e-12)
+    np.testing.assert_allclose(signals.scratch.window.Phi, Phi + 0.5 * R, rtol=1e-12)
     np.testing.assert_allclose(
-        signals.window.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12
+        signals.scratch.window.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12
     )
 
 
@@ -437,6 +443,6 @@ def test_only_estimates_with_a_positive_inertia_are_physical(P2, physical):
     law.signals.q[:] = 2.0, 1.4
     if P2 == 0.02:  # positive definite, but below a tenth of the initial estimate
         law.settings.initial_estimate[:3] = [1.0, 0.32, 0.0]
-    work, P0 = law.signals.latch, law.settings.initial_estimate
+    work, P0 = law.signals.scratch.latch, law.settings.initial_estimate
     excitation.find_spare_inertia(law.settings.model, work, law.signals.q, theta, P0)
     assert cholesky_factor(work.inertia) == physical

@@ -30,7 +30,7 @@ from blf_dsc_controller.errors import (
     ConfigurationError,
     MissingExtraError,
 )
-from blf_dsc_controller.law.external_torque import is_touched
+from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode

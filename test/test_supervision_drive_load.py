@@ -9,7 +9,7 @@ import pytest
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
-from blf_dsc_controller.law.external_torque import QUIET, TOUCHED
+from blf_dsc_controller.law.contact import QUIET, TOUCHED
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 
 CONFIG = change(

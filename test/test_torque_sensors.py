@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,12 @@ from law_part import part
 
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.factory.controller import controller_of
-from blf_dsc_controller.law import torque_sensors
+from blf_dsc_controller.law import (
+    joint_sensors,
+    load_observer,
+    motor_friction,
+    torque_sensors,
+)
 from blf_dsc_controller.law.torque_sensors import (
     COMMANDS,
     NONE,
@@ -108,6 +114,35 @@ def test_r_that_shakes_is_found_and_one_that_takes_a_load_or_is_small_is_not(joi
     assert (small.fault[0], load.fault[0]) == (NONE, NONE)
 
 
+def test_ripple_of_r_does_not_hide_that_it_shakes():
+    """0.8 N m at 200 Hz: a half wave of less than a fortieth of the limit, 2 N m, is none."""
+
+    def r(t):
+        wave = 3.0 * np.sin(2.0 * np.pi * 20.0 * t)
+        return np.array([wave + 0.8 * np.sin(2.0 * np.pi * 200.0 * t), 0.0])
+
+    state = watched(r, 0.25)
+    assert (state.fault[0], state.joint[0]) == (SHAKES, 0)
+
+
+@pytest.mark.parametrize(
+    ('ratio', 'fault', 'expected'),
+    [
+        (0.01, NONE, (COMMANDS, 1.0)),
+        (0.05, NONE, (NONE, 0.0)),  # between 0.02 and 0.1
+        (0.2, NONE, (NONE, 1.0)),
+        (0.05, OFF, (OFF, 1.0)),  # it is known what they are not
+    ],
+)
+def test_efforts_are_judged_once(ratio, fault, expected):
+    state, _ = new()
+    state.fault[0] = fault
+    state.square[:] = [[4.0 * ratio, ratio / 4.0], [1.0, 1.0]]
+    torque_sensors.decide(state)
+    assert (state.fault[0], state.is_distinct[0]) == expected
+    assert state.joint[0] == float(expected[0] == COMMANDS)  # the nearest
+
+
 def shaking(seconds, *joints):
     """Return what is found where r of some joints shakes at 30 Hz."""
     share = np.isin(np.arange(2), joints) * LIMIT / 80.0
@@ -152,7 +187,7 @@ def off(difference, speed, seconds):
     state, work = new()
     for _ in range(round(seconds / DT)):
         work.differences[0] = difference
-        now = torque_sensors.follow_commands(state, work, LIMIT, speed, MOVES, DT)
+        now = torque_sensors.watch_following(state, work, LIMIT, speed, MOVES, DT)
     return state.fault[0], now
 
 
@@ -168,6 +203,83 @@ def test_efforts_of_an_arm_that_does_not_follow_are_doubted_while_that_lasts():
     assert off(np.array([9.0, 0.0]), 0.0 * MOVES, 1.0) == (NONE, True)
 
 
+def test_joint_follows_within_a_quarter_of_the_speed_of_the_arm():
+    for share, fault in ((-0.26, NONE), (-0.24, OFF), (0.24, OFF), (0.26, NONE)):
+        speed = MOVES + np.array([share * np.hypot(*MOVES), 0.0])
+        assert off(np.array([9.0, 0.0]), speed, 0.1) == (fault, True)
+
+
+def test_efforts_are_off_for_good_only_if_that_lasts_without_a_break():
+    state, work = new()
+    for k in range(1000):
+        work.differences[0] = [9.0 * (k % 50 > 0), 0.0]  # 0.049 s
+        torque_sensors.watch_following(state, work, LIMIT, MOVES, MOVES, DT)
+    assert state.fault[0] == NONE
+
+
+def test_commands_are_compared_behind_the_filter_of_the_efforts():
+    """The torque is the last of a row; 1 - 1 / e after 1 / L."""
+    state, _ = new()
+    row = np.array([[7.0, 8.0, 3.0], [5.0, 6.0, -2.0]])
+    for _ in range(20):
+        torque_sensors.follow_applied(state, row, 2, 50.0, DT)
+    np.testing.assert_allclose(state.command, (1.0 - np.exp(-1.0)) * row[:, 2])
+
+
+def observed(most, disturbance):
+    """Return states of an arm in which efforts are 4 and 2 N m away from commands, for 0.33 s.
+
+    That is 4 / L = 0.08 s until the filters have settled, and 0.25 s of motion.
+    """
+    of = load_observer.Settings(1, 50.0, 0.0, most, np.ones(2), np.zeros(1))
+    motors = SimpleNamespace(size=1, filter_pole=30.0)
+    sizes = {'n': 2, 'p': 1, 'm': 1, 'observer': of, 'motors': motors}
+    settings = SimpleNamespace(
+        **sizes, information=np.eye(1), torque=SimpleNamespace(limit=LIMIT)
+    )
+    observer, sensors, now = (
+        part(each.State, **sizes)
+        for each in (load_observer, torque_sensors, motor_friction)
+    )
+    state = SimpleNamespace(
+        samples=np.ones(1),
+        estimate=np.zeros(1),
+        disturbance=disturbance,
+        observer=observer,
+        sensors=sensors,
+        motors=now,
+    )
+    signals = SimpleNamespace(
+        row=SimpleNamespace(Xu=np.array([[0.0, 9.0], [0.0, 1.0]])),
+        effort=np.array([5.0, -1.0]),
+        dq=MOVES,
+        dqr=MOVES,
+        sensors=part(torque_sensors.Work, **sizes),
+        scratch=SimpleNamespace(observer=part(load_observer.Work, **sizes)),
+    )
+    for _ in range(330):
+        joint_sensors.observe_load(settings, state, signals, DT)
+        state.samples[0] += 1.0
+    return state
+
+
+def test_offset_of_efforts_from_commands_says_nothing_about_them():
+    sensors = observed(LIMIT, np.zeros(2)).sensors
+    np.testing.assert_allclose(sensors.slow, [[-4.0, -2.0], [5.0, -1.0]], atol=0.1)
+    assert sensors.moved[0] == pytest.approx(0.25, abs=2.0 * DT)
+    left = 5.0 * np.exp(-4.0)  # N m, that comes through the filters later
+    assert (sensors.square < 0.25 * left**2).all()
+    # an observer that is off has no load in P^ that it could take from the efforts
+    assert observed(0.0 * LIMIT, np.zeros(2)).sensors.moved[0] == 0.0
+
+
+def test_sensors_are_passed_on_to_the_friction_of_motors_and_d3_to_the_bias():
+    """e^-10 of the efforts is left by the poles of a row, eleven times that by two of them."""
+    state = observed(LIMIT, np.array([0.0, 2.0]))
+    assert state.observer.keeps_bias.tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(state.motors.sensed2, [5.0, -1.0], rtol=6e-4)
+
+
 def test_r_fades_out_and_comes_back_smoothly_and_stays_whole_without_doubt():
     state, _ = new()
     faded = np.zeros(1)
@@ -179,6 +291,7 @@ def test_r_fades_out_and_comes_back_smoothly_and_stays_whole_without_doubt():
     assert torque_sensors.is_fading(faded, still)
     assert not torque_sensors.is_fading(np.ones(1), still)
     assert torque_sensors.is_fading(np.ones(1), np.array([0.0, 0.5]))
+    assert not torque_sensors.is_fading(np.ones(1), np.ones(2))
     for _ in range(500):
         torque_sensors.fade(state, faded, is_off=False, dt=DT)
     assert faded[0] == 0.0

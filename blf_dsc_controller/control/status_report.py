@@ -10,7 +10,7 @@ import numpy as np
 
 from blf_dsc_controller.control.log import Log
 from blf_dsc_controller.control.motion_input import MotionInput
-from blf_dsc_controller.law.external_torque import is_touched
+from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.messages.topics import LOAD, PHASE, REASON, REJECTED, STOPS

@@ -21,7 +21,7 @@ from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.drive.loop import DriveLoop
 from blf_dsc_controller.errors import BlfDscError, TareError
-from blf_dsc_controller.law.external_torque import is_touched
+from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.script_link import ArmState, encode_sample

@@ -37,6 +37,7 @@ from blf_dsc_controller.law import (
     apparent_inertia,
     barrier,
     columns,
+    contact,
     disturbance,
     excitation,
     external_torque,
@@ -141,7 +142,8 @@ def _parts_of_learning(
             period=sliding.row_interval * config.sample_time,
             least_weight=sliding.prior_weight + sliding.regularization,
         ),
-        'contact': _contact(config, sliding),
+        'external': _external(config, sliding),
+        'contact': _contact(config),
         'weighing': _weighing(config, learned, row, sliding),
     }
 
@@ -318,17 +320,25 @@ def _adaptation(
     )
 
 
-def _contact(
+def _contact(config: ControllerConfig) -> contact.Settings:
+    """Return whether contacts are found, what they do, and what is no contact."""
+    given = config.contact
+    return filled(
+        contact.Settings,
+        given,
+        loads=int(given.loads and config.learning.weighing),
+        freezes=int(given.reaction != 'none'),
+    )
+
+
+def _external(
     config: ControllerConfig, sliding: window.Settings
 ) -> external_torque.Settings:
-    """Return whether contacts are found, what they do, and what is no contact."""
-    contact = config.contact
+    """Return how the external torque and its interval are found."""
     least = _least_floor(config)
     return filled(
         external_torque.Settings,
-        contact,
-        loads=int(contact.loads and config.learning.weighing),
-        freezes=int(contact.reaction != 'none'),
+        config.contact,
         window=sliding.length,
         row_interval=sliding.row_interval,
         coulomb_velocity=config.learning.coulomb_velocity,
@@ -366,7 +376,7 @@ def friction_settings(settings: Settings) -> friction.Settings:
         lag=settings.row.lag,
         pole=settings.row.filter_pole,
         reversals=reversals.Settings(
-            unmodelled=settings.contact.unmodelled,
+            unmodelled=settings.external.unmodelled,
             initial=of_coulomb(settings.initial_estimate),
             variance=of_coulomb(adapts.variance),
             least=of_coulomb(adapts.least),

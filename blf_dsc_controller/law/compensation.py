@@ -106,16 +106,17 @@ def measure_rotors(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Update J~ from the last interval."""
-    part, now, work = settings.rotors, state.rotors, signals.rotors
+    part, now, work = settings.rotors, state.rotors, signals.scratch.rotors
     if state.samples[0] <= 1.0:  # the first torque has had no effect yet
         apparent_inertia.begin(now, signals.dq, signals.applied)
         return
     apparent_inertia.pass_band(part, now, work, signals.dq, signals.applied, dt)
     if apparent_inertia.has_settled(state.samples[0], dt):
-        Yp, Yr = signals.momentum.Yp, signals.momentum.Yr
-        settings.model.momentum_regressor(signals.q, work.acceleration, Yp, Yr)
-        P0 = settings.initial_estimate
-        apparent_inertia.update(part, now, work, Yp, P0, dt)
+        momentum, P0 = signals.scratch.momentum, settings.initial_estimate
+        settings.model.momentum_regressor(
+            signals.q, work.acceleration, momentum.Yp, momentum.Yr
+        )
+        apparent_inertia.update(part, now, work, momentum.Yp, P0, dt)
 
 
 @inner

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torque from outside that the learned model does not explain, its interval, and a contact.
+"""Torque from outside that the learned model does not explain, and its interval.
 
 The row X theta = u + tau_ext of each interval (see `prediction`), whole, passes through
 a pole L:
@@ -29,14 +29,6 @@ tare.  At the tare, K = 1 and the torque is zero; the further the arm moves from
 and r_0 have in common, and the less K takes away.  A tare never widens an interval.  It is
 forgotten when the arm has changed, and at the next start.
 
-*A contact* is r with r^T S^-1 r > h^2, unless a load explains it.  A load in the tip with phi = D z
-adds X_L N D z (see `weighing`).  Once r is past h, z ~ (0, 1) is filtered from r, and only what is
-past h of S + X_L N D Cov(z) (X_L N D)^T is a contact: a load follows the arm in every posture and
-acceleration, another force does not.  A load cannot have negative mass: an arm that is known to
-hold no more than what z takes away presses on something.  A contact ends when r has stayed below
-half of h, or when a load has explained it for `_EXPLAINED`.  None is found before half a second
-after the first window.
-
 `perception` calls these functions after the torque has been sent, except for the filter.
 """
 
@@ -49,11 +41,7 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
-_LASTING = 0.2  # s, correlation time of r in the load filter
-_FORGETTING = 1.0  # s, in which the filtered load returns to its prior
 _FIRST = 0.5  # s since the first window, in which theta^ settles and s^2 is measured
-_CALM = 0.2  # s below half of the threshold, after which a contact is over
-_EXPLAINED = 0.5  # s, likewise for a load that explains it
 _REVERSING = 1.5  # `learning.coulomb_velocity`, below which a joint is about to reverse
 _RESTING = 0.005  # `learning.coulomb_velocity`, below which it rests
 _AFTER = (
@@ -65,22 +53,14 @@ _ASSUMED = (0.01, 0.1, 0.1)  # of a window, for which the unmodelled torque coun
 _REMEMBERED = (1.0, 4.0, 4.0)  # windows, over which the mean square is taken
 _LEAST_FRICTION = (0.0, 0.15, 0.05)  # of Coulomb friction, which is never known better
 _MOST_NOISE = 4.0  # times the mean square: r^2 is clipped at this multiple
-_LIGHTER = 3.0  # standard deviations below zero, from which a mass is negative
-
-QUIET, EXPLAINED, TOUCHED = range(3)
-"""Phases: r is small; it is large, but a load explains it; something touches the arm."""
 
 _STEADY, _SLOW, _REST = range(3)  # rows of `State.noise` and `State.samples`
 
 
 class Settings(NamedTuple):
-    """The parameters `contact.*`, and what they rest on."""
+    """The parameter `contact.bandwidth`, and what r rests on."""
 
-    enabled: int  # 1: the external torque is found
     bandwidth: float  # L, rad/s
-    threshold: float  # h
-    loads: int  # 1: what a load in the tip explains is no contact
-    freezes: int  # 1: nothing is learned while something touches the arm
     window: int  # N, rows in a window of the learning
     row_interval: int  # samples between two of them
     coulomb_velocity: float  # rad/s
@@ -110,12 +90,7 @@ class State(NamedTuple):
     tare_noise: Annotated[Array, 'n * contact.enabled']  # s_0^2, (N m)^2
     held: Cell  # w
     offset: Annotated[Array, 'n * contact.enabled']  # K r_0, N m
-    load: Annotated[Array, '10 * contact.enabled']  # z, filtered from r
-    load_covariance: Annotated[Array, '10 * contact.enabled', 10]
     torque: Annotated[Array, 'n * contact.enabled']  # r - K r_0, N m
-    phase: Cell  # QUIET, EXPLAINED or TOUCHED
-    calm: Cell  # s, since r has been small
-    explained: Cell  # s, since a load has explained a contact
 
 
 class Work(NamedTuple):
@@ -128,19 +103,6 @@ class Work(NamedTuple):
     shared: Annotated[Array, 'n * contact.enabled', 'n']  # rows of C, whitened by S_0
     coulomb: Annotated[Array, 'n * contact.enabled']  # c^, N m
     white: Annotated[Array, 'n * contact.enabled']  # r, whitened
-    columns: Annotated[Array, 'n * contact.enabled', 10]  # X_L N D, whitened
-    load: Annotated[Array, '10 * contact.enabled']  # z by this sample alone
-    load_covariance: Annotated[Array, '10 * contact.enabled', 10]
-    gain: Annotated[Array, '10 * contact.enabled']
-
-
-class TipLoad(NamedTuple):
-    """How a load in the tip acts, and what is known to be held."""
-
-    columns: Array  # of `weighing`: those of N D are first
-    scale: Array  # rows of D, likewise: mass [kg] and moments [kg m]
-    mass: float  # kg
-    deviation: float  # of the mass, kg; infinite where it is unknown
 
 
 @inner
@@ -361,201 +323,23 @@ def whiten_torque(state: State, work: Work) -> float:
 
 @inner
 def is_settled(state: State, dt: float) -> bool:
-    """Whether theta^ has settled since the first window, and s^2 is measured."""
+    """Whether theta^ has settled since the first window, from which on s^2 is measured."""
     seen = 0.0
     for k in range(3):
         seen += state.samples[k, 0]
-    return bool(state.latch_time[0] > 0.0 and seen * dt >= _FIRST)
+    return bool(seen * dt >= _FIRST)
 
 
 @inner
-def is_touched(state: State) -> bool:
-    """Whether something touches the arm."""
-    return bool(state.phase[0] == TOUCHED)
-
-
-@inner
-def absorb(
-    columns: Array, e: Array, noise: float, z: Array, covariance: Array, work: Array
-) -> float:
-    """Update z and its covariance by e = columns z + white noise of variance `noise`.
-
-    Returns the sum of the squared innovations, each over its variance.
-    """
-    size = z.size
-    square = 0.0
-    for i in range(e.size):
-        innovation = e[i]
-        variance = noise
-        for a in range(size):
-            innovation -= columns[i, a] * z[a]
-            work[a] = 0.0
-            for b in range(size):
-                work[a] += covariance[a, b] * columns[i, b]
-            variance += columns[i, a] * work[a]
-        square += innovation * innovation / variance
-        for a in range(size):
-            z[a] += work[a] * innovation / variance
-            for b in range(size):
-                covariance[a, b] -= work[a] * work[b] / variance
-    return square
-
-
-@inner
-def forget_load(state: State) -> None:
-    """Return to the prior of the load."""
-    for a in range(state.load.size):
-        state.load[a] = 0.0
-        for b in range(state.load.size):
-            state.load_covariance[a, b] = 1.0 if a == b else 0.0
-
-
-@inner
-def fill_load_columns(state: State, work: Work, load_columns: Array) -> None:
-    """Compute -X_L N D, whitened: the load is missing in X theta^ = u + r."""
-    n, m = work.rows.shape
-    columns = work.columns
-    for a in range(columns.shape[1]):
-        for i in range(n):
-            columns[i, a] = 0.0
-            for j in range(m):
-                columns[i, a] -= state.filtered[i, j] * load_columns[j, a]
-        for k in range(n):
-            columns[k, a] *= state.spread[k, k]
-            for i in range(k + 1, n):
-                columns[i, a] -= state.spread[k, i] * columns[k, a]
-
-
-@inner
-def filter_load(state: State, work: Work, dt: float) -> float:
-    """Filter the load from r, whitened; return how far r is from what any load explains."""
-    size = state.load.size
-    fade = min(1.0, dt / _FORGETTING)
-    for a in range(size):
-        state.load[a] -= fade * state.load[a]
-        work.load[a] = state.load[a]
-        for b in range(size):
-            prior = 1.0 if a == b else 0.0
-            state.load_covariance[a, b] += fade * (prior - state.load_covariance[a, b])
-            work.load_covariance[a, b] = state.load_covariance[a, b]
-    square = absorb(
-        work.columns, work.white, 1.0, work.load, work.load_covariance, work.gain
-    )
-    absorb(
-        work.columns,
-        work.white,
-        _LASTING / dt,
-        state.load,
-        state.load_covariance,
-        work.gain,
-    )
-    return sqrt(square)
-
-
-@inner
-def is_negative_mass(mass: float, variance: float) -> bool:
-    """Whether a mass [kg] is below zero beyond doubt, with its variance [kg^2]."""
-    return bool(mass < -_LIGHTER * sqrt(variance))
-
-
-@inner
-def takes_away_too_much(state: State, load: TipLoad) -> bool:
-    """Whether the filtered load takes away more mass than is held."""
-    mass = load.mass
-    variance = load.deviation * load.deviation
-    for a in range(state.load.size):
-        mass += load.scale[0, a] * state.load[a]
-        for b in range(state.load.size):
-            scale = load.scale[0, a] * load.scale[0, b]
-            variance += scale * state.load_covariance[a, b]
-    return is_negative_mass(mass, variance)
-
-
-@inner
-def explain_by_load(
-    settings: Settings,
-    state: State,
-    work: Work,
-    load: TipLoad,
-    distance: float,
-    dt: float,
-) -> float:
-    """Return the distance of r from what a load explains, or its `distance` without one."""
-    if settings.loads == 0:
-        return distance
-    fill_load_columns(state, work, load.columns)
-    remaining = filter_load(state, work, dt)
-    return distance if takes_away_too_much(state, load) else remaining
-
-
-@inner
-def is_small(phase: float, distance: float, threshold: float) -> bool:
-    """Whether r is too small for a contact, or for one that lasts."""
-    return bool(distance <= (0.5 if phase == TOUCHED else 1.0) * threshold)
-
-
-@inner
-def next_phase(
-    phase: float,
-    distance: float,
-    remaining: float,
-    calm: float,
-    explained: float,
-    threshold: float,
-) -> int:
-    """Return the phase that follows.
-
-    r is at a `distance`, which a load leaves `remaining`.  It has been small for `calm`
-    [s]; a load has explained a contact for `explained` [s].
-    """
-    if is_small(phase, distance, threshold):
-        return TOUCHED if phase == TOUCHED and calm < _CALM else QUIET
-    if remaining > threshold:
-        return TOUCHED
-    return TOUCHED if phase == TOUCHED and explained < _EXPLAINED else EXPLAINED
-
-
-@inner
-def update_contact(
-    settings: Settings,
-    state: State,
-    work: Work,
-    load: TipLoad,
-    distance: float,
-    dt: float,
-) -> float:
-    """Update the phase; return the distance of r from what explains it."""
-    phase = state.phase[0]
-    remaining = distance
-    if is_small(phase, distance, settings.threshold):
-        state.calm[0] += dt
-        state.explained[0] = 0.0
-    else:
-        state.calm[0] = 0.0
-        remaining = explain_by_load(settings, state, work, load, distance, dt)
-        is_explained = phase == TOUCHED and not remaining > settings.threshold
-        state.explained[0] = state.explained[0] + dt if is_explained else 0.0
-    state.phase[0] = next_phase(
-        phase,
-        distance,
-        remaining,
-        state.calm[0],
-        state.explained[0],
-        settings.threshold,
-    )
-    if state.phase[0] == QUIET or remaining > settings.threshold:
-        forget_load(state)
-    return remaining
-
-
-@inner
-def update_noise(settings: Settings, state: State, work: Work) -> None:
+def update_noise(
+    settings: Settings, state: State, work: Work, is_touched: bool
+) -> None:
     """Update s^2 from the first window on, while nothing touches the arm.
 
     At first it is the mean since the first window, with the unmodelled torque as a
     small part of it.  At rest after a tare, r says nothing of it.
     """
-    if state.latch_time[0] == 0.0 or is_touched(state):
+    if state.latch_time[0] == 0.0 or is_touched:
         return
     window = settings.window * settings.row_interval
     for i in range(state.torque.size):

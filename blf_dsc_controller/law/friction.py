@@ -275,9 +275,8 @@ def measure_reversals(
         if begins:
             continue
         k = state.breakaway[i]
-        if reversals.add_row(
-            settings.reversals, state.reversals, i, s_h, b_h, e_h, weight, k, dt
-        ):
+        row = reversals.Row(s_h, b_h, e_h, weight)
+        if reversals.add_row(settings.reversals, state.reversals, i, row, k, dt):
             state.drift_extremes[0, i] = 0.0
             state.drift_extremes[1, i] = 0.0
 

@@ -41,6 +41,7 @@ CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
 LASTING = 2.0  # s, in which a floor of s^2 falls to 1 / e
 MEMORY = 0.1  # s of motion, over which the last rows are averaged
+LATE = 0.15  # s, by which a change of the arm is found
 # times s^2: friction is no noise, and reaches what the noise of a sensor never would
 _ALARM = 8.0
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many

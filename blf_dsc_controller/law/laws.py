@@ -14,7 +14,7 @@ from typing import Any
 
 from numba.core import config
 
-from blf_dsc_controller.compiled.jit import SLOW, compile_methods, kernel
+from blf_dsc_controller.compiled.jit import SLOW, kernel
 from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.called_law import CalledLaw, called, is_callable
@@ -24,8 +24,6 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 
 PACKAGED = (BlfDsc, Backstepping)
 """Types of the package's laws."""
-
-compile_methods(Law, ('compute_demand', 'finish'), BlfDsc, CalledLaw)
 
 
 def for_kernels(

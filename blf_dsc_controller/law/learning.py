@@ -5,9 +5,7 @@
 
 columns, ripple   the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
-load_observer     the torque that joint torque sensors show beyond the model's
-torque_sensors    whether they are such sensors, and alive
-motor_friction    friction of the motors, by these sensors
+joint_sensors     what joint torque sensors show, where there are any
 window            sums of the rows over tau_d
 change            whether the arm has changed, so that the window must be forgotten
 excitation        whether a window is excited, consistent, and latched
@@ -31,12 +29,12 @@ from blf_dsc_controller.law import (
     excitation,
     external_torque,
     friction,
+    joint_sensors,
     load_observer,
     motor_friction,
     prediction,
     reversals,
     ripple,
-    torque_sensors,
     window,
 )
 from blf_dsc_controller.law.compensation import compute_regressors, fill_friction
@@ -65,7 +63,7 @@ def observe(
     samples = int(state.samples[0])
     if samples % settings.window.row_interval == 0:
         if settings.observer.enabled == 1:
-            add_friction_row(settings, state, signals)
+            joint_sensors.add_friction_row(settings, state, signals)
         window.push_row(state.window, signals.row.Xu)
         measure_reversals(settings, state, signals, settings.window.row_interval * dt)
     if settings.excitation.change_detection == 1:
@@ -75,48 +73,16 @@ def observe(
 
 
 @inner
-def senses_friction(settings: Settings, state: State) -> bool:
-    """Whether joint torque sensors have shown friction, and nothing speaks against them."""
-    return bool(
-        settings.observer.enabled == 1
-        and state.motors.rows[0] > 0.0
-        and state.observer.faded[0] == 0.0
-    )
-
-
-@inner
-def add_friction_row(settings: Settings, state: State, signals: Signals) -> None:
-    """Add the row to those that show the friction of the motors, unless a sensor is silent."""
-    of, now, row = settings.motors, state.motors, signals.row.Xu
-    if load_observer.is_missing(signals.effort):
-        return
-    moving = prediction.moving_share(signals.dqr, settings.row.motion_scale)
-    share = motor_friction.fade(of, now, moving)
-    for i in range(settings.n):
-        weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        g = motor_friction.friction_of_row(
-            now,
-            row,
-            weight,
-            i,
-            settings.observer.rotors,
-            settings.initial_estimate,
-            state.estimate,
-        )
-        motor_friction.add_row(now, row, i, g, share)
-
-
-@inner
 def check_excitation(
     settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
     """Latch the window at time t [s] if it suffices."""
-    sliding = Window(settings.window, state.window, signals.window)
+    sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.initial_estimate, settings.information)
     excitation.update_excitation(
         settings.excitation,
         state.latch,
-        signals.latch,
+        signals.scratch.latch,
         sliding,
         prior,
         settings.model,
@@ -127,7 +93,10 @@ def check_excitation(
     is_new = state.latch.latched[0] == 1.0 and state.latch.latch_time[0] == t
     if is_new and settings.observer.enabled == 1:
         motor_friction.solve(
-            settings.motors, state.motors, signals.motors, settings.information
+            settings.motors,
+            state.motors,
+            signals.scratch.motors,
+            settings.information,
         )
 
 
@@ -155,7 +124,7 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
         prediction.delay_torque(of, now, signals.applied, begins, dt)
         prediction.fill_interval(now, work, dt)
         if settings.observer.enabled == 1:
-            observe_load(settings, state, signals, dt)
+            joint_sensors.observe_load(settings, state, signals, dt)
         if settings.contact.enabled == 1:
             filter_external_torque(settings, state, signals, dt)
         prediction.pass_poles(of, now, work, signals.dqr, dt)
@@ -188,61 +157,8 @@ def filter_external_torque(
             settings.friction, state.friction, state.estimate, i
         )
         external_torque.filter_interval(
-            settings.contact, state.contact, i, signals.row.Xu[i], extra, dt
+            settings.external, state.external, i, signals.row.Xu[i], extra, dt
         )
-
-
-@inner
-def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Let `load_observer` find r by the row of the last interval, before its poles."""
-    of, now, row = settings.observer, state.observer, signals.row.Xu
-    if state.samples[0] <= 1.0:
-        load_observer.begin(now, state.disturbance)
-    if load_observer.is_missing(signals.effort):
-        return
-    had_settled = load_observer.has_settled(of, now)
-    for i in range(settings.n):
-        load_observer.filter_interval(of, now, i, row[i], signals.effort[i], dt)
-    load_observer.update(
-        of,
-        now,
-        signals.observer,
-        state.estimate,
-        state.motors.absorbed,
-        settings.information,
-        dt,
-    )
-    motor_friction.pass_poles(settings.motors, state.motors, now.late, dt)
-    torque_sensors.follow_applied(
-        state.sensors, row, settings.m, of.observer_bandwidth, dt
-    )
-    if load_observer.has_settled(of, now):
-        check_sensors(settings, state, signals, not had_settled, dt)
-
-
-@inner
-def check_sensors(
-    settings: Settings, state: State, signals: Signals, begins: bool, dt: float
-) -> None:
-    """Fade r out where efforts are not those of torque sensors at the links."""
-    of, now, work = state.observer, state.sensors, signals.sensors
-    limit = settings.torque.limit
-    for i in range(settings.n):
-        work.differences[0, i] = of.filtered[i, settings.p] - now.command[i]
-        if now.is_distinct[0] == 0.0:
-            work.differences[1, i] = load_observer.residual(
-                settings.observer, of, i, state.estimate, state.motors.absorbed
-            )
-    if begins:
-        torque_sensors.begin(now, of.torque)
-    torque_sensors.watch_shaking(now, work, limit, of.torque, dt)
-    if settings.observer.most[0] > 0.0:  # else a load is left out of r
-        torque_sensors.compare_with_commands(now, work, signals.dqr, begins, dt)
-    is_off = torque_sensors.follow_commands(
-        now, work, limit, signals.dq, signals.dqr, dt
-    )
-    torque_sensors.fade(now, of.faded, is_off, dt)
-    torque_sensors.calm(now, of.calmed, dt)
 
 
 @inner
@@ -261,7 +177,7 @@ def measure_reversals(
     latch, rows = state.latch, state.window.rows[0]
     length = settings.window.length
     since_latch = friction.update_since_latch(state.friction, latch.latched[0], period)
-    if senses_friction(settings, state):
+    if joint_sensors.shows_friction(settings, state):
         settled = rows * period * settings.row.filter_pole >= prediction.SETTLED
         begins = not settled or load_observer.is_missing(signals.effort)
     else:
@@ -281,7 +197,7 @@ def measure_reversals(
 @inner
 def fill_unexplained(settings: Settings, state: State, signals: Signals) -> None:
     """Write e, what all but Coulomb friction leaves of the torque, where `friction` reads it."""
-    senses = senses_friction(settings, state)
+    senses = joint_sensors.shows_friction(settings, state)
     rotors = settings.observer.rotors
     for i in range(settings.n):
         row, own = state.row.filter2[i], settings.friction.first_coulomb + i
@@ -304,12 +220,12 @@ def detect_change(
     of friction, only what reversals have shown of late is taken back.
     """
     of, latch, row = settings.excitation, state.latch, signals.row.Xu
-    sliding = Window(settings.window, state.window, signals.window)
+    sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.initial_estimate, settings.row_information)
     if change.is_predicted(sliding):
         has_changed = change.compare_with_rows(
             state.change,
-            signals.change,
+            signals.scratch.change,
             sliding,
             prior,
             row,
@@ -320,7 +236,7 @@ def detect_change(
         )
     else:
         has_changed = change.compare_with_solution(
-            of, state.change, signals.change, latch, row, dt
+            of, state.change, signals.scratch.change, latch, row, dt
         )
     if not has_changed:
         return
@@ -343,8 +259,8 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
     What is not learned from the window stays: Coulomb friction is of reversals, and the other
     friction of the sensors, if there are any.
     """
-    senses = senses_friction(settings, state)
-    before = signals.adaptation.tracked  # scratch here
+    senses = joint_sensors.shows_friction(settings, state)
+    before = signals.scratch.adaptation.tracked  # scratch here
     for j in range(settings.m):
         before[j] = state.estimate[j]
         is_sensed = senses and settings.p <= j < settings.motors.size
@@ -361,42 +277,7 @@ def transfer_learned(
     """Subtract from d^3 what theta^ has learned since `before` (m,), less what r gives up."""
     disturbance.transfer_learned(state.disturbance, signals.H, state.estimate, before)
     if settings.observer.enabled == 1:
-        load_observer.transfer_learned(
-            settings.observer,
-            state.observer,
-            state.disturbance,
-            state.estimate,
-            before,
-            state.motors.absorbed,
-            state.motors.absorbed,
-        )
-        load_observer.hand_over(
-            settings.observer,
-            state.observer,
-            state.disturbance,
-            signals.H,
-            state.estimate,
-            before,
-        )
-
-
-@inner
-def follow_absorbed(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Let P_f follow, as P^ does; d^3 takes what r loses."""
-    now, work = state.motors, signals.motors
-    of = settings.adaptation
-    motor_friction.follow(now, work, of.weight, of.adaptation_gain, dt)
-    load_observer.transfer_learned(
-        settings.observer,
-        state.observer,
-        state.disturbance,
-        state.estimate,
-        state.estimate,
-        now.absorbed,
-        work.before,
-    )
+        joint_sensors.transfer_learned(settings, state, signals.H, before)
 
 
 @inner
@@ -416,7 +297,7 @@ def adapt(
             follow_disturbance(settings, state, signals, dt)
         transfer_friction(settings, state, signals)
         return
-    of, work = settings.adaptation, signals.adaptation
+    of, work = settings.adaptation, signals.scratch.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
     adaptation.fill_prediction_error(of, work, latch, estimate)
     if latch.latched[0] == 1.0:
@@ -428,7 +309,7 @@ def adapt(
             estimate,
             work.rate,
         )
-        if senses_friction(settings, state):
+        if joint_sensors.shows_friction(settings, state):
             motor_friction.follow_columns(
                 state.motors,
                 settings.initial_estimate,
@@ -449,7 +330,7 @@ def adapt(
         if settings.disturbance.bumpless == 1:
             transfer_learned(settings, state, signals, work.tracked)
         if settings.observer.enabled == 1:
-            follow_absorbed(settings, state, signals, dt)
+            joint_sensors.follow_absorbed(settings, state, signals, dt)
         friction.adapt_breakaway(
             settings.friction, state.friction, signals.friction, dt
         )
@@ -473,7 +354,7 @@ def follow_disturbance(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF."""
-    work = signals.disturbance
+    work = signals.scratch.disturbance
     disturbance.fill_step(
         settings.disturbance, work, state.disturbance, signals.xi2, dt
     )
@@ -489,11 +370,11 @@ def scale_by_inertia(
     settings: Settings, state: State, signals: Signals, x: Array
 ) -> None:
     """Replace x (n,) by (M(q, P^(0)) + J~) x / m."""
-    Yp, Yr = signals.momentum.Yp, signals.momentum.Yr
+    momentum = signals.scratch.momentum
     for i in range(settings.n):
         x[i] /= settings.joint_inertia[i]
-    settings.model.momentum_regressor(signals.q, x, Yp, Yr)
+    settings.model.momentum_regressor(signals.q, x, momentum.Yp, momentum.Yr)
     for i in range(settings.n):
         x[i] *= state.rotors.error[i]
         for j in range(settings.p):
-            x[i] += Yp[i, j] * settings.initial_estimate[j]
+            x[i] += momentum.Yp[i, j] * settings.initial_estimate[j]

@@ -70,6 +70,14 @@ class Settings(NamedTuple):
     rotors: Annotated[Array, 'p * observer.enabled']
 
 
+class Links(NamedTuple):
+    """What is learned of the links: P_l = P^ - P_r - P_f."""
+
+    estimate: Array  # theta^ = [P^; d^] (m,)
+    rotors: Array  # P_r (p,), of the assumed rotors
+    absorbed: Array  # P_f (p,), of friction
+
+
 class State(NamedTuple):
     """What it keeps from one sample to the next."""
 
@@ -129,18 +137,14 @@ def filter_interval(
 
 
 @inner
-def residual(
-    settings: Settings, state: State, i: int, estimate: Array, absorbed: Array
-) -> float:
-    """Return tau_J,L - X_L P_l of joint i [N m].
-
-    The `estimate` is theta (m,), `absorbed` is P_f (p,).
-    """
+def residual(state: State, i: int, links: Links) -> float:
+    """Return tau_J,L - X_L P_l of joint i [N m]."""
     filtered = state.filtered[i]
     p = filtered.size - 1
     r = filtered[p]
     for j in range(p):
-        r -= filtered[j] * (estimate[j] - settings.rotors[j] - absorbed[j])
+        P_l = links.estimate[j] - links.rotors[j] - links.absorbed[j]
+        r -= filtered[j] * P_l
     return float(r)
 
 
@@ -173,27 +177,25 @@ def update(
     settings: Settings,
     state: State,
     work: Work,
-    estimate: Array,
-    absorbed: Array,
+    links: Links,
     information: Array,
     dt: float,
 ) -> None:
     """Compute r after an interval of `dt` [s], and its bias once the filters have settled.
 
-    The `information` (m, m) is the inverse covariance of the prior of theta; P_f (p,) is
-    `absorbed` of friction.
+    The `information` (m, m) is the inverse covariance of the prior of theta.
     """
     settling = _SETTLING / settings.observer_bandwidth
     before = state.elapsed[0]
     state.elapsed[0] = before + dt
     if before < settling <= state.elapsed[0]:
-        find_bias(settings, state, work, estimate, absorbed, information)
+        find_bias(settings, state, work, links, information)
     release_bias(settings, state, dt)
     passed = filter_gain(1.0 / settings.observer_bandwidth, dt)
     slowly = filter_gain(_SLOW, dt)
     for i in range(state.torque.size):
         state.handover[i] -= passed * state.handover[i]
-        shown = residual(settings, state, i, estimate, absorbed) - state.bias[i]
+        shown = residual(state, i, links) - state.bias[i]
         state.over[i] = clip(abs(shown) - settings.most[i], 0.0, state.over[i])
         r = load_torque(settings, state, i, shown)
         state.slow[i] += slowly * (r - state.slow[i])
@@ -212,12 +214,7 @@ def release_bias(settings: Settings, state: State, dt: float) -> None:
 
 @inner
 def find_bias(
-    settings: Settings,
-    state: State,
-    work: Work,
-    estimate: Array,
-    absorbed: Array,
-    information: Array,
+    settings: Settings, state: State, work: Work, links: Links, information: Array
 ) -> None:
     """Subtract what the sensors show at the start; keep it where the prior does not explain it."""
     m = information.shape[0]
@@ -225,9 +222,9 @@ def find_bias(
         for k in range(j, m):
             work.factor[j, k] = information[j, k]
     cholesky_factor(work.factor)
+    p = state.filtered.shape[1] - 1
     for i in range(state.bias.size):
-        state.bias[i] = residual(settings, state, i, estimate, absorbed)
-        p = state.filtered.shape[1] - 1
+        state.bias[i] = residual(state, i, links)
         for j in range(m):
             work.row[j] = state.filtered[i, j] if j < p else 0.0
         f = settings.unmodelled[i]
@@ -252,18 +249,13 @@ def transfer_learned(
     settings: Settings,
     state: State,
     disturbance: Array,
-    theta: Array,
-    before: Array,
-    absorbed: Array,
-    absorbed_before: Array,
+    links: Links,
+    before: Links,
 ) -> None:
-    """Add to d^3, the `disturbance` (n,) [N m], what r has given up since `before`.
-
-    That is by a change of theta (m,), and of what it has `absorbed` (p,).
-    """
+    """Add to d^3, the `disturbance` (n,) [N m], what r has given up since the links `before`."""
     for i in range(state.torque.size):
-        was = residual(settings, state, i, before, absorbed_before) - state.bias[i]
-        shown = residual(settings, state, i, theta, absorbed) - state.bias[i]
+        was = residual(state, i, before) - state.bias[i]
+        shown = residual(state, i, links) - state.bias[i]
         given_up = load_torque(settings, state, i, was)
         take_over(settings, state, i, shown, was)
         given_up -= load_torque(settings, state, i, shown)
@@ -277,12 +269,12 @@ def hand_over(
     state: State,
     disturbance: Array,
     H: Array,
-    theta: Array,
-    before: Array,
+    links: Links,
+    before: Links,
 ) -> None:
     """Take from d^3, the `disturbance` (n,) [N m], what it has given up only since r is late.
 
-    By a change of theta (m,) since `before`, d^3 has given up (H - X_L) (theta - before), H (n, m)
+    By a change of theta^ since `before`, d^3 has given up (H - X_L) (theta^ - before), H (n, m)
     being at the reference and now.  It is not the arm's and fades as r catches up.
     """
     if not has_settled(settings, state):
@@ -291,7 +283,8 @@ def hand_over(
     for i in range(state.torque.size):
         late = 0.0
         for j in range(p):
-            late += (H[i, j] - state.filtered[i, j]) * (theta[j] - before[j])
+            change = links.estimate[j] - before.estimate[j]
+            late += (H[i, j] - state.filtered[i, j]) * change
         late *= 1.0 - state.faded[0]
         disturbance[i] += late
         state.handover[i] -= late

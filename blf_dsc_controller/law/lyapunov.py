@@ -47,11 +47,11 @@ def fill_energies(
         V[k] = 0.0 if settings.truth.known == 1 else nan
     if settings.truth.known == 0:
         return
-    P, Yp, Yr = settings.truth.parameters, signals.momentum.Yp, signals.momentum.Yr
-    settings.model.momentum_regressor(signals.q, signals.xi2, Yp, Yr)
+    P, momentum = settings.truth.parameters, signals.scratch.momentum
+    settings.model.momentum_regressor(signals.q, signals.xi2, momentum.Yp, momentum.Yr)
     for i in range(n):
         for j in range(p):
-            V[1] += 0.5 * signals.xi2[i] * Yp[i, j] * P[j]
+            V[1] += 0.5 * signals.xi2[i] * momentum.Yp[i, j] * P[j]
     for j in range(p):
         if settings.adaptation.adaptation_gain[j] > 0.0:
             error = P[j] - state.estimate[j]

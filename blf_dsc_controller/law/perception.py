@@ -11,8 +11,14 @@ from math import sqrt
 from blf_dsc_controller.arms.model import ArmModel
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import external_torque, prediction, weighing, window
-from blf_dsc_controller.law.external_torque import TipLoad
+from blf_dsc_controller.law import (
+    contact,
+    external_torque,
+    prediction,
+    weighing,
+    window,
+)
+from blf_dsc_controller.law.contact import Seen, TipLoad
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.state import (
     Sample,
@@ -33,18 +39,18 @@ CONTACT, DISTANCE = 0, 1  # in `sample.contact`
 def update_covariance(settings: Settings, state: State) -> None:
     """Give `external_torque` the covariance of theta: of the prior, then of each full window."""
     if state.samples[0] <= 1.0:
-        external_torque.begin(settings.contact, state.contact, settings.information)
+        external_torque.begin(settings.external, state.external, settings.information)
         return
-    if state.change.changes[0] != state.contact.tare_changes[0]:
-        external_torque.forget_tare(state.contact)
+    if state.change.changes[0] != state.external.tare_changes[0]:
+        external_torque.forget_tare(state.external)
     latch = state.latch
     is_full = window.is_full(settings.window, state.window) and latch.latched[0] == 1.0
-    if is_full and latch.latch_time[0] != state.contact.latch_time[0]:
+    if is_full and latch.latch_time[0] != state.external.latch_time[0]:
         excess = max(1.0, latch.residual[0] / settings.excitation.residual_floor)
         external_torque.update_covariance(
-            state.contact,
+            state.external,
             latch.factor,
-            settings.contact.row_variance * excess,
+            settings.external.row_variance * excess,
             latch.latch_time[0],
         )
 
@@ -64,9 +70,7 @@ def update_external_torque(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> float:
     """Find r of the last sample and whether it is a contact; return its distance from none."""
-    part = settings.contact
-    now = state.contact
-    work = signals.contact
+    part, now, work = settings.external, state.external, signals.scratch.external
     update_covariance(settings, state)
     fill_coulomb(settings, state, work.coulomb)
     external_torque.update_torque(now, state.estimate)
@@ -77,12 +81,25 @@ def update_external_torque(
         external_torque.update_spread(part, now, work, state.estimate)
     distance = external_torque.whiten_torque(now, work)
     if external_torque.is_settled(now, dt):
-        tip = settings.weighing
-        mass, deviation = weighing.held_mass(state.weighing)
-        load = TipLoad(tip.columns, tip.scale, mass, deviation)
-        distance = external_torque.update_contact(part, now, work, load, distance, dt)
-    external_torque.update_noise(part, now, work)
+        distance = update_contact(settings, state, signals, distance, dt)
+    touched = contact.is_touched(state.contact)
+    external_torque.update_noise(part, now, work, touched)
     return distance
+
+
+@inner
+def update_contact(
+    settings: Settings, state: State, signals: Signals, distance: float, dt: float
+) -> float:
+    """Find whether r, at a `distance` from zero, is a contact; return the remaining one."""
+    tip = settings.weighing
+    mass, deviation = weighing.held_mass(state.weighing)
+    load = TipLoad(tip.columns, tip.scale, mass, deviation)
+    r, white = state.external, signals.scratch.external.white
+    seen = Seen(r.filtered, r.spread, white, distance)
+    return contact.update(
+        settings.contact, state.contact, signals.scratch.contact, seen, load, dt
+    )
 
 
 @inner
@@ -94,12 +111,12 @@ def fill_sample(
     sample: Sample,
 ) -> None:
     """Write r with its interval, and the contact, to the telemetry sample."""
-    now, work = state.contact, signals.contact
+    now, work = state.external, signals.scratch.external
     for i in range(now.torque.size):
         sample.external[i] = now.torque[i]
-        deviation = sqrt(external_torque.variance_of(settings.contact, now, work, i))
+        deviation = sqrt(external_torque.variance_of(settings.external, now, work, i))
         sample.external_interval[i] = TWO_SIDED * deviation
-    sample.contact[CONTACT] = 1.0 if external_torque.is_touched(now) else 0.0
+    sample.contact[CONTACT] = 1.0 if contact.is_touched(state.contact) else 0.0
     sample.contact[DISTANCE] = distance
 
 
@@ -119,9 +136,9 @@ def sense(
     settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
-    was_touched = external_torque.is_touched(state.contact)
+    was_touched = contact.is_touched(state.contact)
     distance = update_external_torque(settings, state, signals, dt)
-    is_touched = external_torque.is_touched(state.contact)
+    is_touched = contact.is_touched(state.contact)
     if is_touched and settings.contact.freezes == 1:
         state.frozen[0] = prediction.SETTLED / settings.row.filter_pole
     fill_sample(settings, state, signals, distance, sample_of(sample_vector, settings))
@@ -146,7 +163,7 @@ def fill_breakaway(settings: Settings, state: State, signals: Signals) -> None:
     """Compute the shapes of breakaway, filtered and weighted as the row."""
     for i in range(settings.n):
         weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        signals.weighing.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
+        signals.scratch.weighing.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
 
 
 @kernel
@@ -167,15 +184,17 @@ def weigh(
     weighing.add_row(
         settings.weighing,
         state.weighing,
-        signals.weighing,
+        signals.scratch.weighing,
         Prior(settings.initial_estimate, settings.row_information),
-        signals.row.Xu,
-        signals.weighing.shapes,
-        state.friction.shape_lags[0, 2],
-        signals.dqr,
-        int(state.samples[0]),
-        state.change.changes[0],
-        dt,
+        weighing.Sample(
+            signals.row.Xu,
+            signals.scratch.weighing.shapes,
+            state.friction.shape_lags[0, 2],
+            signals.dqr,
+            int(state.samples[0]),
+            state.change.changes[0],
+            dt,
+        ),
     )
 
 

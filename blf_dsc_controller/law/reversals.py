@@ -31,6 +31,7 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
+from blf_dsc_controller.law.innovation import LATE
 from blf_dsc_controller.law.lag import filter_gain
 
 _ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
@@ -38,7 +39,6 @@ _SHOWN = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its frictio
 _PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
-_LATE = 0.15  # s, by which a change of the arm is found
 _NEAR = 0.1  # s around a reversal in which its torque is compared with friction's
 _USUAL = 4.0  # s, of what is away from reversals: its noise
 _CHANCE = 2.0  # times its mean square
@@ -60,6 +60,15 @@ class Settings(NamedTuple):
     most: Annotated[Array, 'n']
 
 
+class Row(NamedTuple):
+    """A row of one joint behind the high pass."""
+
+    s: float  # s_h
+    b: float  # b_h
+    e: float  # e_h, N m
+    weight: float  # p dt
+
+
 class Shown(NamedTuple):
     """What reversals have shown."""
 
@@ -77,7 +86,7 @@ class State(NamedTuple):
     """What it keeps from one row to the next."""
 
     shown: Shown
-    earlier: Shown  # some `_LATE` ago or less
+    earlier: Shown  # some `LATE` ago or less
     earliest: Shown  # one to two times as long ago
     since_kept: Cell  # s
     # p int of s_h^2, e_h^2 [(N m)^2] and 1 dt, faded by `_NEAR`
@@ -107,36 +116,35 @@ def add_row(
     settings: Settings,
     state: State,
     i: int,
-    s: float,
-    b: float,
-    e: float,
-    weight: float,
+    row: Row,
     k: float,
     dt: float,
 ) -> bool:
-    """Add s_h, b_h and e_h of a row of joint i to its present reversal, by their weight p dt.
+    """Add a row of joint i, `dt` [s] after the last, to its present reversal.
 
-    Return whether that shows its friction since this row, `dt` [s] after the last.  k is k^.
+    Return whether that shows its friction since this row.  k is k^.
     """
     now = state.shown.present
+    s, b, e, weight = row
     was_shown = counted(settings, state, i, k) > 0.0
     now[_SE, i] += weight * s * e
     now[_BE, i] += weight * b * e
     now[_SS, i] += weight * s * s
     now[_SB, i] += weight * s * b
     now[_BB, i] += weight * b * b
-    add_torque(state, i, s * s, e * e, weight, dt)
+    add_torque(state, i, row, dt)
     return find_last(settings, state, i, k, was_shown)
 
 
 @inner
-def add_torque(
-    state: State, i: int, ss: float, ee: float, weight: float, dt: float
-) -> None:
+def add_torque(state: State, i: int, row: Row, dt: float) -> None:
     """Add e_h^2 of joint i to the torque around its reversal, from `_NEAR` before it to after it.
 
-    The row's `weight` is p dt, with `dt` [s]; away from reversals e_h is noise.
+    Away from reversals e_h is noise.
     """
+    weight = row.weight
+    ss = row.s * row.s
+    ee = row.e * row.e
     recent, usual, shown = state.recent, state.usual, state.shown
     reversed_before = recent[0, i] > _TOUCHED
     fade(recent, i, _NEAR, dt)
@@ -272,26 +280,22 @@ def learned(
     ss = sums[_SS, i] + share * latest[_SS, i] + pull
     sb = sums[_SB, i] + share * latest[_SB, i]
     bb = sums[_BB, i] + share * latest[_BB, i] + _STRIBECK_PRIOR * pull
-    determinant = ss * bb - sb * sb
+    # c and c k, times the determinant of the equations, which the pull keeps positive
+    coulomb = se * bb - be * sb
+    stribeck = be * ss - se * sb
     k = 0.0
-    if determinant > 0.0:
-        coulomb = se * bb - be * sb
-        stribeck = be * ss - se * sb
-        if coulomb > 0.0:
-            k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
-        elif stribeck > 0.0:
-            k = _MOST_STRIBECK
-    total = ss + 2.0 * k * sb + k * k * bb
-    if total <= 0.0:
-        return settings.initial[i], 0.0
-    return (se + k * be) / total, k
+    if coulomb > 0.0:
+        k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
+    elif stribeck > 0.0:
+        k = _MOST_STRIBECK
+    return (se + k * be) / (ss + 2.0 * k * sb + k * k * bb), k
 
 
 @inner
 def keep(state: State, dt: float) -> None:
-    """Keep what reversals have shown, each `_LATE`, and what was kept before; `dt` [s] later."""
+    """Keep what reversals have shown, each `LATE`, and what was kept before; `dt` [s] later."""
     state.since_kept[0] += dt
-    if state.since_kept[0] > _LATE:
+    if state.since_kept[0] > LATE:
         state.since_kept[0] = 0.0
         copy(state.earlier, state.earliest)
         copy(state.shown, state.earlier)

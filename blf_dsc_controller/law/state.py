@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of a law, its state between samples, signals within one, telemetry: flat vectors.
 
-Each part of the law has its own `Settings`, `State` and scratch beside its functions.
-Here they are put together, with the arrays that a sample passes on from one part to the
-next.
+Each part of the law has its own `Settings`, `State` and `Work` beside its functions.  Here they
+are put together, with the arrays that a sample passes on from one part to the next.  A `Work`
+that other parts read is among the `Signals`, any other is `Scratch`.
 
 A controller is saved, restored and compared by copying and comparing its state vector:
 the package keeps no other state of the loop.
@@ -22,6 +22,7 @@ from blf_dsc_controller.law import (
     barrier,
     change,
     columns,
+    contact,
     disturbance,
     excitation,
     external_torque,
@@ -76,7 +77,8 @@ class Settings(NamedTuple):
     window: window.Settings
     excitation: excitation.Settings
     adaptation: adaptation.Settings
-    contact: external_torque.Settings
+    external: external_torque.Settings
+    contact: contact.Settings
     friction: friction.Settings
     rotors: apparent_inertia.Settings
     weighing: weighing.Settings
@@ -99,7 +101,8 @@ class State(NamedTuple):
     sensors: torque_sensors.State
     latch: excitation.State
     change: change.State
-    contact: external_torque.State
+    external: external_torque.State
+    contact: contact.State
     friction: friction.State
     rotors: apparent_inertia.State
     weighing: weighing.State
@@ -114,11 +117,25 @@ class Momentum(NamedTuple):
     Yr: Annotated[Array, 'n', 'm']
 
 
-class Signals(NamedTuple):
-    """Values that a law reads and computes in one sample.
+class Scratch(NamedTuple):
+    """What each part computes for itself: nothing of it outlasts the work of that part."""
 
-    First those that parts pass on to one another, then what each keeps for itself.
-    """
+    momentum: Momentum
+    disturbance: disturbance.Work
+    observer: load_observer.Work
+    motors: motor_friction.Work
+    window: window.Work
+    latch: excitation.Work
+    change: change.Work
+    adaptation: adaptation.Work
+    external: external_torque.Work
+    contact: contact.Work
+    rotors: apparent_inertia.Work
+    weighing: weighing.Work
+
+
+class Signals(NamedTuple):
+    """Values of one sample that the parts of a law pass on to one another."""
 
     q: Annotated[Array, 'n']  # rad
     dq: Annotated[Array, 'n']  # rad/s
@@ -135,25 +152,15 @@ class Signals(NamedTuple):
     demand: Annotated[Array, 'n']  # whole torque (28) before saturation, N m
     torque: Annotated[Array, 'n']  # commanded torque, N m
     H: Annotated[Array, 'n', 'm']  # of what is learned: [H | compensated columns]
-    momentum: Momentum  # scratch
     truth: truth.Work
     barrier: barrier.Work
     surface: surface.Work
     feedback: feedback.Work
-    disturbance: disturbance.Work
     saturation: torque.Work
     row: prediction.Work
-    observer: load_observer.Work
-    motors: motor_friction.Work
     sensors: torque_sensors.Work
-    window: window.Work
-    latch: excitation.Work
-    change: change.Work
-    adaptation: adaptation.Work
-    contact: external_torque.Work
     friction: friction.Work
-    rotors: apparent_inertia.Work
-    weighing: weighing.Work
+    scratch: Scratch
 
 
 class Sample(NamedTuple):

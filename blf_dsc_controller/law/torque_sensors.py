@@ -63,7 +63,7 @@ _STRONG = 0.5  # of the torque limit, a twentieth of which is a wave
 class State(NamedTuple):
     """What it keeps from one sample to the next."""
 
-    fault: Cell  # NONE, SHAKES, COMMANDS or OFF
+    fault: Cell  # one of NONE to OFF
     joint: Cell  # that shows it
     is_distinct: Cell  # 1: efforts are known not to be commands
     moved: Cell  # s of motion so far
@@ -141,16 +141,19 @@ def note_shaken(state: State) -> None:
 
 @inner
 def compare_with_commands(
-    state: State, work: Work, reference_speed: Array, begins: bool, dt: float
+    state: State, work: Work, dqr: Array, begins: bool, dt: float
 ) -> None:
-    """Find whether efforts are commands, by `work.differences`: `begins` with them."""
+    """Find whether efforts are commands, by `work.differences`: `begins` with them.
+
+    dqr (n,) is the velocity of the reference [rad/s].
+    """
     if state.is_distinct[0] == 1.0:
         return
-    n = reference_speed.size
+    n = dqr.size
     share = filter_gain(1.0 / (2.0 * pi * _SLOWEST), dt)
     moves = False
     for i in range(n):
-        moves = moves or abs(reference_speed[i]) > _MOVES
+        moves = moves or abs(dqr[i]) > _MOVES
     for k in range(2):
         for i in range(n):
             if begins:
@@ -185,26 +188,21 @@ def decide(state: State) -> None:
 
 
 @inner
-def follow_commands(
-    state: State,
-    work: Work,
-    limit: Array,
-    speed: Array,
-    reference_speed: Array,
-    dt: float,
+def watch_following(
+    state: State, work: Work, limit: Array, dq: Array, dqr: Array, dt: float
 ) -> bool:
-    """Find whether efforts are off; return whether they are now, which may pass.
+    """Find whether efforts are off, for good; return whether they are now, which may pass.
 
-    `limit` (n,) [N m] is that of the torques; the arm follows its reference where the
-    speeds (n,) [rad/s] are about equal.
+    `limit` (n,) [N m] is that of the torques.  The arm follows its reference where dq and
+    dqr (n,) [rad/s] are about equal.
     """
     n = limit.size
     square = 0.0
     for i in range(n):
-        square += reference_speed[i] * reference_speed[i]
+        square += dqr[i] * dqr[i]
     is_off = False
     for i in range(n):
-        late = speed[i] - reference_speed[i]
+        late = dq[i] - dqr[i]
         follows = square > _MOVES * _MOVES
         follows = follows and late * late < _FOLLOWS * _FOLLOWS * square
         is_one = abs(work.differences[0, i]) > _OFF * limit[i]

@@ -17,7 +17,7 @@ The rows before are those of the first window, or of less if they contradict eac
 weighed, too.  Where later rows contradict the solution, something else is held.  If
 what was held until then is clearly less than nothing, the arm held a load before: what
 is lightest is taken for nothing.  If it was nothing, its rows are added to those before
-until they make a window.  Rows are kept apart until they are 0.15 to 0.3 s old, so that
+until they make a window.  Rows are kept apart for `innovation.LATE`, and then once more, so that
 those of a change that has not been found yet can be discarded.
 
 Rows of slow joints count little, since they may stick.  Friction must not be taken for a load,
@@ -48,8 +48,6 @@ from blf_dsc_controller.law.prediction import SETTLED, moving_share, moving_squa
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 _FEWEST = 0.5  # s of motion that a part has
-# s, for which the latest rows are kept apart, and then those of them again
-_APART = 0.15
 _CHANGING = 20.0  # s, until the variance of e has grown
 # rad/s or m/s, below which friction is least like its columns, and rows count less
 _SLOW = 0.1
@@ -99,6 +97,18 @@ class State(NamedTuple):
     load: Annotated[Array, 8]
 
 
+class Sample(NamedTuple):
+    """What it reads of a sample."""
+
+    Xu: Array  # [X | u] (n, m + 1)
+    shapes: Array  # of breakaway (n,), filtered and weighted as the row
+    signs: Array  # s of the motion (n,), filtered alone
+    dqr: Array  # (n,) rad/s
+    samples: int  # number of samples so far
+    changes: float  # of the arm that were found so far
+    dt: float  # s
+
+
 class Work(NamedTuple):
     """Scratch of one row."""
 
@@ -119,31 +129,20 @@ def add_row(
     state: State,
     work: Work,
     prior: Prior,
-    given: Array,
-    shapes: Array,
-    signs: Array,
-    dqr: Array,
-    samples: int,
-    changes: float,
-    dt: float,
+    sample: Sample,
 ) -> None:
-    """Add the row of this sample if one is due, and solve for the load ten times a second.
-
-    The row that is `given` is [X | u] (n, m + 1), the `shapes` (n,) of breakaway are
-    filtered and weighted as it is, the `signs` s (n,) of the motion filtered alone.  dqr (n,) is
-    the velocity of the reference [rad/s], `samples` the number of samples of `dt` [s],
-    `changes` that of the changes of the arm found so far.
-    """
+    """Add the row of this sample if one is due, and solve for the load ten times a second."""
+    samples, dqr = sample.samples, sample.dqr
     if samples % settings.row_interval != settings.row_interval // 2:
         return
-    period = settings.row_interval * dt
-    has_changed = changes != state.changes[0]
-    state.changes[0] = changes
+    period = settings.row_interval * sample.dt
+    has_changed = sample.changes != state.changes[0]
+    state.changes[0] = sample.changes
     if not is_first(state):
         state.age[0] += period
     row = work.row
     find_held(settings, state, work.held)
-    extend_row(given, shapes, signs, work.held, row)
+    extend_row(sample, work.held, row)
     weight_row(row, dqr)
     if samples <= settings.row_interval:
         begin(settings, state, work, prior, period)
@@ -166,7 +165,7 @@ def refresh(
     """Use the rows that are old enough, and solve for the load, each when it is due."""
     if is_first(state) and rows_before(state) >= settings.window:
         state.complete[0] = 1.0
-    if rows % max(1, round(_APART / period)) == 0:
+    if rows % max(1, round(innovation.LATE / period)) == 0:
         promote(settings, state)
     if rows % max(1, round(innovation.REFRESH / period)) == 0:
         solve(settings, state, work, prior, period)
@@ -186,10 +185,9 @@ def find_held(settings: Settings, state: State, held: Array) -> None:
 
 
 @inner
-def extend_row(
-    given: Array, shapes: Array, signs: Array, held: Array, row: Array
-) -> None:
+def extend_row(sample: Sample, held: Array, row: Array) -> None:
     """Write [X | u] (n, m + 1) with columns of b, then of k, to `row`."""
+    given, shapes, signs = sample.Xu, sample.shapes, sample.signs
     n = shapes.size
     m = row.shape[1] - 1 - 2 * n
     for i in range(n):

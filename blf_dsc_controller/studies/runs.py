@@ -43,10 +43,10 @@ from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.factory.controller import controller_of
-from blf_dsc_controller.law.controller import update
 from blf_dsc_controller.law.perception import sense
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.state import Sample
+from blf_dsc_controller.law.step import update
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.run import Contact

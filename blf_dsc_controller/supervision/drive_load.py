@@ -25,8 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.external_torque import is_touched
 from blf_dsc_controller.law.load_observer import most_load
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.law.weighing import DEVIATION, MASS

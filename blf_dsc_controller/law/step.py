@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One sample of the loop: from the measurement to the torque.
+
+See `interface` for what the loop does for every law, and what a law does itself.
+"""
+
+from __future__ import annotations
+
+from math import nan
+
+from blf_dsc_controller.arms.model import ArmModel
+from blf_dsc_controller.compiled.jit import compile_methods, inner, kernel
+from blf_dsc_controller.compiled.layout import Array
+from blf_dsc_controller.law import (
+    barrier,
+    oscillation,
+    repeats,
+    torque,
+    torque_sensors,
+    truth,
+)
+from blf_dsc_controller.law.blf_dsc import BlfDsc
+from blf_dsc_controller.law.called_law import CalledLaw
+from blf_dsc_controller.law.check_state import (
+    CONTRADICTION,
+    INVALID,
+    NOT_SENSORS,
+    OSCILLATES,
+    Checks,
+    checks_of,
+)
+from blf_dsc_controller.law.checks import (
+    check_sample,
+    is_valid_state,
+    watch_oscillation,
+)
+from blf_dsc_controller.law.interface import Law
+from blf_dsc_controller.law.lyapunov import fill_energies
+from blf_dsc_controller.law.sensor import compare_velocities
+from blf_dsc_controller.law.state import (
+    Sample,
+    Settings,
+    Signals,
+    State,
+    sample_of,
+    settings_of,
+    signals_of,
+    state_of,
+)
+from blf_dsc_controller.law.weighing import DEVIATION
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
+from blf_dsc_controller.reference import terms as reference
+
+compile_methods(Law, ('compute_demand', 'finish'), BlfDsc, CalledLaw)
+
+
+@inner
+def fill_sample(
+    settings: Settings, state: State, signals: Signals, sample: Sample
+) -> None:
+    """Fill the telemetry sample, except for the terms of (29)."""
+    for i in range(settings.n):
+        sample.qr[i] = signals.qr[i]
+        sample.dqr[i] = signals.dqr[i]
+        sample.xi1[i] = signals.xi1[i]
+        sample.xi2[i] = signals.xi2[i]
+        sample.torque[i] = signals.torque[i]
+        sample.disturbance[i] = state.disturbance[i] + signals.friction.torque[i]
+        for j in range(settings.p, settings.m):
+            sample.disturbance[i] += signals.H[i, j] * state.estimate[j]
+        if settings.observer.enabled == 1:
+            sample.disturbance[i] += state.observer.torque[i]
+        sample.bound[i] = signals.bound[i]
+        sample.cuts[i] = signals.saturation.cuts[i]
+    for j in range(settings.m):
+        sample.estimate[j] = state.estimate[j] if state.latch.active[j] != 0.0 else nan
+    sample.lambda_min[0] = state.latch.lambda_min[0]
+    sample.latched[0] = state.latch.latched[0]
+    sample.changes[0] = state.change.changes[0]
+    load = state.weighing.load
+    for k in range(load.size):
+        is_known = load[DEVIATION + k % DEVIATION] > 0.0
+        factor = 1.0 if k < DEVIATION else TWO_SIDED
+        sample.load[k] = factor * load[k] if is_known else nan
+
+
+@inner
+def check_measurement(checks: Checks, measurement: Array, dt: float) -> int:
+    """Return the flags of a measurement that the law must not use, or 0; update the sensor's."""
+    if checks.velocity_limit[0] <= 0.0:
+        return 0  # nothing is checked
+    if not is_valid_state(checks, measurement):
+        return INVALID
+    T = checks.sample_time[0]
+    if T > 0.0 and compare_velocities(
+        checks.sensor, checks.oscillation, T, dt, measurement
+    ):
+        return INVALID | CONTRADICTION
+    return 0
+
+
+@inner
+def take_measurement(
+    checks: Checks, signals: Signals, measurement: Array, begins: bool, dt: float
+) -> None:
+    """Write q, dq and effort into the signals, without repeats if there are checks."""
+    used = measurement
+    if checks.velocity_limit[0] > 0.0:
+        T = checks.sample_time[0]
+        repeats.bridge(checks.repeats, measurement, begins, T, dt)
+        used = checks.repeats.used
+    n = signals.q.size
+    for i in range(n):
+        signals.q[i] = used[i]
+        signals.dq[i] = used[n + i]
+        signals.effort[i] = used[2 * n + i]
+
+
+@inner
+def prepare(
+    settings: Settings,
+    state: State,
+    signals: Signals,
+    reference_vector: Array,
+    t: float,
+) -> None:
+    """Find what every law reads: torques at work, reference, bound and error."""
+    torque.find_added(settings.torque, signals.saturation, signals.q)
+    torque.find_applied(
+        state.saturation, signals.saturation, state.torque, signals.applied
+    )
+    reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
+    truth.update_disturbance(settings.truth, signals.truth, t)
+    barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
+    for i in range(settings.n):
+        signals.xi1[i] = signals.q[i] - signals.qr[i]
+
+
+@inner
+def advance(
+    law: Law, settings: Settings, state: State, signals: Signals, t: float, dt: float
+) -> None:
+    """Let the law compute its torque, within its limits, and advance its memory by `dt` [s]."""
+    has_last = state.samples[0] > 0.0 or state.saturation.takes_over[0] > 0.0
+    law.compute_demand(settings, state, signals, t, dt)
+    saturated = torque.saturate(
+        settings.torque,
+        state.saturation,
+        signals.saturation,
+        signals.demand,
+        state.torque,
+        has_last,
+        dt,
+        signals.torque,
+    )
+    law.finish(settings, state, signals, dt, saturated)
+    for i in range(settings.n):
+        state.torque[i] = signals.torque[i]
+    state.samples[0] += 1.0
+
+
+@inner
+def step(
+    law: Law,
+    settings: Settings,
+    checks: Checks,
+    reference_vector: Array,
+    state: State,
+    signals: Signals,
+    t: float,
+    dt: float,
+    measurement: Array,
+    sample: Sample,
+) -> int:
+    """Run one sample, from the measurement to the torque; return the flags of its `checks`.
+
+    The measurement is [q (n,) rad, dq (n,) rad/s, effort of the last interval (n,) N
+    m], t [s] the time since the start, dt [s] since the last sample (at the first:
+    until the next).  The terms of (29) are separate: `lyapunov.fill_energies`.
+    """
+    flags = check_measurement(checks, measurement, dt)
+    if flags != 0:
+        return flags
+    begins = state.samples[0] == 0.0
+    take_measurement(checks, signals, measurement, begins, dt)
+    prepare(settings, state, signals, reference_vector, t)
+    oscillates = watch_oscillation(settings, checks, signals, begins, dt)
+    fault = state.sensors.fault[0]
+    advance(law, settings, state, signals, t, dt)
+    fill_sample(settings, state, signals, sample)
+    if checks.velocity_limit[0] <= 0.0:
+        return 0  # nothing is checked
+    flags = check_sample(settings, checks, state, signals, sample)
+    if state.sensors.fault[0] != fault:
+        oscillation.forget_all(checks.oscillation)  # r may have been the cause
+        return flags | NOT_SENSORS
+    r = state.observer
+    if oscillates and not torque_sensors.is_fading(r.faded, r.calmed):
+        return flags | OSCILLATES
+    return flags
+
+
+@kernel
+def update(
+    law: Law,
+    model: ArmModel,
+    settings_vector: Array,
+    state_vector: Array,
+    signals_vector: Array,
+    sample_vector: Array,
+    checks_vector: Array,
+    measurement: Array,
+    reference_vector: Array,
+    t: float,
+    dt: float,
+    observed: bool,
+) -> int:
+    """Run `step` on packed vectors; return its flags.  With `observed`, find the terms of (29)."""
+    settings = settings_of(settings_vector, model)
+    state = state_of(state_vector, settings)
+    signals = signals_of(signals_vector, settings)
+    sample = sample_of(sample_vector, settings)
+    checks = checks_of(checks_vector, settings)
+    flags = step(
+        law,
+        settings,
+        checks,
+        reference_vector,
+        state,
+        signals,
+        t,
+        dt,
+        measurement,
+        sample,
+    )
+    if observed and flags & INVALID == 0:
+        fill_energies(settings, state, signals, sample)
+    return flags
+
+
+@kernel
+def compare(
+    model: ArmModel,
+    settings_vector: Array,
+    checks_vector: Array,
+    measurement: Array,
+    dt: float,
+) -> bool:
+    """Run `compare_velocities` on packed vectors, without the law."""
+    settings = settings_of(settings_vector, model)
+    checks = checks_of(checks_vector, settings)
+    T = checks.sample_time[0]
+    return compare_velocities(checks.sensor, checks.oscillation, T, dt, measurement)
