@@ -36,7 +36,7 @@ from blf_dsc_controller.configuration.robot import (
 )
 from blf_dsc_controller.configuration.schema import Value, parameters
 
-_OBSERVER = 60.0  # rad/s, below the drives' own loops
+_OBSERVER = 150.0  # rad/s, below the drives' own loops
 
 
 def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:

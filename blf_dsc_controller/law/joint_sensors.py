@@ -60,14 +60,17 @@ def check_sensors(
             work.differences[1, i] = load_observer.residual(of, i, links)
     if begins:
         torque_sensors.begin(now, of.torque)
-    torque_sensors.watch_shaking(now, work, limit, of.torque, dt)
+    torque_sensors.watch_shaking(now, work, limit, of.torque, of.slowed, dt)
     if settings.observer.most[0] > 0.0:  # else a load is left out of r
-        torque_sensors.compare_with_commands(now, work, signals.dqr, begins, dt)
+        falls = begins or of.elapsed[0] < torque_sensors.FALLS
+        torque_sensors.compare_with_commands(
+            now, work, of.slowed, signals.dqr, falls, dt
+        )
     is_off = torque_sensors.watch_following(
         now, work, limit, signals.dq, signals.dqr, dt
     )
     torque_sensors.fade(now, of.faded, is_off, dt)
-    torque_sensors.calm(now, of.calmed, dt)
+    torque_sensors.calm(of.slowed, of.calmed, dt)
 
 
 @inner

@@ -31,7 +31,8 @@ law continues with a d^3 of its own, which may have that already.
 have to give up the rest of H (P^ - P^_before): the torque of a load that has just gone, of an
 inertia that accelerates.  That is not of the arm, and fades with L (`hand_over`).
 
-*Shaking.*  Where r shakes (`torque_sensors`), only what changes slowly of it is added.
+*Slower.*  Where r has shaken, and until efforts are known to be those of sensors, its pole L_i is
+slower (`torque_sensors`).  With r behind that pole, r_s, it is r - (1 - L_i / L) (r - r_s) then.
 
 *Friction.*  What is learned describes the torque of the motors, with all their friction.  P_l
 is without what P^ has absorbed of that (`motor_friction`), or else r would take it back.
@@ -50,7 +51,8 @@ _SETTLING = 4.0  # 1/L, until r is that of the arm
 _RELEASED = 10.0  # 1/L, in which a plausible bias fades
 _SIGMAS = 3.0  # of what the prior explains
 _MOST = 0.5  # of the torque limit
-_SLOW = 0.1  # s, lag of what is slow in r
+SLOWER = 0.4
+"""Factor on the pole of r in a joint, a step."""
 
 
 def most_load(limit: Array) -> Array:
@@ -88,9 +90,12 @@ class State(NamedTuple):
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
     faded: Cell  # share of r that is left out, as the sensors are in doubt
-    # share of what changes fast in r that is left out, since it shakes
+    slowed: Annotated[
+        Array, 'n * observer.enabled'
+    ]  # steps by which r is slower than L
+    # share of what changes faster than that slower pole that is left out
     calmed: Annotated[Array, 'n * observer.enabled']
-    slow: Annotated[Array, 'n * observer.enabled']  # r behind a slow lag, N m
+    slow: Annotated[Array, 'n * observer.enabled']  # r behind this slower pole, N m
     elapsed: Cell  # s, since the first interval
     # beyond the largest |r|, since what it takes over was learned, N m
     over: Annotated[Array, 'n * observer.enabled']
@@ -192,15 +197,33 @@ def update(
         find_bias(settings, state, work, links, information)
     release_bias(settings, state, dt)
     passed = filter_gain(1.0 / settings.observer_bandwidth, dt)
-    slowly = filter_gain(_SLOW, dt)
     for i in range(state.torque.size):
         state.handover[i] -= passed * state.handover[i]
         shown = residual(state, i, links) - state.bias[i]
         state.over[i] = clip(abs(shown) - settings.most[i], 0.0, state.over[i])
         r = load_torque(settings, state, i, shown)
-        state.slow[i] += slowly * (r - state.slow[i])
+        slower = slower_pole(settings, max(1.0, state.slowed[i]))
+        state.slow[i] += filter_gain(1.0 / slower, dt) * (r - state.slow[i])
         fast = r - state.slow[i]
         state.torque[i] = r - state.calmed[i] * fast + state.handover[i]
+
+
+@inner
+def slower_pole(settings: Settings, steps: float) -> float:
+    """Return the pole of r in a joint in which it is so many steps slower [rad/s]."""
+    pole = settings.observer_bandwidth
+    for _ in range(int(steps)):
+        pole *= SLOWER
+    return float(pole)
+
+
+@inner
+def calmed_share(steps: float) -> float:
+    """Return the share of r less r behind a slower pole that makes this pole that of r."""
+    left = 1.0
+    for _ in range(int(steps)):
+        left *= SLOWER
+    return 1.0 - left
 
 
 @inner
@@ -235,13 +258,15 @@ def find_bias(
 
 @inner
 def begin(state: State, disturbance: Array) -> None:
-    """Begin with d^3 (n,) [N m]: if it is not zero, it may have what the sensors show."""
+    """Begin a step slower, and with d^3 (n,) [N m], which may have what the sensors show."""
     continues = 0.0
     for i in range(disturbance.size):
         if disturbance[i] != 0.0:
             continues = 1.0
     for i in range(state.keeps_bias.size):
         state.keeps_bias[i] = continues
+        state.slowed[i] = 1.0
+        state.calmed[i] = calmed_share(1.0)
 
 
 @inner

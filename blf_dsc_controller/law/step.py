@@ -185,19 +185,26 @@ def step(
     take_measurement(checks, signals, measurement, begins, dt)
     prepare(settings, state, signals, reference_vector, t)
     oscillates = watch_oscillation(settings, checks, signals, begins, dt)
-    fault = state.sensors.fault[0]
+    noted = state.sensors.noted[0]
     advance(law, settings, state, signals, t, dt)
     fill_sample(settings, state, signals, sample)
     if checks.velocity_limit[0] <= 0.0:
         return 0  # nothing is checked
     flags = check_sample(settings, checks, state, signals, sample)
-    if state.sensors.fault[0] != fault:
+    if state.sensors.noted[0] != noted:
         oscillation.forget_all(checks.oscillation)  # r may have been the cause
         return flags | NOT_SENSORS
     r = state.observer
-    if oscillates and not torque_sensors.is_fading(r.faded, r.calmed):
-        return flags | OSCILLATES
-    return flags
+    if not oscillates or torque_sensors.is_fading(r.faded, r.slowed, r.calmed):
+        return flags
+    gives_way = torque_sensors.take_blame(
+        state.sensors,
+        checks.oscillation,
+        settings.torque.limit,
+        settings.observer.most,
+        r.slowed,
+    )
+    return flags | (NOT_SENSORS if gives_way else OSCILLATES)
 
 
 @kernel

@@ -17,9 +17,10 @@ and k and D those of a gear,
 are stable only with an L of some rad/s.  So is a true sensor, where a gear is softer than is
 known, and a load heavier.  So r fades out for good where
 
-- *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).  First only
-  what changes fast of it is left out, and only in the joints that shake: loads, which stay,
-  are then found slowly.  If r of one of these shakes again, all of r is left out.
+- *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).  Then it becomes
+  slower, only in the joints that shake: loads, which stay, are found, if later.  If r of one of
+  these still shakes after `_OFTEN` times, all of r is left out.  Where the arm oscillates, r
+  takes the blame first: slower, it costs less than softer feedback, which comes next.
 - *efforts are commands*: in the first motion, efforts behind the filter L are within a
   `_EQUAL` share of the torque that is commanded, as seen against what they are away from
   that of the links, in the geometric mean of the joints.  The mean squares are those of
@@ -41,13 +42,18 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.lag import filter_gain
+from blf_dsc_controller.law.load_observer import calmed_share
 
-NONE, SHAKES, STILL_SHAKES, COMMANDS, OFF = range(5)
+NONE, MAY_SHAKE, SHAKES, STILL_SHAKES, COMMANDS, OFF = range(6)
 """What is wrong with the efforts, if anything; beyond SHAKES all of r is left out."""
+
+FALLS = 0.07
+"""Time [s] after the start in which an arm falls that holds a load of which nobody knows."""
 
 _FADE = 0.02  # s, time constant with which r is left out or comes back
 _SHAKEN = 0.005  # s, likewise of one that shakes: it may grow threefold in 10 ms
 _NOTHING = 1e-6  # of r
+_OFTEN = 3.0  # steps by which r of a joint becomes slower
 _SLOWEST = 0.5  # Hz
 _EQUAL = 0.02
 _DISTINCT = 0.1
@@ -64,8 +70,10 @@ class State(NamedTuple):
     """What it keeps from one sample to the next."""
 
     fault: Cell  # one of NONE to OFF
+    noted: Cell  # how many times one has been
     joint: Cell  # that shows it
     is_distinct: Cell  # 1: efforts are known not to be commands
+    waits: Cell  # 1: r is left out until they are, since it has shaken
     moved: Cell  # s of motion so far
     # N m, of the last interval behind L: the torque commanded
     command: Annotated[Array, 'n * observer.enabled']
@@ -75,7 +83,6 @@ class State(NamedTuple):
     square: Annotated[Array, '2 * observer.enabled', 'n']
     lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
     shaking: oscillation.State  # of r
-    shaken: Annotated[Array, 'n * observer.enabled']  # 1: r of this joint has shaken
 
 
 class Work(NamedTuple):
@@ -110,13 +117,17 @@ def note_fault(state: State, fault: float, i: int) -> None:
     if state.fault[0] <= SHAKES:
         state.fault[0] = fault
         state.joint[0] = i
+        state.noted[0] += 1.0
 
 
 @inner
 def watch_shaking(
-    state: State, work: Work, limit: Array, torque: Array, dt: float
+    state: State, work: Work, limit: Array, torque: Array, slowed: Array, dt: float
 ) -> None:
-    """Find whether r, a `torque` (n,) [N m], shakes the arm; `limit` (n,) [N m] as configured."""
+    """Find whether r, a `torque` (n,) [N m], shakes the arm; `limit` (n,) [N m] as configured.
+
+    `slowed` (n,) are the steps by which r of a joint is slower.
+    """
     for i in range(torque.size):
         work.limit[i] = _STRONG * limit[i]
         work.clear[i] = _CLEAR * limit[i]
@@ -125,29 +136,74 @@ def watch_shaking(
     )
     for i in range(torque.size):
         if oscillation.oscillates(state.shaking, i):
-            note_fault(state, STILL_SHAKES if state.shaken[i] == 1.0 else SHAKES, i)
-            note_shaken(state)
-            state.is_distinct[0] = 1.0  # what shakes says nothing about commands
+            note_fault(state, STILL_SHAKES if slowed[i] == _OFTEN else SHAKES, i)
+            slow_down(state, state.shaking, slowed)
             oscillation.forget_all(state.shaking)
 
 
 @inner
-def note_shaken(state: State) -> None:
-    """Note all joints whose r shakes."""
-    for i in range(state.shaken.size):
-        if state.shaking.waves[i] >= oscillation.SOME:
-            state.shaken[i] = 1.0
+def slow_down(state: State, oscillating: oscillation.State, slowed: Array) -> None:
+    """Make r a step slower, `_OFTEN` in all, in the joints of what is `oscillating`.
+
+    As long as efforts may be commands, all of r waits until it is known that they are not.
+    """
+    for i in range(slowed.size):
+        if oscillating.waves[i] >= oscillation.SOME:
+            slowed[i] = min(slowed[i] + 1.0, _OFTEN)
+    if state.is_distinct[0] == 0.0:
+        state.waits[0] = 1.0
+        state.moved[0] = 0.0
+        state.square[:] = 0.0
+
+
+@inner
+def take_blame(
+    state: State,
+    arm: oscillation.State,
+    limit: Array,
+    most: Array,
+    slowed: Array,
+) -> bool:
+    """Make r slower where the `arm` oscillates, at most `_OFTEN` times; return whether it did.
+
+    `limit` (n,) [N m] is that of the torques, `most` (n,) [N m] the largest |r|, and `slowed` (n,)
+    are the steps.  Nothing waits for r where the torques are violent.
+    """
+    blamed = -1
+    for i in range(slowed.size):
+        if oscillation.oscillates(arm, i):
+            if arm.amplitude[i] > oscillation.VIOLENT * limit[i]:
+                return False
+            if most[i] > 0.0 and slowed[i] < _OFTEN:
+                blamed = i
+    if blamed < 0 or state.fault[0] > SHAKES:
+        return False
+    slow_down(state, arm, slowed)
+    note_fault(state, MAY_SHAKE, blamed)
+    oscillation.forget_all(arm)
+    return True
+
+
+@inner
+def begin_comparison(state: State, work: Work) -> None:
+    """Begin with `work.differences`: what stays of them is not compared."""
+    for k in range(2):
+        for i in range(state.slow.shape[1]):
+            state.slow[k, i] = work.differences[k, i]
 
 
 @inner
 def compare_with_commands(
-    state: State, work: Work, dqr: Array, begins: bool, dt: float
+    state: State, work: Work, slowed: Array, dqr: Array, begins: bool, dt: float
 ) -> None:
     """Find whether efforts are commands, by `work.differences`: `begins` with them.
 
-    dqr (n,) is the velocity of the reference [rad/s].
+    If they are not, r becomes faster (`decide`).  dqr (n,) [rad/s] is that of the reference.
     """
     if state.is_distinct[0] == 1.0:
+        return
+    if begins:
+        begin_comparison(state, work)
         return
     n = dqr.size
     share = filter_gain(1.0 / (2.0 * pi * _SLOWEST), dt)
@@ -156,8 +212,6 @@ def compare_with_commands(
         moves = moves or abs(dqr[i]) > _MOVES
     for k in range(2):
         for i in range(n):
-            if begins:
-                state.slow[k, i] = work.differences[k, i]
             fast = work.differences[k, i] - state.slow[k, i]
             state.slow[k, i] += share * fast
             if moves:
@@ -165,12 +219,15 @@ def compare_with_commands(
     if moves:
         state.moved[0] += dt
     if state.moved[0] > _LEAST_MOTION:
-        decide(state)
+        decide(state, slowed)
 
 
 @inner
-def decide(state: State) -> None:
-    """Decide by the mean squares whether efforts are commands, certainly not, or neither yet."""
+def decide(state: State, slowed: Array) -> None:
+    """Decide by the mean squares whether efforts are commands, certainly not, or neither yet.
+
+    If they are not, r is a step faster than it was until now, which `slowed` (n,) says.
+    """
     product = equal = distinct = 1.0
     nearest = 0
     for i in range(state.square.shape[1]):
@@ -182,8 +239,12 @@ def decide(state: State) -> None:
         if ratio < near:
             nearest = i
     if product < equal:
-        note_fault(state, COMMANDS, nearest)
-    if product > distinct or state.fault[0] != NONE:
+        note_fault(state, STILL_SHAKES if state.waits[0] == 1.0 else COMMANDS, nearest)
+    if product > distinct:
+        state.waits[0] = 0.0
+        for i in range(slowed.size):
+            slowed[i] -= 1.0
+    if product > distinct or state.fault[0] > SHAKES:
         state.is_distinct[0] = 1.0
 
 
@@ -216,9 +277,10 @@ def watch_following(
 @inner
 def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
     """Leave more of r out where the efforts are in doubt, or less; zero stays zero."""
-    is_doubted = is_off or state.fault[0] > SHAKES
+    has_shaken = state.fault[0] == STILL_SHAKES or state.waits[0] == 1.0
+    is_doubted = is_off or has_shaken or state.fault[0] > SHAKES
     aim = 1.0 if is_doubted else 0.0
-    time_constant = _SHAKEN if state.fault[0] == STILL_SHAKES else _FADE
+    time_constant = _SHAKEN if has_shaken else _FADE
     if faded[0] != aim:
         faded[0] += filter_gain(time_constant, dt) * (aim - faded[0])
         if abs(faded[0] - aim) < _NOTHING:
@@ -226,20 +288,21 @@ def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
 
 
 @inner
-def calm(state: State, calmed: Array, dt: float) -> None:
-    """Leave what changes fast in r out, for good, where it has shaken."""
+def calm(slowed: Array, calmed: Array, dt: float) -> None:
+    """Let r become as slow, or as fast, as the steps in `slowed` (n,) say."""
     share = filter_gain(_SHAKEN, dt)
     for i in range(calmed.size):
-        if state.shaken[i] == 1.0 and calmed[i] < 1.0:
-            calmed[i] += share * (1.0 - calmed[i])
-            if 1.0 - calmed[i] < _NOTHING:
-                calmed[i] = 1.0
+        aim = calmed_share(slowed[i])
+        if calmed[i] != aim:
+            calmed[i] += share * (aim - calmed[i])
+            if abs(aim - calmed[i]) < _NOTHING:
+                calmed[i] = aim
 
 
 @inner
-def is_fading(faded: Array, calmed: Array) -> bool:
+def is_fading(faded: Array, slowed: Array, calmed: Array) -> bool:
     """Whether more of r is being left out, or comes back; `calmed` (n,) is of each joint."""
     fades = 0.0 < faded[0] < 1.0
     for i in range(calmed.size):
-        fades = fades or 0.0 < calmed[i] < 1.0
+        fades = fades or calmed[i] != calmed_share(slowed[i])
     return bool(fades)

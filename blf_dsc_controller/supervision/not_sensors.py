@@ -9,6 +9,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque_sensors import (
     COMMANDS,
+    MAY_SHAKE,
     NONE,
     OFF,
     SHAKES,
@@ -27,9 +28,14 @@ _SHAKES = (
     f'the arm, or set disturbance.observer_bandwidth to 0{_DRIVER}'
 )
 _TEXTS = {
+    MAY_SHAKE: (
+        'joint {joint!r} oscillates, and the load observer, which may be the cause, is slower '
+        'there from now on: the gains are high for this arm or its base. Commission it, or give a '
+        'smaller feedback.stiffness or disturbance.observer_bandwidth'
+    ),
     SHAKES: _SHAKES
-    % ('shakes', 'it follows loads slowly from now on, where it shakes'),
-    STILL_SHAKES: _SHAKES % ('shakes again', _ALONE),
+    % ('shakes', 'it follows loads more slowly from now on, where it shakes'),
+    STILL_SHAKES: _SHAKES % ('has shaken', _ALONE),
     COMMANDS: (
         'the efforts are what is commanded, most of all that of joint {joint!r}, and not those '
         f'of joint torque sensors: {_ALONE}. Set robot.effort to commanded if they are commands '
