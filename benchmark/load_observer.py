@@ -83,9 +83,9 @@ PICK_UP = 8.0  # s
 LATER = 3.5  # s
 SECONDS = 16.0
 WEIGHT = 2.0  # kg
-BANDWIDTH = 60.0  # rad/s
+BANDWIDTH = 150.0  # rad/s
 
-BANDWIDTHS = (0.0, 40.0, 60.0, 100.0)
+BANDWIDTHS = (0.0, 60.0, 100.0, 150.0, 200.0)
 STIFFNESS = (1.0, 3.0)  # of the gears, over that of the preset
 MOTORS = np.array(
     (0.606, 0.606, 0.462, 0.462, 0.206, 0.206, 0.206)
@@ -411,7 +411,7 @@ DECLARATIONS = {
     'efforts are commands, torque loop': (True, {'torque_loop': TorqueLoop()}),
     'efforts are commands, no torque loop': (True, {}),
 }
-SLOW_TO_FAST = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 100.0)  # rad/s
+SLOW_TO_FAST = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 150.0)  # rad/s
 FINE = np.concatenate((np.geomspace(0.02, 5.0, 150), np.geomspace(5.05, 499.0, 1200)))
 
 

@@ -34,7 +34,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -48,6 +47,7 @@ import numpy as np
 from benchmark import elastic
 from benchmark.elastic import FREE
 from benchmark.harness import print_table
+from benchmark.kept import Results
 from benchmark.studies import load_study
 from blf_dsc_controller.arms.linear_loop import (
     Feedback,
@@ -426,28 +426,22 @@ class Key(NamedTuple):
     law: str
 
 
-class Kept:
-    """Results by run, kept in a file of JSON lines if one is named."""
+class Kept(Results[Key, Result]):
+    """Results by run, kept in a file if one is named."""
 
     def __init__(self, path: Path | None) -> None:
         """Read those that the file has."""
-        self.path = path
-        self.results: dict[Key, Result] = {}
-        if path is not None and path.exists():
-            for line in path.read_text(encoding='utf-8').splitlines():
-                key, result = json.loads(line)
-                self.results[Key(*key)] = Result(*result)
+        super().__init__(path, lambda key: Key(*key), lambda value: Result(*value))
 
     def of(self, key: Key, study: Study) -> Result:
         """Return the result of a run, from the file or computed now."""
-        if key not in self.results:
+
+        def compute() -> Result:
             controller = law_of(study.controller, key.robot, key.law)
             bound = np.array(study.controller.barrier.bound)
-            self.results[key] = run(controller, arm_of(study, key.number), bound)
-            if self.path is not None:
-                with self.path.open('a', encoding='utf-8') as file:
-                    file.write(json.dumps([key, self.results[key]]) + '\n')
-        return self.results[key]
+            return run(controller, arm_of(study, key.number), bound)
+
+        return self.get(key, compute)
 
 
 def arms(

@@ -40,7 +40,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -51,6 +50,7 @@ import numpy as np
 from benchmark import soft_arms
 from benchmark.elastic import FREE
 from benchmark.harness import print_table
+from benchmark.kept import Results
 from benchmark.load_observer import WEIGHT
 from benchmark.options import positive
 from benchmark.random_arms import ROBOTS, describe
@@ -414,28 +414,25 @@ def run(
     return [figures_of(*each, seen) for each in zip(moves, laters, strict=True)]
 
 
-class Kept:
-    """Figures of runs, in a file of JSON lines if one is named."""
+_Key = tuple[str, float, int, str, tuple[float, ...]]
+
+
+class Kept(Results[_Key, list[Figures]]):
+    """Figures of runs, in a file if one is named."""
 
     def __init__(self, path: Path | None, limits: Sequence[float]) -> None:
         """Read those that the file has; each run has moves with all the limits."""
-        self.path, self.limits = path, limits
-        self.found: dict[tuple[object, ...], list[Figures]] = {}
-        if path is not None and path.exists():
-            for line in path.read_text(encoding='utf-8').splitlines():
-                key, values = json.loads(line)
-                of_run = (*key[:-1], tuple(key[-1]))
-                self.found[of_run] = [Figures(*each) for each in values]
+        self.limits = tuple(limits)
+        super().__init__(
+            path,
+            lambda key: (*key[:-1], tuple(key[-1])),
+            lambda values: [Figures(*each) for each in values],
+        )
 
     def of(self, name: str, load: float, truth: int, rule: str) -> list[Figures]:
         """Return the figures of a run, from the file or computed now."""
-        key = name, load, truth, rule, tuple(self.limits)
-        if key not in self.found:
-            self.found[key] = run(*key)
-            if self.path is not None:
-                with self.path.open('a', encoding='utf-8') as file:
-                    file.write(json.dumps([key, self.found[key]]) + '\n')
-        return self.found[key]
+        key = name, load, truth, rule, self.limits
+        return self.get(key, lambda: run(*key))
 
     def of_arm(self, name: str, truths: int, rule: str) -> list[list[Figures]]:
         """Return the figures of the runs of a number of true arms with each load."""

@@ -55,7 +55,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -65,6 +64,7 @@ import numpy as np
 
 from benchmark import elastic, load_observer, random_arms
 from benchmark.harness import print_table
+from benchmark.kept import Results
 from benchmark.load_observer import LATER, PICK_UP, Law
 from benchmark.options import positive
 from benchmark.random_arms import CT, PD, RANGES, ROBOTS, THIS
@@ -440,29 +440,26 @@ def spread(
     return f'{middle} ({worst(values):{digits}})' if len(values) > 1 else middle
 
 
-class Kept:
-    """Figures by arm, law and number of the true arm, in a file of JSON lines if one is named."""
+class Kept(Results[tuple[str, str, int], Figures]):
+    """Figures by arm, law and number of the true arm, in a file if one is named."""
 
     def __init__(self, path: Path | None, *, links: bool = False) -> None:
         """Read those that the file has; with `links`, only these differ."""
-        self.path = path
         self.links = links
-        self.found: dict[tuple[str, str, int], Figures] = {}
-        if path is not None and path.exists():
-            for line in path.read_text(encoding='utf-8').splitlines():
-                (name, law, number), values = json.loads(line)
-                self.found[name, law, number] = Figures(*values)
+        super().__init__(
+            path,
+            lambda key: (key[0], key[1], key[2]),
+            lambda values: Figures(*values),
+        )
 
     def of(self, name: str, law: str, number: int) -> Figures:
         """Return the figures of a run, from the file or computed now."""
-        key = name, law, number
-        if key not in self.found:
+
+        def compute() -> Figures:
             true = {} if self.links else drawn(ALL[name], number)
-            self.found[key] = figures(name, law, number, true=true)
-            if self.path is not None:
-                with self.path.open('a', encoding='utf-8') as file:
-                    file.write(json.dumps([key, self.found[key]]) + '\n')
-        return self.found[key]
+            return figures(name, law, number, true=true)
+
+        return self.get((name, law, number), compute)
 
 
 def rows(

@@ -5,9 +5,9 @@
 
 The studies are `monte_carlo_elastic_changes_*`: gears, motors, links, delays and tables are drawn
 independently of the controller, friction falls with the speed and grows with the load, and four
-events change load, friction and what pushes.  Each arm runs with learning, without it, and
-without it with other noise.  The rms is that of the error's norm from 5 s on, with learning over
-without, of arms that go to the end with finite numbers both times.
+events change load, friction and what pushes.  Each arm runs supervised, with learning, without
+it, and without it with other noise.  The rms is that of the error's norm from 5 s on, with
+learning over without, of arms that go to the end with finite numbers both times.
 
 It goes round the robots arm by arm.  After an interrupt, `--keep` goes on from the arms that
 its file has, and `soft-pairs 0` prints the table of what is there.
@@ -17,20 +17,21 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmark.harness import print_table
+from benchmark.kept import Results
 from benchmark.studies import load_study
-from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study
-from blf_dsc_controller.studies.runs import KEPT, VIOLATED, Columns, run_chunk
+from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.studies.monte_carlo import Study, draw, plant_with
+from blf_dsc_controller.studies.runs import KEPT, VIOLATED, figures_of
 
 ROBOTS = 'panda', 'ur5e', 'fr3'
-LAWS = '', WITHOUT, NOISE
 ALLOWED = 1.1  # rms with learning over without
 
 
@@ -44,43 +45,45 @@ class Pair(NamedTuple):
     rms: tuple[float, ...]  # rad, of the norm
 
 
-def pair_of(robot: str, number: int, study: Study, found: Columns) -> Pair:
-    """Return an arm from the columns of its runs."""
+def pair_in(value: list[Any]) -> Pair:
+    """Return the pair that a file has."""
+    robot, number, *figures = value
+    return Pair(robot, number, *map(tuple, figures))
 
-    def rms(law: str) -> float:
-        each = [found[f'{law}rms_error_rad.{name}'][0] for name in study.plant.joints]
-        return float(np.linalg.norm(each))
 
-    outcomes = [str(found[f'{law}outcome'][0]) for law in LAWS]
+def pair_of(robot: str, study: Study, number: int) -> Pair:
+    """Run an arm of a study in the supervised loop, with each law."""
+    drawn = draw(study, number)
+    outcomes, rms = [], []
+    for prefix, config in study.laws().items():
+        plant = plant_with(study, drawn, prefix)
+        with np.errstate(all='ignore'):
+            found = figures_of(study, simulate(config, plant), plant)
+        each = [found[f'rms_error_rad.{name}'] for name in study.plant.joints]
+        outcomes.append(str(found['outcome']))
+        rms.append(float(np.linalg.norm(each)))
     return Pair(
         robot,
         number,
         tuple(each == KEPT for each in outcomes),
         tuple(each in (KEPT, VIOLATED) for each in outcomes),
-        tuple(map(rms, LAWS)),
+        tuple(rms),
     )
 
 
 def pairs(runs: int, robots: Sequence[str], path: Path | None) -> Iterator[Pair]:
     """Yield the arms that a file has, and those that are missing, which it gets."""
-    known = set()
-    if path is not None and path.exists():
-        for line in path.read_text(encoding='utf-8').splitlines():
-            robot, number, *values = json.loads(line)
-            known.add((robot, number))
-            yield Pair(robot, number, *map(tuple, values))
+    kept: Results[tuple[str, int], Pair] = Results(
+        path, lambda key: (key[0], key[1]), pair_in
+    )
+    yield from kept.results.values()
     studies = {
         name: load_study(f'monte_carlo_elastic_changes_{name}') for name in robots
     }
+    known = set(kept.results)
     for number, (name, study) in itertools.product(range(runs), studies.items()):
-        if (name, number) in known:
-            continue
-        with np.errstate(all='ignore'):
-            pair = pair_of(name, number, study, run_chunk(study, number, 1))
-        if path is not None:
-            with path.open('a', encoding='utf-8') as file:
-                file.write(json.dumps(pair) + '\n')
-        yield pair
+        if (name, number) not in known:
+            yield kept.get((name, number), partial(pair_of, name, study, number))
 
 
 def row(robot: str, found: Sequence[Pair]) -> list[str]:

@@ -12,6 +12,7 @@ from benchmark import (
     joint_pd,
     many_arms,
     momentum_observer,
+    observer_bandwidth,
     random_arms,
     rise,
     soft_arms,
@@ -445,19 +446,43 @@ def test_rows_of_pairs_count_what_learning_and_noise_break():
 def test_pairs_that_are_kept_are_not_run_again(monkeypatch, tmp_path):
     made = []
 
-    def run_chunk(study, first, count):
-        made.append(first + count - 1)
-        rms = {f'rms_error_rad.{name}': [3e-3] for name in study.plant.joints}
-        row = {'outcome': ['kept'], **rms}
-        return {f'{law}{name}': row[name] for law in soft_pairs.LAWS for name in row}
+    def figures_of(study, *_):
+        made.append(1)
+        rms = {f'rms_error_rad.{name}': 3e-3 for name in study.plant.joints}
+        return {'outcome': 'kept', **rms}
 
-    monkeypatch.setattr(soft_pairs, 'run_chunk', run_chunk)
+    monkeypatch.setattr(soft_pairs, 'simulate', lambda *_: None)
+    monkeypatch.setattr(soft_pairs, 'figures_of', figures_of)
     path = tmp_path / 'pairs.jsonl'
     found = list(soft_pairs.pairs(2, ['ur5e'], path))
     assert list(soft_pairs.pairs(2, ['ur5e'], path)) == found
-    assert made == [0, 1]
+    assert len(made) == 2 * 3
     assert found[1].rms == pytest.approx([3e-3 * 6**0.5] * 3)
     assert found[1].kept == found[1].ends == (True,) * 3
+
+
+def test_bandwidths_are_compared_on_arms_that_ran_with_all_of_them(
+    monkeypatch, tmp_path
+):
+    made = []
+
+    def outcome(_, number, bandwidth):
+        made.append(number)
+        figures = 1.0 + bandwidth, 0.002, bandwidth > 0.0, number < 0, number < 0
+        return observer_bandwidth.Outcome(*figures)
+
+    monkeypatch.setattr(observer_bandwidth, 'outcome', outcome)
+    path = tmp_path / 'runs.jsonl'
+    found = observer_bandwidth.outcomes(2, path)
+    assert observer_bandwidth.outcomes(2, path) == found
+    assert len(made) == 2 * 2 * len(observer_bandwidth.BANDWIDTHS)
+    found.pop(('fr3', 300.0, 1))
+    rows = list(observer_bandwidth.rows(found))
+    at_60, at_150 = rows[1], rows[3]
+    assert at_60 == ['panda', '60', '2', '1.00, 1.00', '2.0, 2.0, 2.0', '2', '0', '0']
+    assert at_150[:4] == ['panda', '150', '2', '2.48, 2.48']
+    assert [row[2] for row in rows] == ['2'] * 6 + ['1'] * 6
+    assert all(len(row) == len(observer_bandwidth.HEADS) for row in rows)
 
 
 @pytest.mark.parametrize('name', soft_pairs.ROBOTS)
