@@ -192,12 +192,13 @@ def test_joint_that_begins_to_shake_later_is_slower_as_well():
     assert (state.fault[0], shaken) == (SHAKES, [1.0, 1.0])
 
 
-def arm_that_oscillates(share, joint=0):
+def arm_that_oscillates(share, joint=0, growth=0.0, seconds=0.15):
     """What `oscillation` finds of an arm with torques of a `share` of their limit at 30 Hz."""
     found = part(oscillation.State, n=2)
     oscillation.begin(found, np.zeros(2), np.zeros(2))
-    for k in range(150):
+    for k in range(round(seconds / DT)):
         wave = np.sin(2.0 * np.pi * 30.0 * k * DT) * np.eye(2)[joint]
+        wave *= np.exp(growth * k * DT)
         none = np.zeros(2)
         oscillation.watch(
             found, LIMIT, 0.01 * wave, share * LIMIT * wave, none, none, DT
@@ -222,17 +223,23 @@ def test_r_takes_the_blame_of_an_arm_that_oscillates_as_often_as_it_becomes_slow
 
 
 @pytest.mark.parametrize(
-    ('share', 'most', 'fault'),
-    [(0.6, LIMIT, NONE), (0.1, 0.0 * LIMIT, NONE), (0.1, LIMIT, OFF)],
-    ids=['violent', 'r is zero', 'r is left out'],
+    ('share', 'growth', 'most', 'fault'),
+    [
+        (0.6, 0.0, LIMIT, NONE),
+        (0.06, 15.0, LIMIT, NONE),
+        (0.1, 0.0, 0.0 * LIMIT, NONE),
+        (0.1, 0.0, LIMIT, OFF),
+    ],
+    ids=['violent', 'grows', 'r is zero', 'r is left out'],
 )
 def test_nothing_waits_for_r_where_it_is_late_or_cannot_be_the_cause(
-    share, most, fault
+    share, growth, most, fault
 ):
     state, _ = new()
     state.fault[0] = fault
     shaken = np.zeros(2)
-    arm = arm_that_oscillates(share)
+    arm = arm_that_oscillates(share, growth=growth, seconds=0.12)
+    assert (oscillation.grows(arm, 0)) == (growth > 0.0)
     assert not torque_sensors.take_blame(state, arm, LIMIT, most, shaken)
     assert (state.noted[0], shaken.tolist()) == (0.0, [0.0, 0.0])
 

@@ -148,7 +148,13 @@ def begin(now: State, error: Array, torque: Array) -> None:
 @inner
 def oscillates(now: State, i: int) -> bool:
     """Whether joint i oscillates."""
-    return bool(now.waves[i] >= WAVES or now.grown[i] >= _GROWN)
+    return bool(now.waves[i] >= WAVES or grows(now, i))
+
+
+@inner
+def grows(now: State, i: int) -> bool:
+    """Whether the last half waves of joint i grow."""
+    return bool(now.grown[i] >= _GROWN)
 
 
 @inner

@@ -167,12 +167,13 @@ def take_blame(
     """Make r slower where the `arm` oscillates, at most `_OFTEN` times; return whether it did.
 
     `limit` (n,) [N m] is that of the torques, `most` (n,) [N m] the largest |r|, and `slowed` (n,)
-    are the steps.  Nothing waits for r where the torques are violent.
+    are the steps.  Nothing waits for r where the oscillation grows, or its torques are violent.
     """
     blamed = -1
     for i in range(slowed.size):
         if oscillation.oscillates(arm, i):
-            if arm.amplitude[i] > oscillation.VIOLENT * limit[i]:
+            is_violent = arm.amplitude[i] > oscillation.VIOLENT * limit[i]
+            if is_violent or oscillation.grows(arm, i):
                 return False
             if most[i] > 0.0 and slowed[i] < _OFTEN:
                 blamed = i
