@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,8 @@ from elastic_two_link import ARM, NEAR, shorten_motions, shorten_moves
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.cli import commission_ripple
 from blf_dsc_controller.cli.commission_ripple import on_robot
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.main import main
@@ -100,9 +103,16 @@ def whole(tmp_path_factory):
         monkeypatch.setattr(
             'builtins.print', lambda *words, **_: told.append(' '.join(map(str, words)))
         )
+        chosen = []
+        choose = blf.Commissioning.result
+
+        def noted(*given):
+            chosen.append(choose(*given))
+            return chosen[-1]
+
+        monkeypatch.setattr(blf.Commissioning, 'result', noted)
         assert commission(arm, '--robot', 'plant', '--ripple', '--yes', *at(NEAR)) == 0
-        commissioning = blf.Commissioning(blf.load_loop(arm).controller)
-        found = commissioning.result([arm.with_name('out_bags') / 'posture_1'])
+        (found,) = chosen
         calls = PlantDriver.last.calls
     return SimpleNamespace(arm=arm, found=found, told='\n'.join(told), calls=calls)
 
@@ -155,14 +165,29 @@ def test_bags_give_the_same_and_replay(whole, monkeypatch):
     date = {'commissioning.date': first.commissioning.date}
     assert change(again, date) == first
     assert blf.verify(bags[0]).difference is None
-    run = blf.read_run(bags[0])
-    assert run.stops == ()
+    # it is the motion of a loop of one's own
+    made = whole.found.slow_motion.config
+    assert read_content(bags[0]).controller_config() == made
+    file = file_in(whole.arm.parent, whole)
+    # also if another process computes what is written
+    compute, found = pickle.loads(pickle.dumps((file.content, whole.found)))  # noqa: S301
+    assert compute(found) == file.content(whole.found)
     # the rest of the table is that of `blf_dsc identify`, too
     loaded = blf.load_loop(whole.arm.with_name('out.yaml')).controller
     own = to_learn(identify_bag(bags[0], loaded.robot, effort='command').ripples)
     assert tuple(each.cycles for each in own) == pytest.approx(
         first.learning.ripple_cycles, abs=0.2
     )
+
+
+@pytest.mark.parametrize(
+    ('preset', 'effort'), [('fr3', 'without-gravity'), ('ur5e', 'command')]
+)
+def test_commands_lack_the_gravity_that_drives_add(preset, effort, whole, monkeypatch):
+    shorten(monkeypatch)
+    monkeypatch.setattr(ripple, 'find_ripples', lambda *given: given[2])
+    run = blf.read_run(whole.arm.with_name('out_bags') / 'slow_motion')
+    assert ripples_in([(run, blf.load_loop(preset).controller)]) == effort
 
 
 def test_slow_motion_alone_gives_no_gains(whole, monkeypatch, capsys):
@@ -172,9 +197,11 @@ def test_slow_motion_alone_gives_no_gains(whole, monkeypatch, capsys):
     assert 'there is no run of a motion in a posture' in capsys.readouterr().err
 
 
-def test_ctrl_c_in_the_slow_motion_keeps_the_gains(arm, capsys):
-    """State 22000 is in it; the arm comes to rest."""
-    options = ('--robot', 'interrupt@22000', '--ripple', '--yes', *at(NEAR))
+def test_ctrl_c_in_the_slow_motion_keeps_the_gains(whole, arm, capsys, monkeypatch):
+    """State 17000 is in it; the arm comes to rest."""
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    monkeypatch.setattr(blf.Commissioning, 'result', lambda *_: whole.found)
+    options = ('--robot', 'interrupt@17000', '--ripple', '--yes', *at(NEAR))
     assert commission(arm, *options) == 130
     told = capsys.readouterr()
     out = arm.with_name('out.yaml')
@@ -186,6 +213,63 @@ def test_ctrl_c_in_the_slow_motion_keeps_the_gains(arm, capsys):
     assert cycles_of(out) == ()
     comment = out.read_text().replace('\n# ', ' ')
     assert 'torque ripple is not measured: the slow motion that shows it' in comment
+
+
+def test_gains_of_a_file_are_proven_and_its_ripple_added(whole, capsys, monkeypatch):
+    """Once somebody has looked at them; the rest of the file stays."""
+    shorten(monkeypatch)
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    monkeypatch.syspath_prepend(whole.arm.parent)
+    gains = whole.arm.with_name('gains.yaml')
+    file = file_in(whole.arm.parent, whole)._replace(path=gains)
+    file.write(whole.found, file.content(whole.found))
+    folder = str(whole.arm.with_name('proof'))
+    words = ['--prove', '--ripple', '--robot', 'plant', '--yes', '--record', folder]
+    assert commission(gains, *words, out='gains.yaml') == 1  # exists
+    assert 'exists already' in capsys.readouterr().err
+    assert commission(gains, *words, out='rippled.yaml') == 0
+    told = capsys.readouterr().out
+    assert told.index('slow motion, for 16 s') < told.index('100% of the gains: calm')
+    assert told.index('error  expected') < told.index('is written as learning.ripple')
+    before, after = (
+        blf.load_loop(whole.arm.with_name(name)).controller
+        for name in ('gains.yaml', 'rippled.yaml')
+    )
+    (cycles,) = after.learning.ripple_cycles
+    assert cycles == pytest.approx(40.0, abs=0.5)
+    assert change(before, {'learning.ripple_cycles': [cycles]}) == after
+    comment = whole.arm.with_name('rippled.yaml').read_text().partition('/**:')[0]
+    assert comment.startswith(gains.read_text().partition('/**:')[0])
+    assert (
+        f'# torque ripple is written as learning.ripple_cycles: [{cycles:g}]' in comment
+    )
+
+
+def test_bag_that_shows_nothing_is_told_and_the_arm_is_held(whole, capsys, monkeypatch):
+    """As where positions come too rarely to tell."""
+    shorten(monkeypatch)
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    monkeypatch.setattr(postures.PostureByPosture, 'slow', lambda *_: None)
+    held = []
+
+    def hold(robot):
+        held.append(robot)
+
+    monkeypatch.setattr(postures.PostureByPosture, 'hold_after', hold)
+
+    def shows_nothing(_bags):
+        assert not held
+        raise BlfDscError('the joint states are 0.1 s apart')
+
+    monkeypatch.setattr(commission_ripple, 'ripples_by_bags', shows_nothing)
+    gains = whole.arm.with_name('out.yaml')
+    folder = str(whole.arm.with_name('proof_only'))
+    words = ['--prove', '--ripple', '--robot', 'plant', '--yes', '--record', folder]
+    assert commission(gains, *words, out='none.yaml') == 1
+    told = capsys.readouterr().err
+    assert f'0.1 s apart. Torque ripple was not measured; {gains} has' in told
+    assert len(held) == 1
+    assert not whole.arm.with_name('none.yaml').exists()
 
 
 class Pushed(PlantDriver):
@@ -253,8 +337,8 @@ def file_in(folder, whole):
 @pytest.mark.parametrize(
     ('given', 'told'),
     [
-        (['--robot', 'plant', '--prove'], 'leave out --prove and --write'),
-        (['--write', 'm.yaml'], 'leave out --prove and --write'),
+        (['--write', 'm.yaml'], 'and --write measures nothing: leave out'),
+        (['--robot', 'plant', '--prove'], 'feedback.joint_stiffness is empty: prove'),
         (['bag'], '--ripple makes a motion, and its bag needs no option'),
     ],
 )
@@ -323,6 +407,7 @@ def test_ripple_of_a_ur5e_is_found_in_all_joints_and_none_where_there_is_none():
     assert listed.cycles == pytest.approx(30.0, abs=0.3)
     assert abs(listed.cycles - 30.0) < 4.0 * listed.deviation + 0.05
     assert sorted(listed.joints) == [0, 1, 2, 3, 4, 5]
+    assert not any(each.repeats for each in found)
     amplitudes = [each.found[0].amplitude for each in found]
     np.testing.assert_allclose(amplitudes, [1.2] * 3 + [0.224] * 3, rtol=0.2)
     assert to_learn(none := ur5e(has_ripple=False)) == ()
@@ -330,7 +415,7 @@ def test_ripple_of_a_ur5e_is_found_in_all_joints_and_none_where_there_is_none():
 
 
 def shown(found, *ripples):
-    return '\n'.join(of_ripple(found._replace(ripples=ripples)))
+    return '\n'.join(of_ripple(found.before, ripples))
 
 
 def test_it_says_how_sure_a_ripple_is(whole):
@@ -344,9 +429,11 @@ def test_it_says_how_sure_a_ripple_is(whole):
     assert 'joint2 moved too little to show' in shown(whole.found, seen, NOTHING)
     # what a motion that repeats shows is not learned
     again = whole.found._replace(ripples=(seen._replace(repeats=True), none))
-    assert 'joint1 repeated the same motion' in '\n'.join(of_ripple(again))
+    assert 'joint1 repeated the same motion' in shown(again, *again.ripples)
     assert 'learning.ripple_cycles' not in again.parameters()
-    assert '1.2 +- 0.039 N m at 40.01 +- 0.098' in ripple_table(again)
+    assert '1.2 +- 0.039 N m at 40.01 +- 0.098' in ripple_table(
+        again.before, again.ripples
+    )
     # a list that the file has stays
     known = change(whole.found.before, {'learning.ripple_cycles': [12.5]})
     kept = whole.found._replace(before=known)
@@ -356,6 +443,17 @@ def test_it_says_how_sure_a_ripple_is(whole):
     # without the option, nothing has changed
     assert sum('ripple' in each for each in sentences(whole.found)) == 1
     assert 'is not looked for' in '\n'.join(sentences(whole.found))
+
+
+def test_slow_motion_has_the_tones_of_the_reference_at_half_the_pace():
+    config = blf.load_loop('ur5e').controller
+    slow = slow_motion.slow_frequencies(config)
+    shares = np.divide(slow, config.reference.frequency)
+    assert shares[0] == pytest.approx(0.5, rel=1e-3)
+    assert shares.max() <= 0.65
+    assert slow_motion.slow_motion(config).config.reference.frequency == slow
+    hold = change(config, {'reference.type': 'hold'})
+    assert slow_motion.slow_frequencies(hold) == ()
 
 
 def range_of(config, seconds=60.0):

@@ -284,7 +284,7 @@ _COMMISSION = Command(
         option(
             '--ripple',
             'also prove the gains, find the torque ripple of the drives in a slow motion of a '
-            'minute that does not repeat, and write learning.ripple_cycles',
+            'minute that does not repeat, and write learning.ripple_cycles; with --prove, to --out',
             action='store_true',
         ),
         option(

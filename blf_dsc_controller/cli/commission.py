@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller.cli.commission_ripple import (
+    after_proof,
     before_start,
     on_robot,
     on_simulated,
@@ -19,6 +20,7 @@ from blf_dsc_controller.cli.commission_robot import (
     ask,
     measured_on,
     of_proof,
+    print_proof,
     proven,
     robot,
 )
@@ -132,7 +134,8 @@ def _on_robot(options: Namespace, path: Path, commissioning: Commissioning) -> i
     with _arm(options, path, commissioning) as arm:
         measured = measured_on(options, arm, commissioning, after)
         if options.ripple:
-            code = _with_ripple(options, path, arm, commissioning, runs, measured)
+            given = options, path, arm, commissioning, runs, measured
+            code = _still_held(lambda: _with_ripple(*given))
         arm.hold_after()
     if options.ripple:
         return code
@@ -151,24 +154,32 @@ def _with_ripple(
 ) -> int:
     """Choose the gains of a robot that rests, prove them, and find the torque ripple.
 
-    Return the exit code.  Raises EndedError if the arm is not to be held any more.
+    Return the exit code.
     """
     slow = [Path(name) for name, run in given if commissioning.is_slow_motion(run)]
     names = _names(commissioning, given) + [name for name, _ in measured]
     bags = [*options.bags, *(bag for _, bag in measured)]
     file = _file(options, path)
     print_notice(_CHOOSING)
+    found = arm.aside(commissioning.result, bags)
+    if code := _written(file, found, names, arm.aside):
+        return code
+    on_robot(arm, file, found, slow)
+    return 0
+
+
+def _still_held(work: Callable[[], int]) -> int:
+    """Return the exit code of work beside an arm that is held; an error is printed.
+
+    Raises EndedError if the arm is not to be held any more.
+    """
     try:
-        found = arm.aside(commissioning.result, bags)
-        if code := _written(file, found, names, arm.aside):
-            return code
-        on_robot(arm, file, found, slow)
+        return work()
     except EndedError:
         raise
     except BlfDscError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return 1
-    return 0
 
 
 def _chosen(commissioning: Commissioning, runs: Runs) -> Commissioned:
@@ -193,7 +204,7 @@ def _written(
     """
     print(page.table(found))  # also if the gains are too soft for any bound: an error
     if found.ripples:
-        print(f'\n{ripple_page.ripple_table(found)}')
+        print(f'\n{ripple_page.ripple_table(found.before, found.ripples)}')
     content: Content = aside(file.content, found)
     print('\n'.join(['', *content.lines]))
     picture = _picture(file.path)
@@ -251,10 +262,10 @@ def _check(options: Namespace) -> None:
             '--prove runs a commissioned file on a robot: give --robot or --ros, no bags and no '
             '--write'
         )
-    if options.ripple and (options.prove or options.write):
+    if options.ripple and options.write:
         raise BlfDscError(
-            '--ripple measures an arm, proves the gains and makes a slow motion: leave out --prove '
-            'and --write'
+            '--ripple is found with the gains that are chosen, and --write measures nothing: leave '
+            'out one of them'
         )
     if options.ripple and options.bags and not is_robot:
         raise BlfDscError(
@@ -296,16 +307,26 @@ def _arm(
 def _prove_on_robot(
     options: Namespace, path: Path, commissioning: Commissioning
 ) -> int:
-    """Raise the gains of a file step by step on a robot, and say how far it errs."""
+    """Raise the gains of a file step by step on a robot, and say how far it errs.
+
+    Then look for the torque ripple, if that is asked for.
+    """
     config = commissioning.config
     planned = proof.steps(config)
+    before = [*of_proof(options, config)]
+    if options.ripple:
+        make_room(options.out, force=options.force)
+        before.append(ripple_page.description(slow_motion(config)))
     with _arm(options, path, commissioning) as arm:
-        ask(options, of_proof(options, config))
-        (*_, last), cycles = proven(arm, planned, config)
+        ask(options, before)
+        found = proven(arm, planned, config)
+        if options.ripple:
+            print_proof(config, *found)
+            code = _still_held(lambda: after_proof(options, arm, config, path))
         arm.hold_after()
-    print(page.errors_table(config, last))
-    for each in cycles:
-        print(page.of_limit_cycle(each))
+    if options.ripple:
+        return code
+    print_proof(config, *found)
     return 0
 
 

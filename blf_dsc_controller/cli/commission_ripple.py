@@ -10,12 +10,17 @@ import sys
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 
-from blf_dsc_controller.cli.commission_robot import of_proof, proven
+from blf_dsc_controller.cli.commission_robot import (
+    of_proof,
+    print_proof,
+    proven,
+)
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile, wrapped
 from blf_dsc_controller.cli.run import STOPPED
-from blf_dsc_controller.commissioning import page, ripple_page, simulated
+from blf_dsc_controller.commissioning import files, ripple_page, simulated
 from blf_dsc_controller.commissioning.commissioning import Commissioned
 from blf_dsc_controller.commissioning.postures import (
     EndedError,
@@ -23,10 +28,10 @@ from blf_dsc_controller.commissioning.postures import (
     ripples_by_bags,
 )
 from blf_dsc_controller.commissioning.proof import Step, steps
-from blf_dsc_controller.commissioning.ripple import ripples_in
+from blf_dsc_controller.commissioning.ripple import ripples_in, to_learn
 from blf_dsc_controller.commissioning.slow_motion import SlowMotion, slow_motion
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.configuration.nodes import dump, load_loop, read
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.progress import print_notice
@@ -51,20 +56,53 @@ def on_robot(
 
     Raises EndedError or BlfDscError, which say that torque ripple was not measured.
     """
-    with _without_ripple(file):
+    with _without_ripple(file.path):
         planned, motion = arm.aside(_planned, found)
-        errors, cycles = proven(arm, planned, motion.config)
-        print(page.errors_table(motion.config, errors[-1]))
-        for each in cycles:
-            print(page.of_limit_cycle(each))
-        print(ripple_page.description(motion), flush=True)
-        bag = arm.slow(motion)
-        print_notice('looking for torque ripple in it: some seconds')
-        ripples = arm.aside(ripples_by_bags, [*slow_bags, bag])
+        print_proof(motion.config, *proven(arm, planned, motion.config))
+        ripples = _measured(arm, motion, slow_bags)
         found = found._replace(ripples=ripples)
         content = arm.aside(file.content, found)
     file.write(found, content)
-    _tell(file, found)
+    _tell(found.before, ripples)
+    print(f'wrote {file.path}')
+
+
+def after_proof(
+    options: Namespace, arm: PostureByPosture, config: ControllerConfig, source: Path
+) -> int:
+    """Make the slow motion with gains that are proven, and write what it shows.
+
+    `source` is the file that has them; with a ripple, it is written anew.  Return the exit code.
+
+    Raises as `on_robot`.
+    """
+    with _without_ripple(source):
+        ripples = _measured(arm, arm.aside(slow_motion, config), ())
+    _tell(config, ripples)
+    if listed := to_learn(ripples):
+        sections = files.with_ripple(read(source), [each.cycles for each in listed])
+        table = ripple_page.ripple_table(config, ripples).splitlines()
+        told = wrapped([*ripple_page.of_ripple(config, ripples)])
+        comment = [f'# {line}\n' for line in (options.line, *told, *table)]
+        dump(options.out, sections, ''.join([*_comment(source), *comment]))
+        print(f'wrote {options.out}')
+    return 0
+
+
+def _comment(path: Path) -> Iterator[str]:
+    """Yield the lines of a parameter file before its first section."""
+    with path.open(encoding='utf-8') as lines:
+        yield from takewhile(lambda line: line.startswith('#'), lines)
+
+
+def _measured(
+    arm: PostureByPosture, motion: SlowMotion, others: Sequence[Path]
+) -> tuple[Ripples, ...]:
+    """Return what a slow motion shows, with the bags of others."""
+    print(ripple_page.description(motion), flush=True)
+    bag = arm.slow(motion)
+    print_notice('looking for torque ripple in it: some seconds')
+    return arm.aside(ripples_by_bags, [*others, bag])
 
 
 def on_simulated(file: CommissionedFile, found: Commissioned, stop: str) -> int:
@@ -73,14 +111,15 @@ def on_simulated(file: CommissionedFile, found: Commissioned, stop: str) -> int:
     Not if a `stop` has ended the proof.  Return the exit code.
     """
     try:
-        with _without_ripple(file):
+        with _without_ripple(file.path):
             ripples = _simulated(file.path, stop)
     except BlfDscError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return STOPPED
     found = found._replace(ripples=ripples)
     file.write(found, file.content(found))
-    _tell(file, found)
+    _tell(found.before, ripples)
+    print(f'wrote {file.path}')
     return 0
 
 
@@ -96,9 +135,9 @@ def _simulated(path: Path, stop: str) -> tuple[Ripples, ...]:
 
 
 @contextmanager
-def _without_ripple(file: CommissionedFile) -> Iterator[None]:
-    """Let an error say what was not measured, and what is left."""
-    left = f'Torque ripple was not measured; {file.path} has all else'
+def _without_ripple(path: Path) -> Iterator[None]:
+    """Let an error say what was not measured, and which file has the gains."""
+    left = f'Torque ripple was not measured; {path} has all else'
     try:
         yield
     except EndedError as error:
@@ -113,8 +152,7 @@ def _planned(found: Commissioned) -> tuple[list[Step], SlowMotion]:
     return steps(config), slow_motion(config)
 
 
-def _tell(file: CommissionedFile, found: Commissioned) -> None:
-    """Print the torque ripple, and that it is in the file."""
-    told = wrapped(list(ripple_page.of_ripple(found)))
-    print('\n'.join(['', ripple_page.ripple_table(found), '', *told]))
-    print(f'wrote {file.path}')
+def _tell(config: ControllerConfig, ripples: Sequence[Ripples]) -> None:
+    """Print the torque ripple, and how sure it is."""
+    told = wrapped([*ripple_page.of_ripple(config, ripples)])
+    print('\n'.join(['', ripple_page.ripple_table(config, ripples), '', *told]))

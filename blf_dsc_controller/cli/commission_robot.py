@@ -109,6 +109,15 @@ def proven(
     return found, shaking
 
 
+def print_proof(
+    config: ControllerConfig, errors: Sequence[Errors], cycles: Iterable[LimitCycle]
+) -> None:
+    """Print the errors of the last step beside those to expect, and the limit cycles."""
+    print(page.errors_table(config, errors[-1]))
+    for each in cycles:
+        print(page.of_limit_cycle(each))
+
+
 def prepared_folder(options: Namespace) -> Path:
     """Return the folder for the bags, which does not exist yet.
 

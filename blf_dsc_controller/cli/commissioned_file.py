@@ -53,8 +53,10 @@ class CommissionedFile(NamedTuple):
 
     def write(self, found: Commissioned, content: Content) -> None:
         """Write the file; with the table of the torque ripple, if it was looked for."""
-        table = ripple_page.ripple_table(found).splitlines() if found.ripples else []
-        lines = [self.command, *content.lines, *table]
+        table = ''
+        if found.ripples:
+            table = ripple_page.ripple_table(found.before, found.ripples)
+        lines = [self.command, *content.lines, *table.splitlines()]
         dump(self.path, content.nodes, ''.join(f'# {line}\n' for line in lines))
 
 

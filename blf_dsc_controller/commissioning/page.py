@@ -109,7 +109,7 @@ def sentences(
     if found.has_margin:
         yield f'errors to expect with these gains: {expectation(found.config)}'
         yield from _of_bound(found)
-        yield from of_ripple(found, follows=ripple_follows)
+        yield from of_ripple(found.before, found.ripples, follows=ripple_follows)
     yield (
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'

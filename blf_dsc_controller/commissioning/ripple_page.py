@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
-from blf_dsc_controller.commissioning.commissioning import Commissioned
 from blf_dsc_controller.commissioning.ripple import to_learn
 from blf_dsc_controller.commissioning.slow_motion import (
     SECONDS,
@@ -13,7 +12,7 @@ from blf_dsc_controller.commissioning.slow_motion import (
     slow_frequencies,
 )
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.identification.ripple import Listed
+from blf_dsc_controller.identification.ripple import Listed, Ripples
 from blf_dsc_controller.identification.summary import table_of_ripples
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import SLIDING
@@ -40,33 +39,34 @@ def description(motion: SlowMotion) -> str:
     )
 
 
-def ripple_table(found: Commissioned) -> str:
+def ripple_table(config: ControllerConfig, ripples: Sequence[Ripples]) -> str:
     """Return the torque ripple of each joint, with the columns of `blf_dsc identify`."""
-    chain = found.before.robot.chain(found.joints)
-    return table_of_ripples(chain.joints, found.ripples)
+    return table_of_ripples(config.robot.chain(config.joints).joints, ripples)
 
 
-def of_ripple(found: Commissioned, *, follows: bool = False) -> Iterator[str]:
-    """Yield what is written and how sure it is, or by which motion ripple is found.
+def of_ripple(
+    config: ControllerConfig, ripples: Sequence[Ripples], *, follows: bool = False
+) -> Iterator[str]:
+    """Yield what is written and how sure it is.
 
-    The motion may follow.
+    Without ripples, yield by which motion they are found, or that it follows.
     """
-    if not found.ripples:
-        yield from [_FOLLOWS] if follows else _of_motion(found.before)
+    if not ripples:
+        yield from [_FOLLOWS] if follows else _of_motion(config)
         return
-    listed = to_learn(found.ripples)
+    listed = to_learn(ripples)
     if listed:
         yield (
             f'torque ripple is written as learning.ripple_cycles: '
             f'{_listed([each.cycles for each in listed])}, by which the law learns to compensate it'
         )
     else:
-        known = _listed(found.before.learning.ripple_cycles)
+        known = _listed(config.learning.ripple_cycles)
         yield f'no torque ripple was found: learning.ripple_cycles stays {known}'
     for each in listed:
-        yield _of_entry(found, each)
+        yield _of_entry(config, each)
     little, repeated = [], []
-    for joint, own in zip(found.joints, found.ripples, strict=True):
+    for joint, own in zip(config.joints, ripples, strict=True):
         if not own.is_known:
             little.append(joint)
         elif own.found and own.repeats:
@@ -80,18 +80,19 @@ def of_ripple(found: Commissioned, *, follows: bool = False) -> Iterator[str]:
         )
 
 
-def _of_entry(found: Commissioned, entry: Listed) -> str:
+def _of_entry(config: ControllerConfig, entry: Listed) -> str:
     """Return how well an entry of the list is known, and by which joints."""
-    units = [found.before.units[j] for j in entry.joints]
     unit = ' or '.join(
-        dict.fromkeys('rad/m' if each == SLIDING else 'per turn' for each in units)
+        dict.fromkeys(
+            'rad/m' if config.units[j] == SLIDING else 'per turn' for j in entry.joints
+        )
     )
-    names = ', '.join(found.joints[j] for j in sorted(entry.joints))
-    alone = len(entry.joints) == 1 < len(found.joints)
+    names = ', '.join(config.joints[j] for j in sorted(entry.joints))
+    alone = len(entry.joints) == 1 < len(config.joints)
     return (
         f'{entry.cycles:g} {unit} is known to +- {TWO_SIDED * entry.deviation:.2g}; it shows in '
         f'both directions and both halves of the motion of {len(entry.joints)} of '
-        f'{len(found.joints)} joints ({names}){_TRUST * alone}'
+        f'{len(config.joints)} joints ({names}){_TRUST * alone}'
     )
 
 
