@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,6 +29,7 @@ from blf_dsc_controller.commissioning import (
     slow_motion,
 )
 from blf_dsc_controller.commissioning.driven import Driven
+from blf_dsc_controller.commissioning.own_loop import measured_in
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.planned import FROM_LIMITS
 from blf_dsc_controller.commissioning.postures import EndedError
@@ -41,7 +43,7 @@ from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.identification.ripple import NOTHING, Ripple, Ripples
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.run import TURNING
+from blf_dsc_controller.run import TURNING, Stop
 
 DRIVER = """
 from math import inf
@@ -188,6 +190,14 @@ def test_commands_lack_the_gravity_that_drives_add(preset, effort, whole, monkey
     monkeypatch.setattr(ripple, 'find_ripples', lambda *given: given[2])
     run = blf.read_run(whole.arm.with_name('out_bags') / 'slow_motion')
     assert ripples_in([(run, blf.load_loop(preset).controller)]) == effort
+
+
+def test_run_that_goes_on_after_a_stop_shows_no_ripple(whole, monkeypatch):
+    shorten(monkeypatch)
+    run, config = measured_in(whole.arm.with_name('out_bags') / 'slow_motion')
+    stopped = replace(run, stops=(Stop(int(run.stamp[7000]), 'fault', 'a push'),))
+    with pytest.raises(BlfDscError, match=r'the arm stopped 7 s after .* a push'):
+        ripples_in([(stopped, config)])
 
 
 def test_slow_motion_alone_gives_no_gains(whole, monkeypatch, capsys):
