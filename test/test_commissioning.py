@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,8 +26,8 @@ from blf_dsc_controller.arms.linear_loop import (
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
+from blf_dsc_controller.cli.commission import _file as file_for
 from blf_dsc_controller.cli.commission import _lags as lags_of
-from blf_dsc_controller.cli.commission import _told as told_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
@@ -1256,16 +1257,18 @@ def test_bound_at_the_tool_that_cannot_be_widened_is_refused():
 
 
 @pytest.mark.parametrize(('bags', 'advises'), [([], False), (['bag_1'], True)])
-def test_gains_are_to_be_proven_only_where_there_is_a_robot(bags, advises):
+def test_gains_are_to_be_proven_only_where_there_is_a_robot(bags, advises, tmp_path):
     """Without bags and a robot, the command has measured the simulated arm."""
     seen = found()
     stuck = seen.findings._replace(
         inertia=np.array([np.nan, 1.0]), damping=1.1 * seen.choice.gains.damping
     )
     unfit = stuck._replace(unfit=np.array([[True, False]]))
-    options = SimpleNamespace(config='arm', bags=bags, robot=None, ros=False)
+    arm = {'config': 'arm', 'line': '', 'out': Path('out'), 'ripple': False}
+    options = SimpleNamespace(**arm, bags=bags, robot=None, ros=False)
+    file = file_for(options, file_of_arm(tmp_path))
     for each, remedy in ((stuck, 'take half of'), (unfit, 'with a larger --torque')):
-        told = ' '.join(told_of(options, seen._replace(findings=each), []))
+        told = ' '.join(file.content(seen._replace(findings=each)).lines)
         assert remedy in told
         assert 'friction damps joint2 more' in told
         assert told.count('--prove') == 2 * advises
@@ -1473,7 +1476,7 @@ class _Elsewhere(PostureByPosture):
     def _control(self, _config, _duration, bag, _name):
         bag.mkdir()
 
-    def _aside(self, compute, *given, **named):
+    def aside(self, compute, *given, **named):
         return compute(*deepcopy(given), **named)
 
 

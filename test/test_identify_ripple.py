@@ -95,19 +95,6 @@ def along_reference(preset, *, slow, ripple):
     return found_along(simulate(controller, loop.plant).run(), controller)
 
 
-def test_slow_motion_that_does_not_repeat_shows_the_true_ripple():
-    """A motion of 5 s gives 29.6 for 30."""
-    found = along_reference('ur5e', slow=True, ripple=0.008)
-    assert listed_cycles(found) == pytest.approx((30.0,), rel=3e-3)
-    assert not any(own.repeats for own in found)
-    # slow enough for the limits of the reference
-    reference = load_loop('ur5e').controller.reference
-    slow = slow_frequencies(load_loop('ur5e').controller)
-    assert max(np.divide(slow, reference.frequency)) <= 0.65
-    hold = change(load_loop('ur5e').controller, {'reference.type': 'hold'})
-    assert slow_frequencies(hold) == ()
-
-
 def test_motion_that_repeats_is_told():
     """An FR3's drives compensate friction, not exactly: that repeats, and passes for ripples."""
     found = along_reference('fr3', slow=False, ripple=0.0)

@@ -282,6 +282,12 @@ _COMMISSION = Command(
             action='store_true',
         ),
         option(
+            '--ripple',
+            'also prove the gains, find the torque ripple of the drives in a slow motion of a '
+            'minute that does not repeat, and write learning.ripple_cycles; with --prove, to --out',
+            action='store_true',
+        ),
+        option(
             '--states', 'joint states of its driver (joint_states)', metavar='TOPIC'
         ),
         option(

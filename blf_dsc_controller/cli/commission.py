@@ -4,18 +4,37 @@
 from __future__ import annotations
 
 import sys
-import textwrap
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
-from blf_dsc_controller import __version__
-from blf_dsc_controller.cli.commission_robot import measured_on, proven_on, robot
+from blf_dsc_controller.cli.commission_ripple import (
+    after_proof,
+    before_start,
+    on_robot,
+    on_simulated,
+)
+from blf_dsc_controller.cli.commission_robot import (
+    ask,
+    measured_on,
+    of_proof,
+    print_proof,
+    proven,
+    robot,
+)
+from blf_dsc_controller.cli.commissioned_file import CommissionedFile, Content
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.ros_check import require_ros
-from blf_dsc_controller.commissioning import files, page, simulated
+from blf_dsc_controller.commissioning import (
+    files,
+    page,
+    proof,
+    ripple_page,
+    simulated,
+)
 from blf_dsc_controller.commissioning.choice import LAGS
 from blf_dsc_controller.commissioning.commissioning import Commissioned
 from blf_dsc_controller.commissioning.own_loop import (
@@ -24,6 +43,7 @@ from blf_dsc_controller.commissioning.own_loop import (
     measured_in,
 )
 from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
+from blf_dsc_controller.commissioning.slow_motion import slow_motion
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
@@ -40,7 +60,10 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import announce_reading, print_notice, steps
 from blf_dsc_controller.supervision.digits import largest_error
 
-_WIDTH = 98
+Runs = list[tuple[str, Measured]]
+"""Runs with their names."""
+
+_CHOOSING = 'choosing the gains by what was measured: some ten seconds'
 
 NO_MARGIN = 3
 """Exit code if no gains have the margin."""
@@ -61,6 +84,8 @@ def commission(options: Namespace) -> int:
 
 def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int:
     """Write the motions of a configuration, or measure, choose and write the gains."""
+    if options.ripple:
+        slow_motion(config)  # an error comes before anything moves
     commissioning = Commissioning(
         config,
         options.posture,
@@ -69,34 +94,145 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         margin=options.margin,
         lags=_lags(path),
     )
-    if options.prove:
-        return _prove_on_robot(options, path, commissioning)
     if options.write:
         _write_motions(options, path, commissioning)
         return 0
-    picture = options.out.with_suffix('.png')
-    make_room(options.out, picture, force=options.force)
+    if options.prove:
+        work = _prove_on_robot
+    else:
+        make_room(options.out, _picture(options.out), force=options.force)
+        work = _on_robot if options.robot or options.ros else _by_runs
     try:
-        names, runs, missing = _all_runs(options, path, commissioning)
+        return work(options, path, commissioning)
     except EndedError as error:
         print(f'blf_dsc commission: {error}', file=sys.stderr)
         return CODES[error.end]
-    print_notice('choosing the gains by what was measured: some ten seconds')
-    found = commissioning.result(runs)
+
+
+def _by_runs(options: Namespace, path: Path, commissioning: Commissioning) -> int:
+    """Commission by bags, or else on the simulated arm."""
+    file = _file(options, path)
+    if options.bags:
+        runs = _given(options)
+        found = _chosen(commissioning, runs)
+        return _written(file, found, _names(commissioning, runs))
+    runs, missing = _simulated(path, commissioning)
+    file = file._replace(missing=tuple(missing))
+    found = _chosen(commissioning, runs)
+    if code := _written(file, found, [name for name, _ in runs]):
+        return code
+    stop = _prove(file.path)
+    return on_simulated(file, found, stop) if options.ripple else 0
+
+
+def _on_robot(options: Namespace, path: Path, commissioning: Commissioning) -> int:
+    """Commission a robot, with the bags that are given, too."""
+    runs = _given(options)
+    after: list[str] = []
+    if options.ripple:
+        after = [*before_start(options, commissioning.config)]
+    with _arm(options, path, commissioning) as arm:
+        measured = measured_on(options, arm, commissioning, after)
+        if options.ripple:
+            given = options, path, arm, commissioning, runs, measured
+            code = _still_held(lambda: _with_ripple(*given))
+        arm.hold_after()
+    if options.ripple:
+        return code
+    runs += [(name, measured_in(bag)) for name, bag in measured]
+    found = _chosen(commissioning, runs)
+    return _written(_file(options, path), found, _names(commissioning, runs))
+
+
+def _with_ripple(
+    options: Namespace,
+    path: Path,
+    arm: PostureByPosture,
+    commissioning: Commissioning,
+    given: Runs,
+    measured: Sequence[tuple[str, Path]],
+) -> int:
+    """Choose the gains of a robot that rests, prove them, and find the torque ripple.
+
+    Return the exit code.
+    """
+    slow = [Path(name) for name, run in given if commissioning.is_slow_motion(run)]
+    names = _names(commissioning, given) + [name for name, _ in measured]
+    bags = [*options.bags, *(bag for _, bag in measured)]
+    file = _file(options, path)
+    print_notice(_CHOOSING)
+    found = arm.aside(commissioning.result, bags)
+    if code := _written(file, found, names, arm.aside):
+        return code
+    on_robot(arm, file, found, slow)
+    return 0
+
+
+def _still_held(work: Callable[[], int]) -> int:
+    """Return the exit code of work beside an arm that is held; an error is printed.
+
+    Raises EndedError if the arm is not to be held any more.
+    """
+    try:
+        return work()
+    except EndedError:
+        raise
+    except BlfDscError as error:
+        print(f'blf_dsc commission: {error}', file=sys.stderr)
+        return 1
+
+
+def _chosen(commissioning: Commissioning, runs: Runs) -> Commissioned:
+    """Return what runs show, and the gains that follow."""
+    print_notice(_CHOOSING)
+    return commissioning.result([run for _, run in runs])
+
+
+def _at_once(compute: Callable[..., Any], *given: object) -> Any:
+    return compute(*given)
+
+
+def _written(
+    file: CommissionedFile,
+    found: Commissioned,
+    names: Sequence[str],
+    aside: Callable[..., Any] = _at_once,
+) -> int:
+    """Print, draw and write what was found, by runs of these names; return the exit code.
+
+    What takes long is computed `aside`.
+    """
     print(page.table(found))  # also if the gains are too soft for any bound: an error
-    lines = _told(options, found, missing)
-    print('\n'.join(['', *lines]))
-    page.draw(found, names, picture)
+    if found.ripples:
+        print(f'\n{ripple_page.ripple_table(found.before, found.ripples)}')
+    content: Content = aside(file.content, found)
+    print('\n'.join(['', *content.lines]))
+    picture = _picture(file.path)
+    aside(page.draw, found, names, picture)
     print(f'wrote {picture}')
     if not found.has_margin:
-        print(f'not written: {options.out}')
+        print(f'not written: {file.path}')
         return NO_MARGIN
-    comment = ''.join(f'# {line}\n' for line in (options.line, *lines))
-    dump(options.out, files.of_commissioned(read(path), found), comment)
-    print(f'wrote {options.out}')
-    if _is_simulated(options):
-        _prove(options.out)
+    file.write(found, content)
+    print(f'wrote {file.path}', flush=True)
     return 0
+
+
+def _file(options: Namespace, path: Path) -> CommissionedFile:
+    """Return the file to write for the parameter file at a path."""
+    return CommissionedFile(
+        path=options.out,
+        source=path,
+        name=options.config,
+        command=options.line,
+        is_simulated=_is_simulated(options),
+        ripple_follows=options.ripple,
+    )
+
+
+def _picture(out: Path) -> Path:
+    """Return the path of the picture beside a parameter file."""
+    return out.with_suffix('.png')
 
 
 def _lags(path: Path) -> Sequence[float]:
@@ -126,6 +262,16 @@ def _check(options: Namespace) -> None:
             '--prove runs a commissioned file on a robot: give --robot or --ros, no bags and no '
             '--write'
         )
+    if options.ripple and options.write:
+        raise BlfDscError(
+            '--ripple is found with the gains that are chosen, and --write measures nothing: leave '
+            'out one of them'
+        )
+    if options.ripple and options.bags and not is_robot:
+        raise BlfDscError(
+            '--ripple makes a motion, and its bag needs no option: give --robot or --ros, too, or '
+            'leave out --ripple'
+        )
     if not is_robot and (options.yes or options.record):
         raise BlfDscError(
             '--yes and --record are for a robot: give --robot or --ros, too'
@@ -136,23 +282,15 @@ def _check(options: Namespace) -> None:
         )
 
 
-def _all_runs(
-    options: Namespace, path: Path, commissioning: Commissioning
-) -> tuple[list[str], list[Measured], list[str]]:
-    """Return names and runs: of bags, of the robot or both, else of the simulated arm.
-
-    Also sentences about what was to be measured and could not be.
-    """
-    if _is_simulated(options):
-        return _simulated(path, commissioning)
-    names = [str(bag) for bag in options.bags]
+def _given(options: Namespace) -> Runs:
+    """Return the runs of the bags that are given."""
     announce_reading(options.bags, 'read')
-    runs = [measured_in(bag) for bag in options.bags]
-    if not (options.robot or options.ros):
-        return names, runs, []
-    measured = measured_on(options, _arm(options, path, commissioning), commissioning)
-    names += [name for name, _ in measured]
-    return names, runs + [run for _, run in measured], []
+    return [(str(bag), measured_in(bag)) for bag in options.bags]
+
+
+def _names(commissioning: Commissioning, runs: Runs) -> list[str]:
+    """Return the names of the runs in postures."""
+    return [name for name, run in runs if not commissioning.is_slow_motion(run)]
 
 
 def _arm(
@@ -169,17 +307,26 @@ def _arm(
 def _prove_on_robot(
     options: Namespace, path: Path, commissioning: Commissioning
 ) -> int:
-    """Raise the gains of a file step by step on a robot, and say how far it errs."""
+    """Raise the gains of a file step by step on a robot, and say how far it errs.
+
+    Then look for the torque ripple, if that is asked for.
+    """
     config = commissioning.config
-    try:
-        arm = _arm(options, path, commissioning)
-        (*_, last), cycles = proven_on(options, arm, config)
-    except EndedError as error:
-        print(f'blf_dsc commission: {error}', file=sys.stderr)
-        return CODES[error.end]
-    print(page.errors_table(config, last))
-    for each in cycles:
-        print(page.of_limit_cycle(each))
+    planned = proof.steps(config)
+    before = [*of_proof(options, config)]
+    if options.ripple:
+        make_room(options.out, force=options.force)
+        before.append(ripple_page.description(slow_motion(config)))
+    with _arm(options, path, commissioning) as arm:
+        ask(options, before)
+        found = proven(arm, planned, config)
+        if options.ripple:
+            print_proof(config, *found)
+            code = _still_held(lambda: after_proof(options, arm, config, path))
+        arm.hold_after()
+    if options.ripple:
+        return code
+    print_proof(config, *found)
     return 0
 
 
@@ -204,15 +351,14 @@ def _write_motions(
     )
 
 
-def _simulated(
-    path: Path, commissioning: Commissioning
-) -> tuple[list[str], list[Measured], list[str]]:
-    """Return names and runs of the motions on the simulated arm, and what it did not bear."""
+def _simulated(path: Path, commissioning: Commissioning) -> tuple[Runs, list[str]]:
+    """Return the runs of the motions on the simulated arm, and what it did not bear."""
     loop = load_loop(path)
     planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):
         print(f'posture {k}: {page.description(each)}', flush=True)
-    names, runs, missing = [], [], []
+    runs: Runs = []
+    missing = []
     with announced_compilation(print_notice):
         made = simulated.runs_of(commissioning, loop)
         total = len(planned) + 1
@@ -226,42 +372,26 @@ def _simulated(
                 missing.append(page.not_measured(name, run))
                 print(missing[-1])
                 continue
-            names.append(name)
-            runs.append(run)
-    return names, runs, missing
+            runs.append((name, run))
+    return runs, missing
 
 
-def _told(
-    options: Namespace, found: Commissioned, missing: Sequence[str]
-) -> Sequence[str]:
-    """Return what was commissioned and when, and the sentences of the page; wrapped.
-
-    What is `missing` comes last: it was said long before, and the file is to say it, too.
-    """
-    origin = (
-        f'{options.config} commissioned on {found.date} by blf_dsc_controller {__version__}, with '
-        f'a modulus margin of {found.choice.margin.value:.2g}'
-    )
-    found_out = page.sentences(found, is_simulated=_is_simulated(options))
-    told = [origin, *found_out, *missing]
-    return [line for each in told for line in textwrap.wrap(each, _WIDTH)]
-
-
-def _prove(path: Path) -> None:
-    """Say what the simulated arm does with its new gains."""
+def _prove(path: Path) -> str:
+    """Say what the simulated arm does with its new gains; return why it stops, if it does."""
     loop = load_loop(path)
     print_notice(
         'simulating the arm with these gains along its own motion: some seconds'
     )
-    proof = simulated.proof(loop)
-    if proof.stop:
+    made = simulated.proof(loop)
+    if made.stop:
         print(
-            f'with these gains the simulated arm stops on its own motion: {proof.stop}'
+            f'with these gains the simulated arm stops on its own motion: {made.stop}'
         )
-        return
+        return made.stop
     print(
-        f'with these gains the simulated arm follows its own motion for {proof.duration:g} s, '
-        f'with {largest_error(proof.error, loop.controller.units)} at most'
+        f'with these gains the simulated arm follows its own motion for {made.duration:g} s, '
+        f'with {largest_error(made.error, loop.controller.units)} at most'
     )
-    for each in proof.cycles:
+    for each in made.cycles:
         print(page.of_limit_cycle(each))
+    return ''

@@ -10,7 +10,7 @@ import signal
 import sys
 from argparse import Namespace
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +23,16 @@ from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.own_loop import (
     REPEATS,
     Commissioning,
-    Measured,
-    measured_in,
 )
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
-from blf_dsc_controller.commissioning.proof import Errors, Step, steps
+from blf_dsc_controller.commissioning.proof import (
+    SHARES,
+    Errors,
+    Step,
+    name_of,
+    seconds,
+)
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -69,28 +73,26 @@ def robot(
 
 def measured_on(
     options: Namespace,
-    arm: AbstractContextManager[PostureByPosture],
+    arm: PostureByPosture,
     commissioning: Commissioning,
-) -> list[tuple[str, Measured]]:
-    """Measure a robot, and return for each posture its name and what was measured.
+    after: Iterable[str] = (),
+) -> list[tuple[str, Path]]:
+    """Measure a robot, and return for each posture its name and its bag.
+
+    `after` says what follows.
 
     Raises:
         EndedError: it ended before its time.
         BlfDscError: nobody agrees, or the robot, the file or a run is not as it should be.
     """
-    with arm as here:
-        planned = commissioning.motions_from(here.position())
-        duration = here.duration(planned)
-        ask(options, _limits(options, commissioning, planned, duration))
-        bags = list(_followed(here, planned))
-        here.hold_after()
-    return [(name, measured_in(bag)) for name, bag in bags]
+    planned = commissioning.motions_from(arm.position())
+    duration = arm.duration(planned)
+    ask(options, [*_limits(options, commissioning, planned, duration), *after])
+    return list(_followed(arm, planned))
 
 
-def proven_on(
-    options: Namespace,
-    arm: AbstractContextManager[PostureByPosture],
-    config: ControllerConfig,
+def proven(
+    arm: PostureByPosture, planned: Sequence[Step], config: ControllerConfig
 ) -> tuple[list[Errors], list[LimitCycle]]:
     """Prove the gains of a configuration on a robot.
 
@@ -98,17 +100,22 @@ def proven_on(
 
     Raises as `measured_on`.
     """
-    planned = steps(config)
-    with arm as here:
-        ask(options, _of_proof(options, planned))
-        found, shaking = [], []
-        for step, errors, cycles in here.proof(planned):
-            worst = largest_error(errors.measured, config.units)
-            print(f'{step.name}: calm, errors of {worst} at most', flush=True)
-            found.append(errors)
-            shaking += cycles
-        here.hold_after()
+    found, shaking = [], []
+    for step, errors, cycles in arm.proof(planned):
+        worst = largest_error(errors.measured, config.units)
+        print(f'{step.name}: calm, errors of {worst} at most', flush=True)
+        found.append(errors)
+        shaking += cycles
     return found, shaking
+
+
+def print_proof(
+    config: ControllerConfig, errors: Sequence[Errors], cycles: Iterable[LimitCycle]
+) -> None:
+    """Print the errors of the last step beside those to expect, and the limit cycles."""
+    print(page.errors_table(config, errors[-1]))
+    for each in cycles:
+        print(page.of_limit_cycle(each))
 
 
 def prepared_folder(options: Namespace) -> Path:
@@ -157,16 +164,15 @@ def _followed(
         yield bag
 
 
-def _of_proof(options: Namespace, planned: Sequence[Step]) -> Iterator[str]:
+def of_proof(options: Namespace, config: ControllerConfig) -> Iterator[str]:
     """Yield what the arm is about to do in a proof."""
-    seconds = sum(each.duration for each in planned)
     yield (
         'before each step the joints move straight to the start of the reference, at '
-        f'{_speed(planned[0].config)} at most: keep the way of the arm free'
+        f'{_speed(config)} at most: keep the way of the arm free'
     )
     yield (
-        f'then the arm follows the reference of {options.config}, for {seconds:g} s in all, with '
-        f'{", ".join(each.name for each in planned)}; before the last it holds still for {HOLD:g} s'
+        f'then the arm follows the reference of {options.config}, for {seconds():g} s in all, with '
+        f'{", ".join(map(name_of, SHARES))}; before the last it holds still for {HOLD:g} s'
     )
     yield (
         'an oscillation, any other check of the controller, or Ctrl-C brings the arm to rest and '

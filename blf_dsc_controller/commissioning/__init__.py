@@ -20,6 +20,9 @@ joints, and these the stiffest gains with a margin.
     driven          likewise, over its driver
     over_ros        likewise, over ROS, by the controller's node
     proof           the chosen gains in three steps along the arm's own reference
+    slow_motion     the motion that shows the torque ripple of the drives
+    ripple          what runs of it show
+    ripple_page     the same in words, and how sure it is
     limit_cycle     whether an arm shakes at rest or in motion
     page            table, sentences and picture of what was found and chosen
     files           the parameter files of motions, and with what was chosen

@@ -38,9 +38,12 @@ from blf_dsc_controller.commissioning.chosen import (
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import Response, response_of
+from blf_dsc_controller.commissioning.ripple import to_learn
+from blf_dsc_controller.commissioning.slow_motion import SlowMotion, slow_motion
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.schema import Value
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.run import Run
 from blf_dsc_controller.supervision.digits import two_digits
 
@@ -72,6 +75,7 @@ class Commissioned(NamedTuple):
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
     coulomb: Floats | None  # (n,) N m, robot.coulomb, if the last runs compensated it
+    ripples: tuple[Ripples, ...] = ()  # of each joint; empty: there was no slow motion
 
     @property
     def has_margin(self) -> bool:
@@ -119,6 +123,14 @@ class Commissioned(NamedTuple):
         """
         return with_gains(self.before, self.parameters())
 
+    @property
+    def slow_motion(self) -> SlowMotion:
+        """The motion that shows the torque ripple, with the chosen gains.
+
+        Raises BlfDscError if no gains have the margin, or the reference is no sum of sinusoids.
+        """
+        return slow_motion(self.config)
+
     def parameters_but_bounds(self) -> dict[str, Value]:
         """Return the parameters that follow, without bounds, also of gains without the margin."""
         gains = self.choice.gains
@@ -133,6 +145,8 @@ class Commissioned(NamedTuple):
             of_arm['feedback.joint_damping_lag'] = _rounded(
                 np.asarray(gains.damping_lag)
             )
+        if listed := to_learn(self.ripples):
+            of_arm['learning.ripple_cycles'] = tuple(each.cycles for each in listed)
         return {
             **of_arm,
             'robot.lag': float(f'{self.lag:.3g}'),
@@ -159,7 +173,7 @@ def commissioned(
 
     Raises BlfDscError if a run is not one of its motions, or has a stop.
     """
-    _check_joints(config, runs)
+    _check_runs(config, runs)
     T = config.sample_time
     measured = as_measured(config, [each for _, each in runs])
     arm, _ = design_of(measured)
@@ -194,10 +208,14 @@ def commissioned(
     )
 
 
-def _check_joints(
+def _check_runs(
     config: ControllerConfig, runs: Sequence[tuple[Run, ControllerConfig]]
 ) -> None:
-    """Raise BlfDscError if a run is of other joints."""
+    """Raise BlfDscError if there is none, or if one is of other joints."""
+    if not runs:
+        raise BlfDscError(
+            'there is no run of a motion in a posture: give the bags of these, too'
+        )
     for run, _ in runs:
         if run.joints != config.joints:
             raise BlfDscError(

@@ -129,12 +129,13 @@ class OverRos(PostureByPosture):
         while time.monotonic() < end:
             self._spin()
 
-    def _aside(
+    def aside(
         self,
         compute: Callable[Given, Answer],
         *given: Given.args,
         **named: Given.kwargs,
     ) -> Answer:
+        """Return the answer of a function that another process computes."""
         computed = self._worker.submit(compute, *given, **named)
         while not computed.done():
             self._spin()

@@ -32,6 +32,8 @@ from blf_dsc_controller.commissioning.planned import (
     plan,
     postures_of,
 )
+from blf_dsc_controller.commissioning.ripple import ripples_in
+from blf_dsc_controller.commissioning.slow_motion import is_slow_motion
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
@@ -59,6 +61,8 @@ class Commissioning:
                 ...  # update, for motion.duration [s]
         found = commissioning.result(['run_0', 'run_1', 'run_2'])
         controller = ArmController(found.config)
+
+    With `found.slow_motion`, run likewise, `result` also finds the torque ripple.
 
     Attributes:
         config: the configuration that the arm is measured for.
@@ -250,7 +254,8 @@ class Commissioning:
         """Return what runs of motions show, and the gains that follow.
 
         Args:
-            runs: folders of bags, or runs with the configurations that they had.
+            runs: folders of bags, or runs with the configurations that they had.  Those of
+                the slow motion show the torque ripple, all others the gains.
 
         Raises:
             BagError: a bag cannot be read.
@@ -260,7 +265,15 @@ class Commissioning:
         measured = [
             each if isinstance(each, tuple) else measured_in(each) for each in runs
         ]
-        return commissioned(self.config, measured, self.margin, self._lags)
+        slow = [each for each in measured if self.is_slow_motion(each)]
+        shaken = [each for each in measured if not self.is_slow_motion(each)]
+        ripples = ripples_in(slow) if slow else ()
+        found = commissioned(self.config, shaken, self.margin, self._lags)
+        return found._replace(ripples=ripples)
+
+    def is_slow_motion(self, measured: Measured) -> bool:
+        """Whether a run is the slow motion that shows the torque ripple."""
+        return is_slow_motion(measured[1], self.config)
 
 
 def measured_in(bag: str | Path) -> Measured:

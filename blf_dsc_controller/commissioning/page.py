@@ -21,7 +21,7 @@ from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
-from blf_dsc_controller.commissioning.slow_motion import SECONDS, slow_frequencies
+from blf_dsc_controller.commissioning.ripple_page import of_ripple
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
@@ -92,10 +92,13 @@ def table(found: Commissioned) -> str:
     return aligned(rows)
 
 
-def sentences(found: Commissioned, *, is_simulated: bool = False) -> Iterator[str]:
+def sentences(
+    found: Commissioned, *, is_simulated: bool = False, ripple_follows: bool = False
+) -> Iterator[str]:
     """Yield what was found, what limits the gains, and what to do about it.
 
-    Gains of an arm that `is_simulated` cannot be proven: --prove is for a robot.
+    Gains of an arm that `is_simulated` cannot be proven: --prove is for a robot.  The slow motion
+    that shows torque ripple may follow.
     """
     yield from _of_states(found)
     yield from _of_hidden(found, is_simulated=is_simulated)
@@ -106,7 +109,7 @@ def sentences(found: Commissioned, *, is_simulated: bool = False) -> Iterator[st
     if found.has_margin:
         yield f'errors to expect with these gains: {expectation(found.config)}'
         yield from _of_bound(found)
-        yield from _of_ripple(found.config)
+        yield from of_ripple(found.before, found.ripples, follows=ripple_follows)
     yield (
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'
@@ -279,19 +282,6 @@ def _of_bound(found: Commissioned) -> Iterator[str]:
             'friction, grow by as much; a bound that was given for the stiffer gains may be too '
             'narrow'
         )
-
-
-def _of_ripple(config: ControllerConfig) -> Iterator[str]:
-    """Yield by which motion and command the torque ripple of the drives is found."""
-    if config.learning.ripple_cycles:
-        return
-    slow = ', '.join(f'{each:g}' for each in slow_frequencies(config))
-    how = f', by reference.frequency: [{slow}] in a copy of the file' if slow else ''
-    yield (
-        'torque ripple of the drives is not looked for: the arm moved too little. '
-        f'{SECONDS:g} s of a slow motion that does not repeat show it{how}: give its bag to '
-        'blf_dsc identify, and the learning.ripple_cycles that it prints to this file'
-    )
 
 
 def _wider(found: Commissioned) -> dict[str, list[str]]:

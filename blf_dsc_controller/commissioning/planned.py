@@ -27,7 +27,7 @@ TRAVEL = 0.01
 POSTURES = 3
 """Postures of the reference in which an arm is measured, if nothing else is asked for."""
 
-_FROM_LIMITS = {TURNING: 0.05, SLIDING: 2.0 * TRAVEL}  # rad or m
+FROM_LIMITS = {TURNING: 0.05, SLIDING: 2.0 * TRAVEL}  # rad or m
 
 
 class Planned(NamedTuple):
@@ -139,7 +139,7 @@ def _check_posture(config: ControllerConfig, posture: Floats) -> None:
         strict=True,
     )
     for joint, units, at, lower, upper in limits:
-        away = _FROM_LIMITS[units]
+        away = FROM_LIMITS[units]
         if not lower + away <= at <= upper - away:
             raise BlfDscError(
                 f'posture: {joint} would be at {at:.4g} {units.position}, '
@@ -152,6 +152,6 @@ def _beyond(at: float, lower: float, upper: float, units: JointUnits) -> str:
     unit = units.position
     limits = f'its limits, {lower:g} to {upper:g} {unit}'
     if lower <= at <= upper:
-        return f'less than {_FROM_LIMITS[units]:g} {unit} from {limits}'
+        return f'less than {FROM_LIMITS[units]:g} {unit} from {limits}'
     hint = hint_at_degrees(at, lower, upper) if units == TURNING else ''
     return f'beyond {limits}{hint}'

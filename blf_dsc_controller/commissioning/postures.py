@@ -38,11 +38,14 @@ from blf_dsc_controller.commissioning.proof import (
     start_of,
 )
 from blf_dsc_controller.commissioning.response import response_of
+from blf_dsc_controller.commissioning.ripple import ripples_in
+from blf_dsc_controller.commissioning.slow_motion import SlowMotion
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.turns import short_way
 
@@ -119,6 +122,14 @@ def better_known_by_bag(
     return commissioning.better_known(planned, measured_in(bag)[0])
 
 
+def ripples_by_bags(bags: Sequence[Path]) -> tuple[Ripples, ...]:
+    """Return the torque ripple of each joint by bags of a slow motion.
+
+    Raises BlfDscError as `ripples_in`.
+    """
+    return ripples_in([measured_in(bag) for bag in bags])
+
+
 def check(bag: Path) -> None:
     """Raise BlfDscError if the run of a bag does not show the response."""
     _check(measured_in(bag))
@@ -178,7 +189,7 @@ class PostureByPosture(ABC):
     def hold_after(self) -> None:  # noqa: B027 - most robots hold themselves
         """Hold an arm after its last run that would fall otherwise."""
 
-    def _aside(
+    def aside(
         self,
         compute: Callable[Given, Answer],
         *given: Given.args,
@@ -229,12 +240,12 @@ class PostureByPosture(ABC):
         """
         for k, posture in enumerate(postures, 1):
             name = f'posture {k}'
-            way = self._aside(move, self._config, self.position(), posture)
+            way = self.aside(move, self._config, self.position(), posture)
             self._run(way.config, way.duration, f'move {k}')
             planned, bag = self._measure(name)
             while k == 1:
                 with _named(name):
-                    better = self._aside(
+                    better = self.aside(
                         better_known_by_bag, self._commissioning, planned, bag
                     )
                 if better is None:
@@ -247,11 +258,11 @@ class PostureByPosture(ABC):
 
     def _measure(self, name: str) -> tuple[Planned, Path]:
         """Measure the arm where it rests, repeatedly if need be; return the last motion and bag."""
-        planned = self._aside(self._commissioning.motion, self.position())
+        planned = self.aside(self._commissioning.motion, self.position())
         bag = self._run(planned.config, planned.duration, name)
         for _ in range(REPEATS):
             with _named(name):
-                again = self._aside(
+                again = self.aside(
                     plan_repeat_by_bag,
                     self._commissioning,
                     planned,
@@ -266,7 +277,7 @@ class PostureByPosture(ABC):
             self._commissioning.go_on_with(again)
             bag = self._run(planned.config, planned.duration, name)
         with _named(name):
-            self._aside(check, bag)
+            self.aside(check, bag)
         return planned, bag
 
     def proof(
@@ -286,12 +297,22 @@ class PostureByPosture(ABC):
             there = start_of(step.config, here)
             is_last = step is steps[-1]
             rest = HOLD if is_last else _REST
-            way = self._aside(move, step.config, here, there, rest)
+            way = self.aside(move, step.config, here, there, rest)
             still = self._run(way.config, way.duration, f'way with {step.name}')
             bag = self._run(step.config, step.duration, step.name)
-            cycles = self._aside(cycles_in, still, bag, step.config) if is_last else []
-            yield step, self._aside(errors_of, bag, step.config), cycles
+            cycles = self.aside(cycles_in, still, bag, step.config) if is_last else []
+            yield step, self.aside(errors_of, bag, step.config), cycles
             held = f'{step.share:.0%} of them were calm'
+
+    def slow(self, motion: SlowMotion) -> Path:
+        """Return the bag of a slow motion, to whose start the arm goes slowly.
+
+        Raises EndedError or BlfDscError as `runs`.
+        """
+        self._left = f'The gains are proven; bags are in {self._folder}'
+        way = self.aside(move, motion.config, self.position(), motion.posture)
+        self._run(way.config, way.duration, 'way to slow motion')
+        return self._run(motion.config, motion.duration, 'slow motion')
 
     def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:
         """Control the robot for so long [s]; return the bag."""

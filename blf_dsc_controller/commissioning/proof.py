@@ -41,6 +41,16 @@ SHARES = (0.5, 0.75, 1.0)
 _SHORT, _LAST = 5.0, 15.0  # s
 
 
+def name_of(share: float) -> str:
+    """Return the name of a step with a share of the gains."""
+    return f'{share:.0%} of the gains'
+
+
+def seconds() -> float:
+    """Return how long all steps take [s]."""
+    return (len(SHARES) - 1) * _SHORT + _LAST
+
+
 class Step(NamedTuple):
     """A run with a share of the gains."""
 
@@ -51,7 +61,7 @@ class Step(NamedTuple):
     @property
     def name(self) -> str:
         """Name of the run, and of its bag."""
-        return f'{self.share:.0%} of the gains'
+        return name_of(self.share)
 
 
 class Errors(NamedTuple):

@@ -17,6 +17,8 @@ from blf_dsc_controller.commissioning.own_loop import (
 )
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import cycles_of
+from blf_dsc_controller.commissioning.slow_motion import SlowMotion
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.plant import PlantConfig, pick_ups
 from blf_dsc_controller.configuration.schema import change
@@ -42,15 +44,29 @@ def measured(planned: Planned, plant: PlantConfig, payload: float = 0.0) -> Meas
 
     Raises BlfDscError if the arm stopped.
     """
+    return _run(planned.config, plant, planned.duration, planned.posture, payload)
+
+
+def _run(
+    config: ControllerConfig,
+    plant: PlantConfig,
+    duration: float,
+    begin: Floats,
+    payload: float = 0.0,
+) -> Measured:
+    """Return a run from `begin` (n,) [rad]; events of the plant are left out.
+
+    Raises BlfDscError if the arm stopped.
+    """
     loaded = [payload] if payload else []
     arm = {
-        'duration': planned.duration,
-        'initial.position': planned.posture.tolist(),
+        'duration': duration,
+        'initial.position': begin.tolist(),
     } | pick_ups([0.0] * len(loaded), loaded)
-    run = simulate(planned.config, change(plant, arm)).run()
+    run = simulate(config, change(plant, arm)).run()
     for stop in run.stops:
         raise BlfDscError(f'the simulated arm stopped: {stop.text}')
-    return run, planned.config
+    return run, config
 
 
 def proof(loop: LoopConfig) -> Proof:
@@ -62,6 +78,14 @@ def proof(loop: LoopConfig) -> Proof:
     error = np.zeros(1) if run.error is None else run.error
     cycles = [] if stop else cycles_of(run, loop.controller)
     return Proof(duration, np.nanmax(np.abs(error), axis=0), stop, cycles)
+
+
+def slow_run(motion: SlowMotion, plant: PlantConfig) -> Measured:
+    """Return the run of a slow motion, of an arm that carries nothing.
+
+    Raises BlfDscError if the arm stopped.
+    """
+    return _run(motion.config, plant, motion.duration, motion.posture)
 
 
 def runs_of(

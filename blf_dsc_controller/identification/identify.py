@@ -112,6 +112,21 @@ def identify_arm(
     return found._replace(other_convention=convention)
 
 
+def find_ripples(
+    recording: Recording, robot: Robot, effort: Effort = 'torque'
+) -> tuple[Ripples, ...]:
+    """Return the ripple of each joint as `identify_arm` does, and look for nothing else.
+
+    Signs of the efforts are right.
+
+    Raises:
+        BlfDscError: the recording is too short or has no motion.
+    """
+    problem = problem_of(recording, robot, effort, None, find_signs=False)
+    selected = _selected(problem)
+    return ripples_left(problem, selected.distances, _final_fit(problem, selected))
+
+
 class _Trained(NamedTuple):
     """An arm fitted to the first four fifths of a recording, and scored on the rest."""
 
@@ -181,7 +196,7 @@ def _trained(
     problem = problem_of(recording, robot, effort, picked_up, find_signs=find_signs)
     windows = problem.windows
     begin(SELECTING)
-    selected = select(problem.rows, windows.fit, problem.G, problem.prior)
+    selected = _selected(problem)
     begin(FITTING)
     trained = fitted(
         selected.rows, windows.fit, problem.G, selected.prior, selected.found
@@ -192,14 +207,28 @@ def _trained(
     return _Trained(recording, problem, selected, trained, score)
 
 
+def _selected(problem: Problem) -> Selected:
+    """Return the model of an arm."""
+    return select(problem.rows, problem.windows.fit, problem.G, problem.prior)
+
+
+def _final_fit(problem: Problem, selected: Selected) -> Fit:
+    """Return the fit to all of a recording."""
+    return fitted(
+        selected.rows,
+        problem.windows.moving,
+        problem.G,
+        selected.prior,
+        selected.found,
+    )
+
+
 def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
     """Return the arm that is fitted to all of the recording, with its intervals."""
     recording, problem, selected, fit, score = trained
     windows = problem.windows
     fits = fit_alone(fit.rows, windows.fit, problem.G, problem.prior, COLUMNS)
-    final = fitted(
-        selected.rows, windows.moving, problem.G, selected.prior, selected.found
-    )
+    final = _final_fit(problem, selected)
     rows = final.rows
     dynamics = nearest_friction(rows, windows, final.values)
     size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])

@@ -107,29 +107,41 @@ def ripples_of(short: Rows, theta: Floats, delay: float) -> tuple[Ripples, ...]:
     return tuple(found)
 
 
+class Listed(NamedTuple):
+    """An entry of `learning.ripple_cycles`, and how sure it is."""
+
+    cycles: float  # N, with no more digits than are known
+    deviation: float  # of N
+    joints: tuple[int, ...]  # numbers of those that have it, the most disturbed first
+
+
 def listed_cycles(ripples: Sequence[Ripples]) -> tuple[float, ...]:
     """Return the N of `learning.ripple_cycles`: of all joints, the few that disturb most."""
-    groups: list[list[_Listed]] = []
-    listed = [
-        _Listed(each, _worth(each, own), own.seen[0] / _PERIODS)
-        for own in ripples
+    return tuple(each.cycles for each in listed_ripples(ripples))
+
+
+def listed_ripples(ripples: Sequence[Ripples]) -> tuple[Listed, ...]:
+    """Return what `listed_cycles` lists, with its deviations and joints."""
+    groups: list[list[_Candidate]] = []
+    candidates = [
+        _Candidate(i, each, _worth(each, own), own.seen[0] / _PERIODS)
+        for i, own in enumerate(ripples)
         for each in own.found
     ]
-    for each in sorted(listed, key=lambda one: -one.worth):
+    for each in sorted(candidates, key=lambda one: -one.worth):
         same = next((group for group in groups if _is_same(group[0], each)), None)
         if same is None:
             groups.append([each])
         else:
             same.append(each)
     groups.sort(key=lambda group: -sum(each.worth for each in group))
-    return tuple(
-        _rounded([each.ripple for each in group]) for group in groups[:_LISTED]
-    )
+    return tuple(map(_together, groups[:_LISTED]))
 
 
-class _Listed(NamedTuple):
+class _Candidate(NamedTuple):
     """A ripple that may be listed."""
 
+    joint: int
     ripple: Ripple
     worth: float
     lobe: float  # of its joint
@@ -141,7 +153,7 @@ def _worth(ripple: Ripple, own: Ripples) -> float:
     return ripple.amplitude**2 / (sum(strengths) + 2.0 * own.torque**2)
 
 
-def _is_same(one: _Listed, other: _Listed) -> bool:
+def _is_same(one: _Candidate, other: _Candidate) -> bool:
     """Return whether ripples of two joints may have the same N, or look alike in their motion."""
     a, b = one.ripple, other.ripple
     deviation = float(np.hypot(a.cycles_deviation, b.cycles_deviation))
@@ -149,16 +161,19 @@ def _is_same(one: _Listed, other: _Listed) -> bool:
     return abs(a.cycles - b.cycles) < max(lobe, TWO_SIDED * deviation)
 
 
-def _rounded(same: Sequence[Ripple]) -> float:
+def _together(same: Sequence[_Candidate]) -> Listed:
     """Return the mean N of ripples, with no more digits than are known: 30.0 for 29.98 +- 0.03."""
-    weights = np.array([1.0 / (each.cycles_deviation**2 + _TINY) for each in same])
-    mean = float(weights @ [each.cycles for each in same] / weights.sum())
-    half = max(TWO_SIDED / float(np.sqrt(weights.sum())), _ROUNDING * mean)
+    ripples = [each.ripple for each in same]
+    weights = np.array([1.0 / (each.cycles_deviation**2 + _TINY) for each in ripples])
+    mean = float(weights @ [each.cycles for each in ripples] / weights.sum())
+    deviation = 1.0 / float(np.sqrt(weights.sum()))
+    half = max(TWO_SIDED * deviation, _ROUNDING * mean)
     for digits in range(3):
         rounded = round(mean, digits)
         if abs(rounded - mean) < half:
             break
-    return rounded
+    joints = tuple(dict.fromkeys(each.joint for each in same))
+    return Listed(rounded, deviation, joints)
 
 
 class _Share:

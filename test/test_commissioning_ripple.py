@@ -1,0 +1,509 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`blf_dsc commission --ripple`: the slow motion, what it shows, and what is left if it ends."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from elastic_two_link import ARM, NEAR, shorten_motions, shorten_moves
+from plant_driver import PlantDriver
+
+import blf_dsc_controller as blf
+from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.cli import commission_ripple
+from blf_dsc_controller.cli.commission_ripple import on_robot
+from blf_dsc_controller.cli.commissioned_file import CommissionedFile
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.commissioning import (
+    postures,
+    proof,
+    ripple,
+    simulated,
+    slow_motion,
+)
+from blf_dsc_controller.commissioning.driven import Driven
+from blf_dsc_controller.commissioning.own_loop import measured_in
+from blf_dsc_controller.commissioning.page import sentences
+from blf_dsc_controller.commissioning.planned import FROM_LIMITS
+from blf_dsc_controller.commissioning.postures import EndedError
+from blf_dsc_controller.commissioning.ripple import ripples_in, to_learn
+from blf_dsc_controller.commissioning.ripple_page import of_ripple, ripple_table
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.drive.loop import End
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.from_files import identify_bag
+from blf_dsc_controller.identification.ripple import NOTHING, Ripple, Ripples
+from blf_dsc_controller.reference.approach import reference_of
+from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.run import TURNING, Stop
+
+DRIVER = """
+from math import inf
+from plant_driver import PlantDriver
+class DRIVER(PlantDriver):
+    arm = {arm!r}
+    facts = PlantDriver.facts._replace(joints=2, torque_limit=(inf,) * 2)
+"""
+MOVES = """
+    reference: {type: sinusoids, offset: [0.3, 1.1], amplitude: [0.3, 0.1, 0.3, 0.1],
+                frequency: [1.6, 2.6], phase: [1.5, 0.0]}
+"""
+RIPPLE = (
+    '    actuator: {torque_limit: [60.0, 30.0], ripple: 0.004, ripple_cycles: 40.0}\n'
+)
+SLOW = 15.0  # s
+
+
+def shorten(monkeypatch):
+    """Let everything take less time than a robot is given: 34 s in place of 3 minutes."""
+    shorten_motions(monkeypatch)
+    shorten_moves(monkeypatch)
+    monkeypatch.setattr(proof, '_SHORT', 0.5)
+    monkeypatch.setattr(proof, '_LAST', 0.5)
+    monkeypatch.setattr(postures, 'HOLD', 1.0)
+    monkeypatch.setattr(postures, '_REST', 0.2)
+    for module in (slow_motion, ripple):
+        monkeypatch.setattr(module, 'SECONDS', SLOW)
+
+
+def written(folder):
+    """Write the file of a rigid arm with ripple, with a driver on it; return its path."""
+    path, driver = folder / 'arm.yaml', folder / 'arm_driver.py'
+    driver.write_text(DRIVER.format(arm=str(path)))
+    text = ARM.replace('    joint.stiffness: [3.0e+3, 1.5e+3]\n', RIPPLE)
+    drive = f'/**/drive:\n  ros__parameters: {{driver: {driver}, settle_time: 0.5}}\n'
+    path.write_text(text.rstrip() + MOVES + drive)
+    return path
+
+
+def commission(arm, *options, out='out.yaml'):
+    """Run the command; return its exit code."""
+    words = ['commission', '--config', str(arm), '--out', str(arm.with_name(out))]
+    return main([*words, *options])
+
+
+def at(posture):
+    return ['--posture', *map(str, posture)]
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """Commission a robot with ripple; return its file, what was found and what was said."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(Path(__file__).parent)
+        shorten(monkeypatch)
+        arm = written(tmp_path_factory.mktemp('ripple'))
+        told = []
+        monkeypatch.setattr(
+            'builtins.print', lambda *words, **_: told.append(' '.join(map(str, words)))
+        )
+        chosen = []
+        choose = blf.Commissioning.result
+
+        def noted(*given):
+            chosen.append(choose(*given))
+            return chosen[-1]
+
+        monkeypatch.setattr(blf.Commissioning, 'result', noted)
+        assert commission(arm, '--robot', 'plant', '--ripple', '--yes', *at(NEAR)) == 0
+        (found,) = chosen
+        calls = PlantDriver.last.calls
+    return SimpleNamespace(arm=arm, found=found, told='\n'.join(told), calls=calls)
+
+
+@pytest.fixture
+def arm(tmp_path, monkeypatch):
+    """Return the file of an arm that was not commissioned."""
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    shorten(monkeypatch)
+    return written(tmp_path)
+
+
+pytestmark = pytest.mark.usefixtures('blank_pictures')
+
+
+def cycles_of(path):
+    return blf.load_loop(path).controller.learning.ripple_cycles
+
+
+def test_robot_is_measured_proven_and_its_ripple_written(whole):
+    before, _, after = whole.told.partition('0 of 1 postures measured')
+    assert 'slow motion, for 16 s: joint1 -0.' in before
+    assert 'for 1.5 s in all, with 50% of the gains' in before
+    steps = [
+        after.find(each) for each in ('1 of 1 postures', '100% of', 'slow motion, for')
+    ]
+    assert steps == sorted(steps)
+    assert whole.calls == ['connect', *['start', 'finish'] * 10]
+    out = whole.arm.with_name('out.yaml')
+    (cycles,) = cycles_of(out)
+    assert cycles == pytest.approx(40.0, abs=0.5)
+    # the table and how sure it is, in the console and in the file
+    comment = out.read_text().partition('/**:')[0].replace('\n# ', ' ')
+    for text in (after.replace('\n', ' '), comment):
+        assert re.search(r'joint2 +0\.1\d+ \+- 0\.0\d+ N m at (39\.|40)', text)
+        assert f'is written as learning.ripple_cycles: [{cycles:g}], by' in text
+        assert 'the motion of 2 of 2 joints (joint1, joint2)' in text
+    assert 'is not measured' not in comment
+
+
+def test_bags_give_the_same_and_replay(whole, monkeypatch):
+    shorten(monkeypatch)
+    folder = whole.arm.with_name('out_bags')
+    bags = [folder / name for name in ('slow_motion', 'posture_1')]
+    assert commission(whole.arm, *map(str, bags), out='again.yaml') == 0
+    first, again = (
+        blf.load_loop(whole.arm.with_name(name)).controller
+        for name in ('out.yaml', 'again.yaml')
+    )
+    date = {'commissioning.date': first.commissioning.date}
+    assert change(again, date) == first
+    assert blf.verify(bags[0]).difference is None
+    # it is the motion of a loop of one's own
+    made = whole.found.slow_motion.config
+    assert read_content(bags[0]).controller_config() == made
+    file = file_in(whole.arm.parent, whole)
+    # also if another process computes what is written
+    compute, found = pickle.loads(pickle.dumps((file.content, whole.found)))  # noqa: S301
+    assert compute(found) == file.content(whole.found)
+    # the rest of the table is that of `blf_dsc identify`, too
+    loaded = blf.load_loop(whole.arm.with_name('out.yaml')).controller
+    own = to_learn(identify_bag(bags[0], loaded.robot, effort='command').ripples)
+    assert tuple(each.cycles for each in own) == pytest.approx(
+        first.learning.ripple_cycles, abs=0.2
+    )
+
+
+@pytest.mark.parametrize(
+    ('preset', 'effort'), [('fr3', 'without-gravity'), ('ur5e', 'command')]
+)
+def test_commands_lack_the_gravity_that_drives_add(preset, effort, whole, monkeypatch):
+    shorten(monkeypatch)
+    monkeypatch.setattr(ripple, 'find_ripples', lambda *given: given[2])
+    run = blf.read_run(whole.arm.with_name('out_bags') / 'slow_motion')
+    assert ripples_in([(run, blf.load_loop(preset).controller)]) == effort
+
+
+def test_run_that_goes_on_after_a_stop_shows_no_ripple(whole, monkeypatch):
+    shorten(monkeypatch)
+    run, config = measured_in(whole.arm.with_name('out_bags') / 'slow_motion')
+    stopped = replace(run, stops=(Stop(int(run.stamp[7000]), 'fault', 'a push'),))
+    with pytest.raises(BlfDscError, match=r'the arm stopped 7 s after .* a push'):
+        ripples_in([(stopped, config)])
+
+
+def test_slow_motion_alone_gives_no_gains(whole, monkeypatch, capsys):
+    shorten(monkeypatch)
+    bag = whole.arm.with_name('out_bags') / 'slow_motion'
+    assert commission(whole.arm, str(bag), out='alone.yaml') == 1
+    assert 'there is no run of a motion in a posture' in capsys.readouterr().err
+
+
+def test_ctrl_c_in_the_slow_motion_keeps_the_gains(whole, arm, capsys, monkeypatch):
+    """State 17000 is in it; the arm comes to rest."""
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    monkeypatch.setattr(blf.Commissioning, 'result', lambda *_: whole.found)
+    options = ('--robot', 'interrupt@17000', '--ripple', '--yes', *at(NEAR))
+    assert commission(arm, *options) == 130
+    told = capsys.readouterr()
+    out = arm.with_name('out.yaml')
+    assert 'slow motion: ended on request. The gains are proven; bags are' in told.err
+    assert f'Torque ripple was not measured; {out} has all else' in told.err
+    assert PlantDriver.last.calls[-1] == 'finish'
+    assert PlantDriver.last.velocity < 0.01  # rad/s
+    assert blf.load_loop(out).controller.commissioning.margin >= 0.5
+    assert cycles_of(out) == ()
+    comment = out.read_text().replace('\n# ', ' ')
+    assert 'torque ripple is not measured: the slow motion that shows it' in comment
+
+
+def test_gains_of_a_file_are_proven_and_its_ripple_added(whole, capsys, monkeypatch):
+    """Once somebody has looked at them; the rest of the file stays."""
+    shorten(monkeypatch)
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    monkeypatch.syspath_prepend(whole.arm.parent)
+    gains = whole.arm.with_name('gains.yaml')
+    file = file_in(whole.arm.parent, whole)._replace(path=gains)
+    file.write(whole.found, file.content(whole.found))
+    folder = str(whole.arm.with_name('proof'))
+    words = ['--prove', '--ripple', '--robot', 'plant', '--yes', '--record', folder]
+    assert commission(gains, *words, out='gains.yaml') == 1  # exists
+    assert 'exists already' in capsys.readouterr().err
+    assert commission(gains, *words, out='rippled.yaml') == 0
+    told = capsys.readouterr().out
+    assert told.index('slow motion, for 16 s') < told.index('100% of the gains: calm')
+    assert told.index('error  expected') < told.index('is written as learning.ripple')
+    before, after = (
+        blf.load_loop(whole.arm.with_name(name)).controller
+        for name in ('gains.yaml', 'rippled.yaml')
+    )
+    (cycles,) = after.learning.ripple_cycles
+    assert cycles == pytest.approx(40.0, abs=0.5)
+    assert change(before, {'learning.ripple_cycles': [cycles]}) == after
+    comment = whole.arm.with_name('rippled.yaml').read_text().partition('/**:')[0]
+    assert comment.startswith(gains.read_text().partition('/**:')[0])
+    assert (
+        f'# torque ripple is written as learning.ripple_cycles: [{cycles:g}]' in comment
+    )
+
+
+def test_bag_that_shows_nothing_is_told_and_the_arm_is_held(whole, capsys, monkeypatch):
+    """As where positions come too rarely to tell."""
+    shorten(monkeypatch)
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    monkeypatch.setattr(postures.PostureByPosture, 'slow', lambda *_: None)
+    held = []
+
+    def hold(robot):
+        held.append(robot)
+
+    monkeypatch.setattr(postures.PostureByPosture, 'hold_after', hold)
+
+    def shows_nothing(_bags):
+        assert not held
+        raise BlfDscError('the joint states are 0.1 s apart')
+
+    monkeypatch.setattr(commission_ripple, 'ripples_by_bags', shows_nothing)
+    gains = whole.arm.with_name('out.yaml')
+    folder = str(whole.arm.with_name('proof_only'))
+    words = ['--prove', '--ripple', '--robot', 'plant', '--yes', '--record', folder]
+    assert commission(gains, *words, out='none.yaml') == 1
+    told = capsys.readouterr().err
+    assert f'0.1 s apart. Torque ripple was not measured; {gains} has' in told
+    assert len(held) == 1
+    assert not whole.arm.with_name('none.yaml').exists()
+
+
+class Pushed(PlantDriver):
+    """An arm that somebody pushes past its bound."""
+
+    def happen(self):
+        if self.what == 'push':
+            self.push = np.array([500.0, 0.0])  # N m
+        else:
+            super().happen()
+
+    def write(self, torque):
+        super().write(None if torque is None else torque + self.push)
+
+    push = np.zeros(2)
+
+
+@pytest.mark.parametrize(
+    ('what', 'number', 'end', 'told'),
+    [
+        ('push', 8000, End.STOPPED, '^slow motion: the controller stopped: joint '),
+        ('silent', 8000, End.LOST, '^slow motion: the connection was lost: no state'),
+        ('push', 1000, End.STOPPED, 'The gains are not proven: no share of the'),
+    ],
+)
+def test_end_before_its_time_says_that_ripple_was_not_measured(
+    what, number, end, told, whole, tmp_path, monkeypatch
+):
+    shorten(monkeypatch)
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    config = whole.found.before
+    driver = Pushed(f'{what}@{number}', config, DriveConfig(settle_time=0.5))
+    driver.arm = whole.arm
+    driver.connect()
+    robot = Driven(driver, blf.Commissioning(config), tmp_path / 'bags')
+    file = file_in(tmp_path, whole)
+    file.write(whole.found, file.content(whole.found))
+    before = file.path.read_text()
+    with pytest.raises(EndedError, match=told) as caught:
+        on_robot(robot, file, whole.found, [])
+    assert caught.value.end is end
+    assert str(caught.value).endswith(
+        f'Torque ripple was not measured; {file.path} has all else'
+    )
+    assert file.path.read_text() == before
+    if number == 8000:
+        bag = tmp_path / 'bags' / 'slow_motion'
+        posture = whole.arm.with_name('out_bags') / 'posture_1'
+        assert bag.exists()
+        with pytest.raises(BlfDscError, match=r'slow motion, which shows torque'):
+            blf.Commissioning(config).result([posture, bag])
+
+
+def file_in(folder, whole):
+    return CommissionedFile(
+        path=folder / 'out.yaml',
+        source=whole.arm,
+        name='arm',
+        command='',
+        is_simulated=False,
+        ripple_follows=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ('given', 'told'),
+    [
+        (['--write', 'm.yaml'], 'and --write measures nothing: leave out'),
+        (['--robot', 'plant', '--prove'], 'feedback.joint_stiffness is empty: prove'),
+        (['bag'], '--ripple makes a motion, and its bag needs no option'),
+    ],
+)
+def test_ripple_that_cannot_be_found_so_is_refused(given, told, arm, capsys):
+    assert commission(arm, '--ripple', *given) == 1
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('robot', [[], ['--robot', 'plant', '--yes']])
+def test_reference_without_tones_is_refused_before_anything_moves(robot, arm, capsys):
+    arm.write_text(arm.read_text().replace('{type: sinusoids', '{type: hold'))
+    PlantDriver.last = None
+    assert commission(arm, '--ripple', *robot, *at(NEAR)) == 1
+    assert 'reference.type: got hold, but torque ripple' in capsys.readouterr().err
+    assert PlantDriver.last is None
+    assert not arm.with_name('out.yaml').exists()
+
+
+def test_simulated_arm_without_ripple_shows_none(arm, capsys):
+    """Its file is written, and says so."""
+    arm.write_text(arm.read_text().replace('ripple: 0.004', 'ripple: 0.0'))
+    assert commission(arm, '--ripple', *at(NEAR)) == 0
+    told = capsys.readouterr().out
+    assert told.index('follows its own motion') < told.index('slow motion, for 16 s')
+    assert 'no torque ripple was found: learning.ripple_cycles stays []' in told
+    assert re.search(r'joint1 +none above \S+ N m at \d', told)
+    out = arm.with_name('out.yaml')
+    assert cycles_of(out) == ()
+    assert 'no torque ripple was found' in out.read_text()
+
+
+def test_simulated_arm_that_stops_keeps_its_gains(arm, capsys, monkeypatch):
+    def stopped(*_):
+        raise BlfDscError('the simulated arm stopped: it fell')
+
+    monkeypatch.setattr(simulated, 'slow_run', stopped)
+    assert commission(arm, '--ripple', *at(NEAR)) == 5
+    out = arm.with_name('out.yaml')
+    assert f'fell. Torque ripple was not measured; {out}' in capsys.readouterr().err
+    assert cycles_of(out) == ()
+
+
+@cache
+def ur5e(*, has_ripple):
+    """Return what the slow motion shows of a simulated UR5e with its chosen gains."""
+    loop = blf.load_loop('ur5e_commissioned')
+    if not has_ripple:  # half a minute shows as well that there is none
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            for module in (slow_motion, ripple):
+                monkeypatch.setattr(module, 'SECONDS', 30.0)
+            return shown_by(
+                loop.controller, change(loop.plant, {'actuator.ripple': 0.0})
+            )
+    return shown_by(loop.controller, loop.plant)
+
+
+def shown_by(controller, plant):
+    motion = slow_motion.slow_motion(controller)
+    return ripples_in([simulated.slow_run(motion, plant)])
+
+
+def test_ripple_of_a_ur5e_is_found_in_all_joints_and_none_where_there_is_none():
+    """Of 30 periods, and 0.8 % of 150 and 28 N m."""
+    found = ur5e(has_ripple=True)
+    (listed,) = to_learn(found)
+    assert listed.cycles == pytest.approx(30.0, abs=0.3)
+    assert abs(listed.cycles - 30.0) < 4.0 * listed.deviation + 0.05
+    assert sorted(listed.joints) == [0, 1, 2, 3, 4, 5]
+    assert not any(each.repeats for each in found)
+    amplitudes = [each.found[0].amplitude for each in found]
+    np.testing.assert_allclose(amplitudes, [1.2] * 3 + [0.224] * 3, rtol=0.2)
+    assert to_learn(none := ur5e(has_ripple=False)) == ()
+    assert all(each.is_known and not each.repeats for each in none)
+
+
+def shown(found, *ripples):
+    return '\n'.join(of_ripple(found.before, ripples))
+
+
+def test_it_says_how_sure_a_ripple_is(whole):
+    own = Ripple(40.01, 0.05, 1.2, 0.02)
+    seen = Ripples((own,), (5.0, 200.0), 0.1, 0.5)
+    none = seen._replace(found=())
+    alone = shown(whole.found, seen, none)
+    assert '40 per turn is known to +- 0.098; it shows in both directions' in alone
+    assert 'of 1 of 2 joints (joint1). No other joint shows it: trust it if' in alone
+    assert 'No other' not in shown(whole.found, seen, seen)
+    assert 'joint2 moved too little to show' in shown(whole.found, seen, NOTHING)
+    # what a motion that repeats shows is not learned
+    again = whole.found._replace(ripples=(seen._replace(repeats=True), none))
+    assert 'joint1 repeated the same motion' in shown(again, *again.ripples)
+    assert 'learning.ripple_cycles' not in again.parameters()
+    assert '1.2 +- 0.039 N m at 40.01 +- 0.098' in ripple_table(
+        again.before, again.ripples
+    )
+    # a list that the file has stays
+    known = change(whole.found.before, {'learning.ripple_cycles': [12.5]})
+    kept = whole.found._replace(before=known)
+    assert 'learning.ripple_cycles stays [12.5]' in shown(kept, none, none)
+    written = kept._replace(ripples=(seen, none)).config
+    assert written.learning.ripple_cycles == (40.0,)
+    # without the option, nothing has changed
+    assert sum('ripple' in each for each in sentences(whole.found)) == 1
+    assert 'is not looked for' in '\n'.join(sentences(whole.found))
+
+
+def test_slow_motion_has_the_tones_of_the_reference_at_half_the_pace():
+    config = blf.load_loop('ur5e').controller
+    slow = slow_motion.slow_frequencies(config)
+    shares = np.divide(slow, config.reference.frequency)
+    assert shares[0] == pytest.approx(0.5, rel=1e-3)
+    assert shares.max() <= 0.65
+    assert slow_motion.slow_motion(config).config.reference.frequency == slow
+    hold = change(config, {'reference.type': 'hold'})
+    assert slow_motion.slow_frequencies(hold) == ()
+
+
+def range_of(config, seconds=60.0):
+    q = sampled(reference_of(config), np.arange(0.0, seconds, 0.01))[:, 0]
+    return q.min(axis=0), q.max(axis=0)
+
+
+@pytest.mark.parametrize('preset', ['ur5e', 'fr3'])
+def test_joints_keep_away_from_near_limits_in_the_slow_motion(preset):
+    """Tones without a period add up to more than those of the reference do."""
+    config = blf.load_loop(preset).controller
+    free = slow_motion.slow_motion(config)
+    np.testing.assert_allclose(free.ranges, range_of(free.config), atol=2e-3)
+    lower, upper = range_of(config)
+    beyond = np.maximum(lower - free.ranges[0], free.ranges[1] - upper)
+    assert beyond.max() > 0.1  # rad
+    near = change(
+        config,
+        {
+            'limits.position_lower': (lower - 0.01).tolist(),
+            'limits.position_upper': (upper + 0.06).tolist(),
+        },
+    )
+    kept = slow_motion.slow_motion(near)
+    assert (kept.ranges[0] > lower - 1e-3).all()
+    assert (kept.ranges[1] < upper + 0.06 - FROM_LIMITS[TURNING] + 1e-3).all()
+    assert kept.config.reference.frequency == free.config.reference.frequency
+    assert slow_motion.is_slow_motion(kept.config, near)
+    assert not slow_motion.is_slow_motion(free.config, near)
+    assert not slow_motion.is_slow_motion(config, config)
+
+
+def test_single_tone_becomes_two_that_do_not_repeat():
+    config = blf.load_loop('recommended').controller
+    assert len(config.reference.frequency) == 1
+    made = slow_motion.slow_motion(config)
+    assert len(made.config.reference.frequency) == 2
+    lower, upper = range_of(config)
+    assert (made.ranges[0] > lower - 1e-3).all()
+    assert (made.ranges[1] < upper + 1e-3).all()
+    np.testing.assert_allclose(
+        made.posture, sampled(reference_of(config), [0.0])[0, 0], atol=1e-12
+    )
