@@ -19,14 +19,15 @@ known, and a load heavier.  So r fades out for good where
 
 - *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).  Then it becomes
   slower, only in the joints that shake: loads, which stay, are found, if later.  If r of one of
-  these still shakes after `_OFTEN` times, all of r is left out.  Where the arm oscillates, r
-  takes the blame first: slower, it costs less than softer feedback, which comes next.
+  these still shakes after `_OFTEN` times, all of r is left out.  Where the arm oscillates, and
+  that does not grow, r takes the blame first: slower, it costs less than softer feedback.
 - *efforts are commands*: in the first motion, efforts behind the filter L are within a
   `_EQUAL` share of the torque that is commanded, as seen against what they are away from
   that of the links, in the geometric mean of the joints.  The mean squares are those of
   what changes faster than `_SLOWEST`.  Between sensor and command are motor and friction,
   also those that a torque loop leaves: they are known to be there as soon as the mean
-  exceeds `_DISTINCT`, and then this question is not asked again, nor once r has shaken.
+  exceeds `_DISTINCT`, and then this question is not asked again.  Until then r is a step
+  slower, and one that shakes is left out.
 - *efforts do not follow*: drives with a loop around sensors make of them what is commanded,
   whatever load or contact is behind.  An effort that is off by `_OFF` of the torque limit
   leaves r out while that lasts, and if it lasts while the arm follows its reference, for
