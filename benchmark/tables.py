@@ -32,7 +32,7 @@ GROUPS = {
         'stop-damping': 'how much of the damping of a stop a joint bears',
         'commissioning': 'random arms, commissioned and put to work',
         'load-observer': 'what joint torque sensors are worth',
-        'observer-bandwidth': 'how fast the use of joint torque sensors may be',
+        'observer-poles': 'how fast the load observer may be',
         'motor-feedback': 'feedback through a bus, and inside motors',
         'holding': 'arms with soft drives, as users report them and under this law',
     },

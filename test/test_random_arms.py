@@ -12,7 +12,7 @@ from benchmark import (
     joint_pd,
     many_arms,
     momentum_observer,
-    observer_bandwidth,
+    observer_poles,
     random_arms,
     rise,
     soft_arms,
@@ -469,20 +469,20 @@ def test_bandwidths_are_compared_on_arms_that_ran_with_all_of_them(
     def outcome(_, number, bandwidth):
         made.append(number)
         figures = 1.0 + bandwidth, 0.002, bandwidth > 0.0, number < 0, number < 0
-        return observer_bandwidth.Outcome(*figures)
+        return observer_poles.Outcome(*figures)
 
-    monkeypatch.setattr(observer_bandwidth, 'outcome', outcome)
+    monkeypatch.setattr(observer_poles, 'outcome', outcome)
     path = tmp_path / 'runs.jsonl'
-    found = observer_bandwidth.outcomes(2, path)
-    assert observer_bandwidth.outcomes(2, path) == found
-    assert len(made) == 2 * 2 * len(observer_bandwidth.BANDWIDTHS)
+    found = observer_poles.outcomes(2, path)
+    assert observer_poles.outcomes(2, path) == found
+    assert len(made) == 2 * 2 * len(observer_poles.BANDWIDTHS)
     found.pop(('fr3', 300.0, 1))
-    rows = list(observer_bandwidth.rows(found))
+    rows = list(observer_poles.rows(found))
     at_60, at_150 = rows[1], rows[3]
     assert at_60 == ['panda', '60', '2', '1.00, 1.00', '2.0, 2.0, 2.0', '2', '0', '0']
     assert at_150[:4] == ['panda', '150', '2', '2.48, 2.48']
     assert [row[2] for row in rows] == ['2'] * 6 + ['1'] * 6
-    assert all(len(row) == len(observer_bandwidth.HEADS) for row in rows)
+    assert all(len(row) == len(observer_poles.HEADS) for row in rows)
 
 
 @pytest.mark.parametrize('name', soft_pairs.ROBOTS)

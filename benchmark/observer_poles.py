@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How fast the load observer may be: random elastic arms that change, with poles of several speeds.
 
-    python -m benchmark observer-bandwidth [N] [--keep FILE]
+    python -m benchmark observer-poles [N] [--keep FILE]
 
 The first N arms of `monte_carlo_elastic_changes_panda` and `_fr3` run supervised, with learning
 and `disturbance.observer_bandwidth` L.  Errors are from 5 s on; the rms is that of their norm.
