@@ -28,6 +28,7 @@ import plants
 import pytest
 from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
+from llvmlite import binding as llvm
 from numba.core import event
 from numba.core.errors import TypingError, UnsupportedError
 from planted import Planted
@@ -379,6 +380,39 @@ def test_kernel_that_allocates_an_array_is_rejected():
         allocating(1.0)
 
 
+DEFINED = """
+@data = global [80 x double] zeroinitializer
+declare i64 @other(i64)
+define i64 @"of \\22a\\22 law"(i64 %x) {
+  %1 = mul i64 %x, %x
+  %2 = call i64 @other(i64 %1)
+  ret i64 %2
+}
+"""
+CALLING = """
+declare i64 @"of \\22a\\22 law"(i64)
+define i64 @calling(i64 %x) {
+  %1 = call i64 @"of \\22a\\22 law"(i64 %x)
+  ret i64 %1
+}
+"""
+
+
+@compiling
+def test_symbols_of_a_stored_kernel_are_known_and_not_taken_for_its_code():
+    stored = sys.modules[jit.KernelCompiler.__module__]._symbols(
+        llvm.parse_assembly(DEFINED).as_bitcode()
+    )
+    symbols = llvm.parse_bitcode(stored)
+    found = {each.name for each in symbols.global_variables if not each.is_declaration}
+    assert found == {'data', 'of "a" law'}
+    calling = llvm.parse_assembly(CALLING)
+    calling.verify()
+    calling.link_in(symbols)
+    with pytest.raises(RuntimeError, match='is called by its Entry alone'):
+        calling.verify()
+
+
 @jit.kernel
 def copy(given, out):
     for i in range(out.size):
@@ -604,6 +638,19 @@ def test_index_that_cannot_be_read_is_replaced(tmp_path, found_and_compiled, con
     assert found_and_compiled() == ['0', '1']
     (index,) = tmp_path.glob('cache/*/*twice*.nbi')
     index.write_bytes(content)
+    assert found_and_compiled() == ['0', '1']
+    assert found_and_compiled() == ['1', '0']
+
+
+@compiling
+def test_machine_code_is_stored_with_its_symbols_alone_and_replaced_if_it_is_cut(
+    tmp_path, found_and_compiled
+):
+    assert found_and_compiled() == ['0', '1']
+    (stored,) = tmp_path.glob('cache/*/*twice*.nbc')
+    whole = stored.read_bytes()
+    assert b'is called by its Entry alone' in whole
+    stored.write_bytes(whole[: len(whole) // 2])
     assert found_and_compiled() == ['0', '1']
     assert found_and_compiled() == ['1', '0']
 

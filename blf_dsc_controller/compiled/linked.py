@@ -34,6 +34,7 @@ from typing import Any
 
 import numba
 from llvmlite import ir
+from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core import cgutils, types
 from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
@@ -61,6 +62,8 @@ FunctionIdentity._unique_ids = count(secrets.randbits(48))  # noqa: SLF001
 
 _ENVIRONMENT = '_ZN08NumbaEnv'
 _ALLOCATORS = ('NRT_Allocate', 'NRT_MemInfo_alloc')
+_REQUIRE = 3  # behaviour of a flag of LLVM's modules
+_NOT_LINKED = 'a kernel that is loaded from the cache is called by its Entry alone'
 _INTERNAL: dict[object, object] = {}  # numba's own functions, compiled this way
 
 
@@ -184,9 +187,34 @@ class _Folder(_CacheLocator):  # type: ignore[misc]
 
 
 class _CachedCode(CompileResultCacheImpl):  # type: ignore[misc]
+    """What is stored of a kernel: its machine code, and for its bitcode that of its symbols alone.
+
+    Of the bitcode numba would parse all whenever it loads a kernel: for its symbols, and to
+    compile it into others, which call it by its address instead.
+    """
+
     def __init__(self, path: Path, function: Any) -> None:
         self._locator_classes = [_Folder(path, function)]
         super().__init__(function)
+
+    def reduce(self, compiled: Any) -> tuple[Any, ...]:
+        (name, kind, (code, bitcode)), *others = super().reduce(compiled)
+        return (name, kind, (code, _symbols(bitcode))), *others
+
+
+def _symbols(bitcode: bytes) -> bytes:
+    """Return the bitcode of a module that defines the same symbols, and must not be linked."""
+    module = parse_bitcode(bitcode)
+    symbols = ir.Module()
+    for each in (*module.functions, *module.global_variables):
+        if not each.is_declaration:
+            byte = ir.GlobalVariable(symbols, ir.IntType(8), each.name)
+            byte.initializer = ir.Constant(byte.value_type, 0)
+    # a flag that requires another, which no module has: the verifier says its name
+    i32 = ir.IntType(32)
+    missing = symbols.add_metadata([_NOT_LINKED, i32(1)])
+    symbols.add_named_metadata('llvm.module.flags', [i32(_REQUIRE), 'kernel', missing])
+    return bytes(parse_assembly(str(symbols)).as_bitcode())
 
 
 class _Stored(FunctionCache):  # type: ignore[misc]
