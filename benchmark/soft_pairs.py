@@ -7,7 +7,8 @@ The studies are `monte_carlo_elastic_changes_*`: gears, motors, links, delays an
 independently of the controller, friction falls with the speed and grows with the load, and four
 events change load, friction and what pushes.  Each arm runs supervised, with learning, without
 it, and without it with other noise.  The rms is that of the error's norm from 5 s on, with
-learning over without, of arms that go to the end with finite numbers both times.
+learning over without, of arms that go to the end both times.  An arm that stops has not kept
+its bound.
 
 It goes round the robots arm by arm.  After an interrupt, `--keep` goes on from the arms that
 its file has, and `soft-pairs 0` prints the table of what is there.
@@ -19,6 +20,7 @@ import argparse
 import itertools
 from collections.abc import Iterator, Sequence
 from functools import partial
+from math import isinf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +35,7 @@ from blf_dsc_controller.studies.runs import KEPT, VIOLATED, figures_of
 
 ROBOTS = 'panda', 'ur5e', 'fr3'
 ALLOWED = 1.1  # rms with learning over without
+STOPPED = 'stopped'
 
 
 class Pair(NamedTuple):
@@ -58,9 +61,11 @@ def pair_of(robot: str, study: Study, number: int) -> Pair:
     for prefix, config in study.laws().items():
         plant = plant_with(study, drawn, prefix)
         with np.errstate(all='ignore'):
-            found = figures_of(study, simulate(config, plant), plant)
+            record = simulate(config, plant)
+            found = figures_of(study, record, plant)
         each = [found[f'rms_error_rad.{name}'] for name in study.plant.joints]
-        outcomes.append(str(found['outcome']))
+        goes_on = isinf(record.stopped)
+        outcomes.append(str(found['outcome']) if goes_on else STOPPED)
         rms.append(float(np.linalg.norm(each)))
     return Pair(
         robot,

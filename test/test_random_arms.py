@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -451,14 +453,20 @@ def test_pairs_that_are_kept_are_not_run_again(monkeypatch, tmp_path):
         rms = {f'rms_error_rad.{name}': 3e-3 for name in study.plant.joints}
         return {'outcome': 'kept', **rms}
 
-    monkeypatch.setattr(soft_pairs, 'simulate', lambda *_: None)
+    def simulate(law, _):  # arm 1 stops without learning
+        is_second = len(made) >= 3
+        stops = is_second and law.learning.weight == 0.0
+        return SimpleNamespace(stopped=4.0 if stops else inf)
+
+    monkeypatch.setattr(soft_pairs, 'simulate', simulate)
     monkeypatch.setattr(soft_pairs, 'figures_of', figures_of)
     path = tmp_path / 'pairs.jsonl'
     found = list(soft_pairs.pairs(2, ['ur5e'], path))
     assert list(soft_pairs.pairs(2, ['ur5e'], path)) == found
     assert len(made) == 2 * 3
     assert found[1].rms == pytest.approx([3e-3 * 6**0.5] * 3)
-    assert found[1].kept == found[1].ends == (True,) * 3
+    assert found[0].kept == found[0].ends == (True,) * 3
+    assert found[1].kept == found[1].ends == (True, False, False)
 
 
 def test_bandwidths_are_compared_on_arms_that_ran_with_all_of_them(
