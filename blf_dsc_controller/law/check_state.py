@@ -27,7 +27,7 @@ OSCILLATES = 32
 """The arm oscillates: at the beginning, and again and again while it lasts."""
 
 NOT_SENSORS = 64
-"""Efforts have turned out not to be torques of joint sensors: see `torque_sensors`."""
+"""What joint torque sensors show is used less, or not at all: see `torque_sensors`."""
 
 
 class Checks(NamedTuple):

@@ -90,9 +90,8 @@ class State(NamedTuple):
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
     faded: Cell  # share of r that is left out, as the sensors are in doubt
-    slowed: Annotated[
-        Array, 'n * observer.enabled'
-    ]  # steps by which r is slower than L
+    # steps by which r of a joint is slower than L
+    slowed: Annotated[Array, 'n * observer.enabled']
     # share of what changes faster than that slower pole that is left out
     calmed: Annotated[Array, 'n * observer.enabled']
     slow: Annotated[Array, 'n * observer.enabled']  # r behind this slower pole, N m
