@@ -489,6 +489,14 @@ def test_file_of_another_format_is_not_worth_a_recovery(tmp_path, all_say):
     all_say(file, 'it is no MCAP file: give a bag')
 
 
+def test_file_to_which_nothing_was_written_is_called_empty(tmp_path, all_say):
+    file = tmp_path / 'full_disk.mcap'
+    file.touch()
+    all_say(
+        file, 'it is empty: nothing was recorded, as on a full disk: give another bag'
+    )
+
+
 @pytest.mark.parametrize('declared', [1 << 27 | 1, 1 << 62])
 def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, all_say, declared):
     file = copy / 'bag_0.mcap'

@@ -269,9 +269,13 @@ def _reason(path: Path, error: Exception) -> str:
         encoding = other_encoding(file)
         if encoding:
             return f'its messages are {encoding}, not CDR of ROS 2: {_remedy(encoding)}'
-    remedy = f'{text}; to save the undamaged part: blf_dsc recover {path}'
-    is_other = not any(map(_has_magic, files))
-    return 'it is no MCAP file: give a bag' if is_other else remedy
+    if not any(file.stat().st_size for file in files):
+        text = 'it is empty: nothing was recorded, as on a full disk: give another bag'
+    elif not any(map(_has_magic, files)):
+        text = 'it is no MCAP file: give a bag'
+    else:
+        text += f'; to save the undamaged part: blf_dsc recover {path}'
+    return text
 
 
 def _has_magic(file: Path) -> bool:
