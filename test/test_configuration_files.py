@@ -236,6 +236,10 @@ REMEDIES = [
     ('a:\n\tb: 1\n', 'indent with spaces, not with tabs'),
     ('<robot name="a">\n<!-- it: is -->\n</robot>', 'names it as robot.urdf'),
     (section('n', 'a: 1') + '---\nm: {}\n', 'leave out the line ---'),
+    (
+        'm:\n    a: {}\n  b:\n    c: 1\n',
+        'in the column of the other lines of its group',
+    ),
     (section('n', 'a: &x 1, b: *x'), 'alias *x: write out its value'),
     ('- 1\n', 'at the top, such as {/**: {ros__parameters: '),
     ('n:\n  ros_parameters: {a: 1}\n', 'ros_parameters has to be ros__parameters'),

@@ -135,6 +135,8 @@ def _remedy(text: str, error: yaml.MarkedYAMLError) -> str:
         return ': indent with spaces, not with tabs'
     if error.problem and 'another document' in error.problem:
         return ': leave out the line ---'
+    if error.problem and error.problem.endswith("found '<block mapping start>'"):
+        return ': begin this line in the column of the other lines of its group'
     return ''
 
 
