@@ -244,6 +244,14 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         ),
         (
             CONTROLLER,
+            {'learning.window': 5.0, 'sample_time': 1.0},
+            (
+                'got 5 s, which is 5 samples of 1 s: between 10 and 1000000 are allowed; '
+                'if sample_time is in ms, give 0.001'
+            ),
+        ),
+        (
+            CONTROLLER,
             {'learning.window': 1000.001},
             'got 1000 s, which is 1000001 samples',
         ),

@@ -41,6 +41,7 @@ _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
+_SLOW = 0.5  # s: sample times from here on are no control loop; they may be ms
 
 
 @dataclass(frozen=True)
@@ -432,10 +433,13 @@ class Learning:
         samples = self.window / sample_time
         (fewest, most) = _SAMPLES
         if not fewest - 0.5 <= samples <= most + 0.5:
-            yield (
+            text = (
                 f'learning.window: got {self.window:g} s, which is {samples:.0f} samples of '
                 f'{sample_time:g} s: between {fewest} and {most} are allowed'
             )
+            if sample_time >= _SLOW:
+                text += f'; if sample_time is in ms, give {1e-3 * sample_time:g}'
+            yield text
         yield from misfits(
             'learning.initial_estimate',
             self.initial_estimate,
