@@ -153,7 +153,7 @@ def test_arm_whose_gears_resonate_gets_a_slower_pole():
 
 def test_pole_is_the_fastest_with_the_margin():
     result = found(SOFT)
-    pole, margin = result.observer
+    pole, margin, _ = result.observer
     assert margin.value >= ENOUGH
     assert margin.frequency >= RESONANT
     f = result.responses[0].frequency
@@ -270,6 +270,7 @@ def test_little_margin_where_gears_are_stiff_is_by_design_but_nearly_none_is_not
             '_least',
             lambda *_: iter([(values, 0.01 * np.ones(3), directions)]),
         )
+        monkeypatch.setattr(SensedLoops, 'why_no_sensors', '')
         response = found().responses[0]._replace(frequency=f, seen=np.ones(3, bool))
         loops = found().loops._replace(responses=[response])
         return found().sensed._replace(loops=loops).fastest_pole(found().choice.gains)
@@ -279,6 +280,52 @@ def test_little_margin_where_gears_are_stiff_is_by_design_but_nearly_none_is_not
     none = chosen(1.0, ENOUGH + 0.009)
     assert none.pole == 0.0
     assert none.margin == pytest.approx((ENOUGH - 0.001, 40.0, 0, 1))
+
+
+def judged(effort_of):
+    """Return the pole that a run with other efforts gets, and why none."""
+    run, config = measured()
+    result = commissioned(CONFIG, [(replace(run, effort=effort_of(run)), config)])
+    return result, result.observer.pole, result.observer.why_none
+
+
+@pytest.mark.parametrize('late', [0, 1, 3])
+def test_efforts_that_are_commands_are_not_used(late):
+    result, pole, why = judged(lambda run: np.roll(run.torque, late, axis=0))
+    assert (pole, why) == (0.0, 'efforts are the commands, a few samples late')
+    assert result.config.disturbance.observer_bandwidth == 0.0
+    assert f'NO LOAD OBSERVER: {why}. Set robot.effort' in ' '.join(sentences(result))
+
+
+@pytest.mark.parametrize(
+    'effort_of',
+    [
+        lambda run: -run.effort,
+        lambda run: 1000.0 * run.effort,
+        lambda run: 0.1 * run.effort,
+        lambda run: 0.0 * run.effort,
+        lambda run: run.effort[:, ::-1],
+    ],
+    ids=['other sign', 'N mm', 'a tenth', 'nothing', 'other joint'],
+)
+def test_efforts_that_do_not_move_the_links_are_not_used(effort_of):
+    _, pole, why = judged(effort_of)
+    assert pole == 0.0
+    assert why.startswith('efforts do not move the links: ')
+
+
+def test_posture_with_a_load_does_not_speak_against_sensors():
+    """Its links are heavier than those of the model, by up to several times."""
+    result = found()
+    (response,) = result.responses
+    loaded = result.sensed._replace(links=0.2 * result.sensed.links)
+    assert loaded.why_no_sensors.startswith('efforts do not move the links: 80 %')
+    both = loaded._replace(
+        loops=result.loops._replace(responses=[response, response]),
+        sensed=2 * loaded.sensed,
+        links=np.vstack((loaded.links, result.sensed.links)),
+    )
+    assert both.why_no_sensors == ''
 
 
 def test_parameters_have_the_pole_only_where_the_law_uses_sensors():

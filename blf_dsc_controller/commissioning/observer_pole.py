@@ -16,6 +16,11 @@ Below `RESONANT`, r makes an arm that holds an unknown load as light as the mode
 no more than M_l / M is left, by design, whatever the pole.  There `BARELY` is enough, noise not
 counted: r is stable for any load while gears are stiff.
 
+Efforts must be those of sensors at the links first.  Where gears are stiff, those of the joint
+that the motion moves are M_l D V: on random arms the difference has at most a quarter of their
+square, and a hundredth as a rule; of efforts in another unit, of another sign or joint it has
+more than half.  Commands are U, a few samples late, and nothing else.
+
 Poles end with `POLES`: a faster one gains little and hands the noise of velocities to the torque.
 """
 
@@ -64,11 +69,17 @@ RESONANT = 20.0
 """Frequency [Hz] from which on gears may resonate."""
 
 
+_UNLIKE = 0.5  # share of the square of efforts that M_l D V may leave
+_AS_COMMANDS = 0.01  # of that, what efforts that are commands leave beside U
+_LATEST = 3  # samples, by which these may be late
+
+
 class ObserverPole(NamedTuple):
     """The chosen pole, and what limits it."""
 
-    pole: float  # L, rad/s; 0: no pole is slow enough
+    pole: float  # L, rad/s; 0: none
     margin: Margin  # with it, or with the slowest that is tried, where gears resonate
+    why_none: str = ''  # of efforts that are no torques of the links
 
 
 class SensedLoops(NamedTuple):
@@ -86,14 +97,65 @@ class SensedLoops(NamedTuple):
         return [each[:2] for each in self._least(gains, pole)]
 
     def fastest_pole(self, gains: JointGains) -> ObserverPole:
-        """Return the fastest pole that is borne, with all that are slower."""
+        """Return the fastest pole that is borne, with all that are slower.
+
+        0 if none is, or if the efforts are not those of sensors at the links.
+        """
         chosen = ObserverPole(0.0, self._margins(gains, POLES[0])[0])
+        if why := self.why_no_sensors:
+            return chosen._replace(why_none=why)
         for pole in POLES:
             margin, below = self._margins(gains, pole)
             if margin.value < ENOUGH or below < BARELY:
                 break
             chosen = ObserverPole(pole, margin)
         return chosen
+
+    @property
+    def why_no_sensors(self) -> str:
+        """Why efforts cannot be those of sensors at the links; empty if they can.
+
+        By the posture that speaks for it most: in another one, the arm may hold a load.
+        """
+        unlike, as_commands = np.array(
+            [
+                self._unlike(*each)
+                for each in zip(
+                    self.loops.responses, self.sensed, self.links, strict=True
+                )
+            ]
+        ).T
+        if as_commands.max() < _AS_COMMANDS:
+            return 'efforts are the commands, a few samples late'
+        if unlike.min() > _UNLIKE:
+            return (
+                'efforts do not move the links: '
+                f'{100.0 * min(float(np.sqrt(unlike.min())), 1.0):.0f} % of them or more are '
+                'not the torque of these'
+            )
+        return ''
+
+    def _unlike(
+        self, response: Response, sensed: Sensed, links: Floats
+    ) -> tuple[float, float]:
+        """Return how unlike M_l D V efforts are, and how much more so U: means of the joints."""
+        T, f = self.loops.sample_time, response.frequency
+        rows = response.seen & (f >= SLOWEST) & (f < RESONANT)
+        z: Complex = np.exp(2j * np.pi * f[rows] * T)
+        effort = np.diagonal(sensed.effort[rows], axis1=1, axis2=2)
+        moving = ((1.0 - 1.0 / z) / T)[:, None, None] * links @ response.velocity[rows]
+        late = effort * self._late(z)[:, None]
+        left = _square(late - np.diagonal(moving, axis1=1, axis2=2))
+        of_commands = min(
+            _mean(_square(effort - (z**-k)[:, None]) / left) for k in range(_LATEST + 1)
+        )
+        return _mean(left / _square(late)), of_commands
+
+    def _late(self, z: Complex) -> Complex:
+        """Return the response (f,) of the lag of velocities."""
+        if self.sensor_lag == 0.0:
+            return np.ones_like(z)
+        return low_pass(1.0 / self.sensor_lag, self.loops.sample_time, z)
 
     def _margins(self, gains: JointGains, pole: float) -> tuple[Margin, float]:
         """Return the margin from `RESONANT` on, and that below with noise not counted."""
@@ -129,10 +191,11 @@ class SensedLoops(NamedTuple):
         """Return the same in one posture, with M_l (n, n) of the `links`."""
         T = self.loops.sample_time
         z: Complex = np.exp(2j * np.pi * response.frequency * T)
-        late = low_pass(1.0 / self.sensor_lag, T, z) if self.sensor_lag > 0.0 else 1.0
         quotient = (1.0 - 1.0 / z) / T
         # r from [effort; velocity]
-        of_effort = (low_pass(pole, T, z) * late)[:, None, None] * np.eye(len(links))
+        of_effort = (low_pass(pole, T, z) * self._late(z))[:, None, None] * np.eye(
+            len(links)
+        )
         of_velocity = -(low_pass(pole, T, z) * quotient)[:, None, None] * links
         C_y, C_v = self.loops.law(response, gains)
         L = C_y @ response.position + (C_v - of_velocity) @ response.velocity
@@ -157,3 +220,13 @@ def low_pass(pole: float, T: float, z: Complex) -> Complex:
     """Return the response (f,) of a sampled pole [rad/s] at z (f,)."""
     left = np.exp(-T * pole)
     return np.asarray((1.0 - left) / (1.0 - left / z))
+
+
+def _square(values: Complex) -> Floats:
+    """Return the sum of squares (n,) over the frequencies (f, n), a little above zero."""
+    return np.asarray((np.abs(values) ** 2).sum(axis=0) + 1e-9)
+
+
+def _mean(values: Floats) -> float:
+    """Return the geometric mean over the joints."""
+    return float(np.exp(np.log(values).mean()))

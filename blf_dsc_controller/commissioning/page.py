@@ -190,13 +190,15 @@ def _of_observer(found: Commissioned) -> Iterator[str]:
     """Yield how fast the load observer is, and what limits it."""
     if found.observer is None:
         return
-    pole, limit = found.observer
+    pole, limit, why_none = found.observer
     where = f'near {two_digits(limit.frequency)} Hz, by {found.joints[limit.joint]}'
+    if why_none:
+        yield f'NO LOAD OBSERVER: {why_none}. Set robot.effort and robot.torque_loop as they are'
+        return
     if pole == 0.0:
         yield (
             f'NO LOAD OBSERVER: with the slowest pole, {POLES[0]:g} rad/s, it would leave a '
-            f'modulus margin of {limit.value:.2g} {where}. Efforts may not be those of joint '
-            'torque sensors, or the URDF describes other links'
+            f'modulus margin of {limit.value:.2g} {where}, or too little for a load'
         )
         return
     yield (
