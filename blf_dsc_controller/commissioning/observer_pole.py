@@ -45,8 +45,7 @@ from blf_dsc_controller.commissioning.response import Response, Sensed
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_SLOW = (10.0, 16.0, 25.0, 40.0)
-POLES = (*_SLOW, 60.0, 80.0, 100.0, 125.0, 150.0, 200.0, 250.0, 300.0)
+POLES = (10.0, 16.0, 25.0, 40.0, 60.0, 100.0, 150.0, 200.0, 300.0)
 """Poles of r [rad/s] that are tried, from slow to fast."""
 
 ENOUGH = 0.25
