@@ -220,10 +220,14 @@ def measured_of(
     plant = change(plant_with(study, draw(study, number)), {'truth.rotor_factor': 1.0})
     if seed is not None:
         plant = change(plant, {'seed': seed})
+    return controller, runs_of(controller, plant), plant
+
+
+def runs_of(controller: ControllerConfig, plant: PlantConfig) -> list[Measured]:
+    """Return the runs of a commissioning of an arm that go to the end."""
     loop = LoopConfig(plant, controller, RecorderConfig())
     runs = [run for _, run in simulated.runs_of(Commissioning(controller), loop)]
-    measured = [run for run in runs if not isinstance(run, BlfDscError)]
-    return controller, measured, plant
+    return [run for run in runs if not isinstance(run, BlfDscError)]
 
 
 def lagging(name: str, number: int) -> list[str]:

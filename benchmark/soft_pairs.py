@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random elastic arms that change, each with and without learning.
 
-    python -m benchmark soft-pairs [N] [--robots NAME...] [--keep FILE]
+    python -m benchmark soft-pairs [N] [--robots NAME...] [--commissioned] [--keep FILE]
 
 The studies are `monte_carlo_elastic_changes_*`: gears, motors, links, delays and tables are drawn
 independently of the controller, friction falls with the speed and grows with the load, and four
@@ -9,6 +9,9 @@ events change load, friction and what pushes.  Each arm runs supervised, with le
 it, and without it with other noise.  The rms is that of the error's norm from 5 s on, with
 learning over without, of arms that go to the end both times.  An arm that stops has not kept
 its bound.
+
+With `--commissioned`, each arm is measured first, and has the gains that follow.  One that
+gets none has not kept its bound.
 
 It goes round the robots arm by arm.  After an interrupt, `--keep` goes on from the arms that
 its file has, and `soft-pairs 0` prints the table of what is there.
@@ -19,6 +22,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from math import isinf
 from pathlib import Path
@@ -26,9 +30,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmark.commissioning import runs_of
 from benchmark.harness import print_table
 from benchmark.kept import Results
 from benchmark.studies import load_study
+from blf_dsc_controller.commissioning.commissioning import commissioned
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import Study, draw, plant_with
 from blf_dsc_controller.studies.runs import KEPT, VIOLATED, figures_of
@@ -54,11 +61,25 @@ def pair_in(value: list[Any]) -> Pair:
     return Pair(robot, number, *map(tuple, figures))
 
 
-def pair_of(robot: str, study: Study, number: int) -> Pair:
-    """Run an arm of a study in the supervised loop, with each law."""
+def measured(study: Study, number: int) -> Study | None:
+    """Return a study with the gains that an arm of it gets; None: it gets none."""
+    controller = study.controller
+    plant = plant_with(study, draw(study, number))
+    try:
+        found = commissioned(controller, runs_of(controller, plant))
+        return replace(study, controller=found.config)
+    except BlfDscError:
+        return None
+
+
+def pair_of(robot: str, study: Study, number: int, *, measures: bool) -> Pair:
+    """Run an arm of a study in the supervised loop, with each law; perhaps commission it first."""
     drawn = draw(study, number)
+    own = measured(study, number) if measures else study
+    if own is None:
+        return Pair(robot, number, (False,) * 3, (False,) * 3, (np.nan,) * 3)
     outcomes, rms = [], []
-    for prefix, config in study.laws().items():
+    for prefix, config in own.laws().items():
         plant = plant_with(study, drawn, prefix)
         with np.errstate(all='ignore'):
             record = simulate(config, plant)
@@ -76,7 +97,9 @@ def pair_of(robot: str, study: Study, number: int) -> Pair:
     )
 
 
-def pairs(runs: int, robots: Sequence[str], path: Path | None) -> Iterator[Pair]:
+def pairs(
+    runs: int, robots: Sequence[str], path: Path | None, *, measures: bool = False
+) -> Iterator[Pair]:
     """Yield the arms that a file has, and those that are missing, which it gets."""
     kept: Results[tuple[str, int], Pair] = Results(
         path, lambda key: (key[0], key[1]), pair_in
@@ -88,7 +111,8 @@ def pairs(runs: int, robots: Sequence[str], path: Path | None) -> Iterator[Pair]
     known = set(kept.results)
     for number, (name, study) in itertools.product(range(runs), studies.items()):
         if (name, number) not in known:
-            yield kept.get((name, number), partial(pair_of, name, study, number))
+            run = partial(pair_of, name, study, number, measures=measures)
+            yield kept.get((name, number), run)
 
 
 def row(robot: str, found: Sequence[Pair]) -> list[str]:
@@ -138,12 +162,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument('runs', type=int, nargs='?', default=1000, help='arms of each')
     parser.add_argument('--robots', nargs='+', choices=ROBOTS, default=list(ROBOTS))
+    parser.add_argument(
+        '--commissioned', action='store_true', help='measure each arm first'
+    )
     parser.add_argument('--keep', type=Path, help='file of the runs that are made')
 
 
 def main(given: argparse.Namespace) -> None:
     """Print the table."""
-    found = list(pairs(given.runs, given.robots, given.keep))
+    found = list(
+        pairs(given.runs, given.robots, given.keep, measures=given.commissioned)
+    )
     names = sorted({each.robot for each in found})
     of = {name: [each for each in found if each.robot == name] for name in names}
     print_table(HEADS, (row(*each) for each in of.items()))

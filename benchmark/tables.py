@@ -33,6 +33,7 @@ GROUPS = {
         'commissioning': 'random arms, commissioned and put to work',
         'load-observer': 'what joint torque sensors are worth',
         'observer-poles': 'how fast the load observer may be',
+        'chosen-poles': 'how fast commissioning makes it, and what that is worth',
         'motor-feedback': 'feedback through a bus, and inside motors',
         'holding': 'arms with soft drives, as users report them and under this law',
     },

@@ -41,6 +41,9 @@ class Chosen:
             self.values['commissioning.unseen_inertia'] = commissioning.unseen_inertia
         if feedback.joint_damping_lag:  # where it pays
             self.values['feedback.joint_damping_lag'] = feedback.joint_damping_lag
+        if config.disturbance.observer_bandwidth:  # joint torque sensors are used
+            bandwidth = config.disturbance.observer_bandwidth
+            self.values['disturbance.observer_bandwidth'] = bandwidth
         if config.robot.rotor_inertia:  # no drive hides the motors
             self.values['robot.rotor_inertia'] = config.robot.rotor_inertia
             self.values['safety.damping'] = config.safety.damping

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from benchmark import (
+    chosen_poles,
     joint_pd,
     many_arms,
     momentum_observer,
@@ -28,6 +29,7 @@ from blf_dsc_controller.arms.linear_loop import (
     law_response,
 )
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.supervision.model_torque import model_torque
 
@@ -467,6 +469,63 @@ def test_pairs_that_are_kept_are_not_run_again(monkeypatch, tmp_path):
     assert found[1].rms == pytest.approx([3e-3 * 6**0.5] * 3)
     assert found[0].kept == found[0].ends == (True,) * 3
     assert found[1].kept == found[1].ends == (True, False, False)
+
+
+def test_arms_of_pairs_that_are_commissioned_have_the_gains_that_follow(monkeypatch):
+    """An arm that gets none has not kept its bound."""
+    stiffness = []
+
+    def simulate(law, _):
+        stiffness.append(law.feedback.joint_stiffness)
+        return SimpleNamespace(stopped=inf)
+
+    def figures_of(study, *_):
+        return {'outcome': 'kept'} | {
+            f'rms_error_rad.{name}': 1.0 for name in study.plant.joints
+        }
+
+    def commissioned(controller, runs):
+        if runs == ['none']:
+            raise BlfDscError('no gains have the margin')
+        gains = {'feedback.joint_stiffness': [123.0] * len(controller.joints)}
+        return SimpleNamespace(config=change(controller, gains))
+
+    monkeypatch.setattr(soft_pairs, 'simulate', simulate)
+    monkeypatch.setattr(soft_pairs, 'figures_of', figures_of)
+    monkeypatch.setattr(soft_pairs, 'commissioned', commissioned)
+    monkeypatch.setattr(soft_pairs, 'runs_of', lambda *_: ['a run'])
+    (pair,) = soft_pairs.pairs(1, ['ur5e'], None, measures=True)
+    assert pair.kept == (True,) * 3
+    assert stiffness == [(123.0,) * 6] * 3
+    monkeypatch.setattr(soft_pairs, 'runs_of', lambda *_: ['none'])
+    (pair,) = soft_pairs.pairs(1, ['ur5e'], None, measures=True)
+    assert pair.kept == pair.ends == (False,) * 3
+    assert len(stiffness) == 3
+
+
+def test_chosen_poles_are_compared_with_one_for_all(monkeypatch, tmp_path):
+    made = []
+
+    def outcome(robot, number, pole):
+        made.append((robot, number, pole))
+        L = 100.0 * (1 + number) if pole == chosen_poles.CHOSEN else float(pole)
+        errors = 0.001, 0.6 / L, 0.002
+        return chosen_poles.Outcome(L, *errors, number > 0, number > 1, number > 1)
+
+    monkeypatch.setattr(chosen_poles, 'outcome', outcome)
+    path = tmp_path / 'runs.jsonl'
+    found = chosen_poles.outcomes(3, path)
+    assert chosen_poles.outcomes(3, path) == found
+    assert len(made) == 3 * 2 * 3
+    rows = list(chosen_poles.rows(found))
+    assert [row[:2] for row in rows[3:]] == [
+        ['fr3', '60'],
+        ['fr3', '150'],
+        ['fr3', 'chosen: 100, 200, 300'],
+    ]
+    assert rows[0][2:] == ['3', '1, 1', '10, 10', '2, 2', '2', '1', '1']
+    assert rows[5][2:5] == ['3', '1, 1', '3, 6']
+    assert all(len(row) == len(chosen_poles.HEADS) for row in rows)
 
 
 def test_bandwidths_are_compared_on_arms_that_ran_with_all_of_them(

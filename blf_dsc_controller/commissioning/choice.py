@@ -123,21 +123,35 @@ class Loops(NamedTuple):
         self, response: Response, gains: JointGains
     ) -> tuple[Floats, Floats, Complex]:
         """Return least singular values (f,), their doubt (f,) and directions (f, n)."""
-        n = len(self.inertia)
-        s: Complex = np.asarray(2j * np.pi * response.frequency, complex)
-        feedback = linear(gains, self.inertia, 1)
-        C_y, C_v = (each[0] for each in law_responses(feedback, self.sample_time, s))
+        C_y, C_v = self.law(response, gains)
         L = C_y @ response.position + C_v @ response.velocity
-        left, values, right = np.linalg.svd(np.eye(n) + L)
-        # u^H (I + L) v changes by u^H dL v; what two share changes in both at once
         position, velocity = response.deviations()
         dL = np.abs(np.diagonal(C_y, axis1=1, axis2=2))[:, :, None] * position
         dL += np.abs(np.diagonal(C_v, axis1=1, axis2=2))[:, :, None] * velocity
-        parts = np.abs(left[:, :, -1, None]) * dL * np.abs(right[:, -1, None, :])
-        both = parts + np.swapaxes(parts, 1, 2)
-        squares = np.where(response.shared, 0.5 * both**2, parts**2)
-        doubt = DEVIATIONS * np.sqrt(squares.sum(axis=(1, 2)))
-        return values[:, -1], np.asarray(doubt), right[:, -1].conj()
+        return least_singular_values(L, dL, response.shared)
+
+    def law(self, response: Response, gains: JointGains) -> tuple[Complex, Complex]:
+        """Return C_y [N m/rad] and C_v [N m s/rad] (f, n, n) at the frequencies of a response."""
+        s: Complex = np.asarray(2j * np.pi * response.frequency, complex)
+        feedback = linear(gains, self.inertia, 1)
+        C_y, C_v = (each[0] for each in law_responses(feedback, self.sample_time, s))
+        return C_y, C_v
+
+
+def least_singular_values(
+    L: Complex, dL: Floats, shared: NDArray[np.bool_]
+) -> tuple[Floats, Floats, Complex]:
+    """Return the least singular values (f,) of I + L, their doubt (f,) and directions (f, n).
+
+    `dL` (f, n, n) are the standard deviations of L, and `shared` as in `Response`.
+    """
+    left, values, right = np.linalg.svd(np.eye(L.shape[-1]) + L)
+    # u^H (I + L) v changes by u^H dL v; what two share changes in both at once
+    parts = np.abs(left[:, :, -1, None]) * dL * np.abs(right[:, -1, None, :])
+    both = parts + np.swapaxes(parts, 1, 2)
+    squares = np.where(shared, 0.5 * both**2, parts**2)
+    doubt = DEVIATIONS * np.sqrt(squares.sum(axis=(1, 2)))
+    return values[:, -1], np.asarray(doubt), right[:, -1].conj()
 
 
 def choose(

@@ -36,6 +36,7 @@ from blf_dsc_controller.commissioning.chosen import (
     with_gains,
 )
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
+from blf_dsc_controller.commissioning.observer_pole import ObserverPole, SensedLoops
 from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import Response, response_of
 from blf_dsc_controller.commissioning.ripple import to_learn
@@ -75,6 +76,10 @@ class Commissioned(NamedTuple):
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
     coulomb: Floats | None  # (n,) N m, robot.coulomb, if the last runs compensated it
+    sensed: (
+        SensedLoops | None
+    )  # None: there are no joint torque sensors, or they are not used
+    observer: ObserverPole | None  # likewise
     ripples: tuple[Ripples, ...] = ()  # of each joint; empty: there was no slow motion
 
     @property
@@ -145,6 +150,8 @@ class Commissioned(NamedTuple):
             of_arm['feedback.joint_damping_lag'] = _rounded(
                 np.asarray(gains.damping_lag)
             )
+        if self.observer is not None:
+            of_arm['disturbance.observer_bandwidth'] = self.observer.pole
         if listed := to_learn(self.ripples):
             of_arm['learning.ripple_cycles'] = tuple(each.cycles for each in listed)
         return {
@@ -185,18 +192,21 @@ def commissioned(
     start = measuring_gains(measured)
     rigid = RigidArm(_least(found.inertias, assumed), found.timing(T, arm.lag))
     by_factors = _gains_by_factors(config, start, inertia)
+    choice = choose(loops, start, by_factors, rigid, margin, lags)
+    lag = _lag(measured, found)
+    sensed = _sensed_loops(config, arm, loops, lag)
     return Commissioned(
         joints=config.joints,
         responses=responses,
         loops=loops,
         start=start,
-        choice=choose(loops, start, by_factors, rigid, margin, lags),
+        choice=choice,
         findings=found,
         assumed=assumed.max(axis=0),
         rotors=_rotors(config, arm, found, assumed),
         friction=_expected_friction(found, start),
         unseen=_unseen(found, assumed),
-        lag=_lag(measured, found),
+        lag=lag,
         date=datetime.now().astimezone().strftime('%Y-%m-%d %H:%M'),
         aim=margin,
         before=config,
@@ -205,6 +215,8 @@ def commissioned(
             if measured is config
             else np.maximum(known_friction(measured), found.friction)
         ),
+        sensed=sensed,
+        observer=None if sensed is None else sensed.fastest_pole(choice.gains),
     )
 
 
@@ -287,6 +299,23 @@ def _lag(config: ControllerConfig, found: Findings) -> float:
     """Return `robot.lag` [s]: measured, or that of the configuration."""
     lag = found.lag(config.sample_time)
     return config.robot.lag if np.isnan(lag) else lag
+
+
+def _sensed_loops(
+    config: ControllerConfig, arm: Design, loops: Loops, lag: float
+) -> SensedLoops | None:
+    """Return the loops with joint torque sensors, if the law uses them and all runs have efforts.
+
+    `lag` [s] is that of velocities and torques together.
+    """
+    sensed = tuple(each.sensed for each in loops.responses if each.sensed is not None)
+    is_used = config.disturbance.observer_bandwidth > 0.0
+    if not is_used or len(sensed) < len(loops.responses):
+        return None
+    postures = np.array([each.posture for each in loops.responses])
+    P_l = arm.parameters.of(arm.chain.inertias, np.zeros_like(arm.rotors))
+    links = inertia_matrices(arm.parameters.model, P_l, postures)
+    return SensedLoops(loops, sensed, links, sensor_lag=0.5 * lag)
 
 
 def _least(measured: Floats, assumed: Floats) -> Floats:

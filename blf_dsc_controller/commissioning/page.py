@@ -19,6 +19,7 @@ from blf_dsc_controller.commissioning.better_known import FAR_ABOVE, known_frict
 from blf_dsc_controller.commissioning.commissioning import CREEPING, Commissioned
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
+from blf_dsc_controller.commissioning.observer_pole import ENOUGH, POLES
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.ripple_page import of_ripple
@@ -105,6 +106,7 @@ def sentences(
     yield from _of_friction(found, is_simulated=is_simulated)
     yield from _of_margin(found)
     yield from _of_lags(found)
+    yield from _of_observer(found)
     yield from _of_factors(found)
     if found.has_margin:
         yield f'errors to expect with these gains: {expectation(found.config)}'
@@ -181,6 +183,32 @@ def _of_lags(found: Commissioned) -> Iterator[str]:
         f'the damping of {lags} lags (feedback.joint_damping_lag): it drives resonances less, '
         f'and with the same margin the damping of the joints is {raised.min():.3g} to '
         f'{raised.max():.3g} times what it would be without'
+    )
+
+
+def _of_observer(found: Commissioned) -> Iterator[str]:
+    """Yield how fast the load observer is, and what limits it."""
+    if found.observer is None:
+        return
+    pole, limit, why_none = found.observer
+    where = f'near {two_digits(limit.frequency)} Hz, by {found.joints[limit.joint]}'
+    if why_none:
+        yield f'NO LOAD OBSERVER: {why_none}. Set robot.effort and robot.torque_loop as they are'
+        return
+    if pole == 0.0:
+        yield (
+            f'NO LOAD OBSERVER: with the slowest pole, {POLES[0]:g} rad/s, it would leave a '
+            f'modulus margin of {limit.value:.2g} {where}, or too little for a load'
+        )
+        return
+    yield (
+        f'the load observer has a pole of {pole:g} rad/s, which leaves a modulus margin of '
+        f'{limit.value:.2g} {where}: '
+        + (
+            'a faster one gains little'
+            if pole == POLES[-1]
+            else f'a faster one less than {ENOUGH:g}, or too little for a load'
+        )
     )
 
 
@@ -347,6 +375,7 @@ def draw(found: Commissioned, names: Sequence[str], path: Path) -> None:
     before, after = picture.axes[0]
     _draw_margin(before, found, found.start, 'as measured', names)
     _draw_margin(after, found, found.choice.gains, 'as chosen', names)
+    _draw_observer(after, found)
     before.legend(frameon=False, fontsize=8, loc='lower right')
     panels = list(picture.axes[1:].flat)
     for j, axes in enumerate(panels[:n]):
@@ -375,6 +404,23 @@ def _draw_margin(
     axes.set_ylim(0.0, 1.5)
     axes.set_title(f'least singular value of I + L, gains {label}', loc='left')
     axes.set_xlabel('frequency [Hz]')
+
+
+def _draw_observer(axes: Axes, found: Commissioned) -> None:
+    """Draw the least singular value with the load observer, dotted, if there is one."""
+    if found.sensed is None or found.observer is None or found.observer.pole == 0.0:
+        return
+    pole = found.observer.pole
+    values = found.sensed.singular_values(found.choice.gains, pole)
+    lines = []
+    for k, ((value, _), response) in enumerate(
+        zip(values, found.responses, strict=True)
+    ):
+        seen = response.seen
+        f, least = response.frequency[seen], value[seen]
+        lines += axes.semilogx(f, least, color=_colour(k), ls=':', lw=1.0)
+    label = f'with the load observer, {pole:g} rad/s'
+    axes.legend(lines[:1], [label], frameon=False, fontsize=8, loc='upper left')
 
 
 def _draw_response(axes: Axes, found: Commissioned, j: int) -> None:

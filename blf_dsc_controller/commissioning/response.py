@@ -8,11 +8,11 @@ In the closed loop, at the n lines around a frequency (`motion`), torques U and 
 
 whatever feedback was at work, and without a model.  Delays, drives, gears, motors and what
 carries the arm are all in it.  The law acts on velocities as its driver measures or
-filters them, so theirs are measured, too.
+filters them, so theirs are measured, too, and where it acts on efforts, those of efforts.
 
 Gears have sharp resonances that may fall between two frequencies.  Where G_y peaks its
-inverse is smooth, as is G_v G_y^-1, so these are interpolated.  A peak between two lines
-counts only if both lines show more of it than noise (`seen`).
+inverse is smooth, as are G_v G_y^-1 and G_e G_y^-1, so these are interpolated.  A peak
+between two lines counts only if both lines show more of it than noise (`seen`).
 
 Between the lines there is what the motion did not cause: noise, ripple, and what friction
 makes of it.  A line has as much, which gives the standard deviation of each response.
@@ -25,6 +25,7 @@ the mean of both there, by their variances, unless they differ by more than nois
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +50,15 @@ class HiddenError(BlfDscError):
     """The positions do not show the motion at all."""
 
 
+class Sensed(NamedTuple):
+    """The response of efforts at the f frequencies of a `Response`."""
+
+    effort: Complex  # G_e (f, n, n), N m/(N m)
+    # (f, 2 n, 2 n) covariance of [E - G_e U; V - G_v U] beside the motion: what moves a link
+    # shows in both
+    noise: Complex
+
+
 class Response(NamedTuple):
     """Responses in one posture, at f frequencies."""
 
@@ -64,6 +74,7 @@ class Response(NamedTuple):
     seen: NDArray[np.bool_]  # (f,) the rest may be noise that looks like a resonance
     speed: Floats  # (n,) rad/s, of all tones: mean square over mean
     friction: Floats  # (n,) N m, a constant one that takes the power of the slow tones
+    sensed: Sensed | None = None  # None: the run has no efforts
 
     def deviations(self) -> tuple[Floats, Floats]:
         """Return the standard deviations (f, n, n) of G_y [rad/(N m)] and G_v [rad/(s N m)]."""
@@ -83,10 +94,14 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
     Raises BlfDscError if it has no whole period, too many samples are lost, or the
     positions do not show it.
     """
-    torque, position, velocity = _period(run, lines.period, sample_time)
-    U, Y, V = (_spectrum(each) for each in (torque, position, velocity))
+    rows = _period(run, lines.period, sample_time)
+    _check_finite(run, rows)
+    position = run.position[rows]
+    U, Y, V = (
+        _spectrum(each) for each in (run.torque[rows], position, run.velocity[rows])
+    )
     at = lines.bins.T  # (f, n): the lines of each experiment
-    U_at, Y_at, V_at = (np.swapaxes(each[at], 1, 2) for each in (U, Y, V))
+    U_at, Y_at, V_at = (_at_lines(each, at) for each in (U, Y, V))
     if (np.linalg.matrix_rank(Y_at) < Y_at.shape[-1]).any():
         raise HiddenError(
             'the positions do not show the motion: friction holds the arm, or it moves by less '
@@ -98,6 +113,16 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
         _noise(measured, U, response, at, between)
         for measured, response in ((Y, Y_at @ inverse), (V, V_at @ inverse))
     ]
+    sensed = None
+    if run.effort is not None and np.isfinite(run.effort[rows]).all():
+        E = _spectrum(run.effort[rows])
+        G_e = np.asarray(_at_lines(E, at) @ inverse)
+        both = np.concatenate((G_e, V_at @ inverse), axis=1)
+        noise = [
+            rest.T @ rest.conj() / len(rest)
+            for rest in _rests(np.hstack((E, V)), U, both, at, between)
+        ]
+        sensed = Sensed(G_e, np.array(noise))
     speed, friction = _rubbing(U, Y, lines)
     at_lines = Response(
         frequency=lines.frequencies,
@@ -111,8 +136,14 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
         seen=np.ones(len(lines.frequencies), bool),
         speed=speed,
         friction=friction,
+        sensed=sensed,
     )
     return refined(reciprocal(at_lines))
+
+
+def _at_lines(spectrum: Complex, at: NDArray[np.int64]) -> Complex:
+    """Return waves (f, n, n) of a spectrum (N, n): of each sensor by the line of each motion."""
+    return np.asarray(np.swapaxes(spectrum[at], 1, 2))
 
 
 def reciprocal(response: Response) -> Response:
@@ -164,6 +195,10 @@ def refined(response: Response) -> Response:
     low = np.minimum(np.arange(fine.size) // _FINER, f.size - 2)
     position = np.linalg.inv(inverse_between)
     ratio = between(response.velocity @ inverse)
+    sensed = response.sensed
+    if sensed is not None:
+        of_position = between(sensed.effort @ inverse)
+        sensed = Sensed(np.asarray(of_position @ position), between(sensed.noise))
     return Response(
         frequency=fine,
         position=np.asarray(position),
@@ -176,6 +211,7 @@ def refined(response: Response) -> Response:
         seen=_is_seen(response, inverse, inverse_between, low),
         speed=response.speed,
         friction=response.friction,
+        sensed=sensed,
     )
 
 
@@ -207,8 +243,8 @@ def _is_seen(
     return np.asarray(seen | ~peaks)
 
 
-def _period(run: Run, period: float, T: float) -> tuple[Floats, Floats, Floats]:
-    """Return torque, position, velocity (N + 1, n) over the first period after settling.
+def _period(run: Run, period: float, T: float) -> NDArray[np.intp]:
+    """Return the samples (N + 1,) of the first period after settling.
 
     On an even grid: each sample is the one nearest to its time.
     """
@@ -233,11 +269,18 @@ def _period(run: Run, period: float, T: float) -> tuple[Floats, Floats, Floats]:
             f'{lost} of {count} joint states are missing in the period that counts: measure '
             'with a driver that keeps its rate'
         )
-    found = run.torque[nearest], run.position[nearest], run.velocity[nearest]
-    for name, values in zip(('torques', 'positions', 'velocities'), found, strict=True):
-        if not np.isfinite(values).all():
+    return nearest
+
+
+def _check_finite(run: Run, rows: NDArray[np.intp]) -> None:
+    """Raise BlfDscError if torques, positions or velocities in some rows are not finite."""
+    for name, values in (
+        ('torques', run.torque),
+        ('positions', run.position),
+        ('velocities', run.velocity),
+    ):
+        if not np.isfinite(values[rows]).all():
             raise BlfDscError(f'the run has {name} that are not finite')
-    return found
 
 
 def _nearest(stamp: Stamps, times: Stamps) -> NDArray[np.intp]:
@@ -292,8 +335,19 @@ def _noise(
     between: NDArray[np.bool_],
 ) -> Floats:
     """Return the rms (f, n) of what is measured between the lines beside G U."""
+    rests = _rests(measured, U, response, at, between)
+    return np.array([np.sqrt((np.abs(rest) ** 2).mean(axis=0)) for rest in rests])
+
+
+def _rests(
+    measured: Complex,
+    U: Complex,
+    response: Complex,
+    at: NDArray[np.int64],
+    between: NDArray[np.bool_],
+) -> Iterator[Complex]:
+    """Yield for each line what is measured between the lines around it beside G U (r, m)."""
     n = at.shape[1]
-    found = np.empty(at.shape)
     for k, line in enumerate(at[:, 0]):
         reach = _BETWEEN * n
         while True:
@@ -302,6 +356,4 @@ def _noise(
             if rows.size >= 2 * n or reach > len(U):
                 break
             reach *= 2
-        rest = measured[rows] - U[rows] @ response[k].T
-        found[k] = np.sqrt((np.abs(rest) ** 2).mean(axis=0))
-    return found
+        yield measured[rows] - U[rows] @ response[k].T

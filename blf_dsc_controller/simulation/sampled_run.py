@@ -30,7 +30,7 @@ def run_of(
     """
     samples = sample_columns(rows, controller.settings)
     used = ~np.isnan(samples.qr[:, 0])
-    position, velocity, _ = np.split(measurements, 3, axis=1)
+    position, velocity, effort = np.split(measurements, 3, axis=1)
     tool = tool_of(config)
     external = None
     if config.contact.enabled:
@@ -56,5 +56,6 @@ def run_of(
         arm=learned_arm(config),
         tool=tool.errors if tool else None,
         learns=traits_of(config).learns and config.learning.weight > 0.0,
+        effort=effort,
         sliding=config.robot.sliding(config.joints),
     )

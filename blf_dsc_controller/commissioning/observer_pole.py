@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pole of the load observer: the fastest one that the measured arm bears, in every posture.
+
+An arm with joint torque sensors has a second loop, r (`law.load_observer`).  At the torques of
+all joints, with the measured response G_e of the efforts and the inertia M_l of the model's links,
+
+    L = C_y G_y + C_v G_v - F_L (F_s G_e - M_l D G_v)
+
+F_L is the pole, F_s the lag of velocities, which efforts wait for, and D the difference quotient
+of a sample.  As r is faster, I + L comes nearer to being singular where gears resonate: an arm
+whose r shakes has next to no modulus margin there.  So poles are tried from slow to fast as long as
+`ENOUGH` is left, noise counted against it.  That is less than the gains alone must have, since r
+that shakes all the same becomes slower by itself.
+
+Below `RESONANT`, r makes an arm that holds an unknown load as light as the model: of its torque
+no more than M_l / M is left, by design, whatever the pole.  There `BARELY` is enough, noise not
+counted: r is stable for any load while gears are stiff.
+
+Efforts must be those of sensors at the links first.  Where gears are stiff, those of the joint
+that the motion moves are M_l D V: on random arms the difference has at most a quarter of their
+square, and a hundredth as a rule; of efforts in another unit, of another sign or joint it has
+more than half.  Commands are U, a few samples late, and nothing else.
+
+Poles end with `POLES`: a faster one gains little and hands the noise of velocities to the torque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.arms.joint_gains import JointGains
+from blf_dsc_controller.arms.linear_loop import SLOWEST
+from blf_dsc_controller.commissioning.choice import (
+    BARELY,
+    Loops,
+    Margin,
+    least_singular_values,
+)
+from blf_dsc_controller.commissioning.response import Response, Sensed
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+POLES = (10.0, 16.0, 25.0, 40.0, 60.0, 100.0, 150.0, 200.0, 300.0)
+"""Poles of r [rad/s] that are tried, from slow to fast."""
+
+ENOUGH = 0.25
+"""Modulus margin that r leaves where gears resonate."""
+
+RESONANT = 20.0
+"""Frequency [Hz] from which on gears may resonate."""
+
+
+_UNLIKE = 0.5  # share of the square of efforts that M_l D V may leave
+_AS_COMMANDS = 0.01  # of that, what efforts that are commands leave beside U
+_LATEST = 3  # samples, by which these may be late
+
+
+class ObserverPole(NamedTuple):
+    """The chosen pole, and what limits it."""
+
+    pole: float  # L, rad/s; 0: none
+    margin: Margin  # with it, or with the slowest that is tried, where gears resonate
+    why_none: str = ''  # of efforts that are no torques of the links
+
+
+class SensedLoops(NamedTuple):
+    """Measured arms in k postures, and r by its pole."""
+
+    loops: Loops
+    sensed: tuple[Sensed, ...]  # of each of the loops' responses
+    links: Floats  # M_l (k, n, n), kg m^2
+    sensor_lag: float  # of velocities, s
+
+    def singular_values(
+        self, gains: JointGains, pole: float
+    ) -> list[tuple[Floats, Floats]]:
+        """Return for each posture the least singular value of I + L (f,), and its doubt."""
+        return [each[:2] for each in self._least(gains, pole)]
+
+    def fastest_pole(self, gains: JointGains) -> ObserverPole:
+        """Return the fastest pole that is borne, with all that are slower.
+
+        0 if none is, or if the efforts are not those of sensors at the links.
+        """
+        chosen = ObserverPole(0.0, self._margins(gains, POLES[0])[0])
+        if why := self.why_no_sensors:
+            return chosen._replace(why_none=why)
+        for pole in POLES:
+            margin, below = self._margins(gains, pole)
+            if margin.value < ENOUGH or below < BARELY:
+                break
+            chosen = ObserverPole(pole, margin)
+        return chosen
+
+    @property
+    def why_no_sensors(self) -> str:
+        """Why efforts cannot be those of sensors at the links; empty if they can.
+
+        By the posture that speaks for it most: in another one, the arm may hold a load.
+        """
+        unlike, as_commands = np.array(
+            [
+                self._unlike(*each)
+                for each in zip(
+                    self.loops.responses, self.sensed, self.links, strict=True
+                )
+            ]
+        ).T
+        if as_commands.max() < _AS_COMMANDS:
+            return 'efforts are the commands, a few samples late'
+        if unlike.min() > _UNLIKE:
+            return (
+                'efforts do not move the links: '
+                f'{100.0 * min(float(np.sqrt(unlike.min())), 1.0):.0f} % of them or more are '
+                'not the torque of these'
+            )
+        return ''
+
+    def _unlike(
+        self, response: Response, sensed: Sensed, links: Floats
+    ) -> tuple[float, float]:
+        """Return how unlike M_l D V efforts are, and how much more so U: means of the joints."""
+        T, f = self.loops.sample_time, response.frequency
+        rows = response.seen & (f >= SLOWEST) & (f < RESONANT)
+        z: Complex = np.exp(2j * np.pi * f[rows] * T)
+        effort = np.diagonal(sensed.effort[rows], axis1=1, axis2=2)
+        moving = ((1.0 - 1.0 / z) / T)[:, None, None] * links @ response.velocity[rows]
+        late = effort * self._late(z)[:, None]
+        left = _square(late - np.diagonal(moving, axis1=1, axis2=2))
+        of_commands = min(
+            _mean(_square(effort - (z**-k)[:, None]) / left) for k in range(_LATEST + 1)
+        )
+        return _mean(left / _square(late)), of_commands
+
+    def _late(self, z: Complex) -> Complex:
+        """Return the response (f,) of the lag of velocities."""
+        if self.sensor_lag == 0.0:
+            return np.ones_like(z)
+        return low_pass(1.0 / self.sensor_lag, self.loops.sample_time, z)
+
+    def _margins(self, gains: JointGains, pole: float) -> tuple[Margin, float]:
+        """Return the margin from `RESONANT` on, and that below with noise not counted."""
+        margins, below = [], []
+        for k, (response, (value, doubt, direction)) in enumerate(
+            zip(self.loops.responses, self._least(gains, pole), strict=True)
+        ):
+            f = response.frequency
+            rigid = response.seen & (f >= SLOWEST) & (f < RESONANT)
+            below.append(float(value[rigid].min(initial=np.inf)))
+            counted = np.where(response.seen & (f >= RESONANT), value - doubt, np.inf)
+            at = int(counted.argmin())
+            joint = int(np.abs(direction[at]).argmax())
+            margins.append(Margin(float(counted[at]), float(f[at]), k, joint))
+        return min(margins), min(below)
+
+    def _least(
+        self, gains: JointGains, pole: float
+    ) -> Iterator[tuple[Floats, Floats, Complex]]:
+        """Yield least singular values (f,), their doubt (f,) and directions (f, n)."""
+        of_each = zip(self.loops.responses, self.sensed, self.links, strict=True)
+        for response, sensed, links in of_each:
+            yield self._least_of(response, sensed, links, gains, pole)
+
+    def _least_of(
+        self,
+        response: Response,
+        sensed: Sensed,
+        links: Floats,
+        gains: JointGains,
+        pole: float,
+    ) -> tuple[Floats, Floats, Complex]:
+        """Return the same in one posture, with M_l (n, n) of the `links`."""
+        T = self.loops.sample_time
+        z: Complex = np.exp(2j * np.pi * response.frequency * T)
+        quotient = (1.0 - 1.0 / z) / T
+        # r from [effort; velocity]
+        of_effort = (low_pass(pole, T, z) * self._late(z))[:, None, None] * np.eye(
+            len(links)
+        )
+        of_velocity = -(low_pass(pole, T, z) * quotient)[:, None, None] * links
+        C_y, C_v = self.loops.law(response, gains)
+        L = C_y @ response.position + (C_v - of_velocity) @ response.velocity
+        L -= of_effort @ sensed.effort
+        position, velocity = response.deviations()
+        dL = np.abs(C_y) @ position + np.abs(C_v) @ velocity
+        dL += self._deviation(response, sensed, np.dstack((of_effort, of_velocity)))
+        return least_singular_values(L, dL, response.shared)
+
+    def _deviation(
+        self, response: Response, sensed: Sensed, of_both: Complex
+    ) -> Floats:
+        """Return the standard deviations (f, n, n) of r by torques."""
+        variance = np.einsum(
+            'fia,fab,fib->fi', of_both, sensed.noise, of_both.conj(), optimize=True
+        ).real
+        own = np.sqrt(variance.clip(0.0))
+        return np.asarray(own[:, :, None] * response.columns[:, None, :])
+
+
+def low_pass(pole: float, T: float, z: Complex) -> Complex:
+    """Return the response (f,) of a sampled pole [rad/s] at z (f,)."""
+    left = np.exp(-T * pole)
+    return np.asarray((1.0 - left) / (1.0 - left / z))
+
+
+def _square(values: Complex) -> Floats:
+    """Return the sum of squares (n,) over the frequencies (f, n), a little above zero."""
+    return np.asarray((np.abs(values) ** 2).sum(axis=0) + 1e-9)
+
+
+def _mean(values: Floats) -> float:
+    """Return the geometric mean over the joints."""
+    return float(np.exp(np.log(values).mean()))
