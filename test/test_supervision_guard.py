@@ -759,6 +759,43 @@ def test_clock_was_set_if_a_moving_arm_has_moved_for_less_than_half_the_gap(
     assert (fault is not None) == is_set
 
 
+def test_arm_that_was_braked_in_a_gap_is_no_step_of_the_clock():
+    """It has moved for less than the gap, at its mean velocity, since it has stood."""
+    rig = Rig(live=True)
+    rig.step(1000)
+    before = rig.state()
+    rig.base += 35 * 10**6
+    rig.sense = lambda state: [state.raw(q=before.q, dq=0.1 * before.dq)]
+    rig.step()
+    assert 'the clock was set' not in rig.supervisor.text
+
+
+@pytest.mark.parametrize('what', ['q', 'dq'])
+def test_what_is_not_finite_after_a_gap_is_no_step_of_the_clock(what):
+    rig = Rig(live=True)
+    rig.step(1000)
+    rig.base += 35 * 10**6
+    rig.sense = lambda state: [state.raw(**{what: np.full(2, np.nan)})]
+    rig.step()
+    assert rig.supervisor.reason is Reason.NOT_FINITE
+
+
+@pytest.mark.parametrize('way', ['fail', 'time_out'])
+def test_stop_without_a_state_begins_at_the_last_command_also_after_a_gap(way):
+    """The effort of the state after the gap is older."""
+    rig = Rig({'robot.effort': 'whole', 'safety.stop_ramp': 0.1})
+    rig.step(1000)
+    rig.sense = lambda _: []
+    rig.step(35)
+    rig.sense = lambda state: [state.raw(effort=state.effort + 5.0)]
+    rig.step()
+    assert rig.supervisor.running, rig.supervisor.text
+    before = rig.guard.commanded.copy()
+    torque = getattr(rig.guard, way)('why')
+    # N m: 8 ms of a ramp of 0.1 s, from 8.5 N m to none
+    np.testing.assert_allclose(torque, before, atol=1.0)
+
+
 def test_states_that_are_really_missed_are_no_step_of_the_clock():
     rig = Rig(live=True)
     rig.step(1000)
