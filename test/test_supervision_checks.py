@@ -378,6 +378,16 @@ def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     assert (np.abs(rig.commands[-1]) > 0.1).all()
 
 
+def test_messages_that_cannot_be_read_are_no_silence():
+    """Each gets a torque; those of the watchdog besides would let it fade twice as fast."""
+    rig = Rig(HOLDING, live=True)
+    rig.step(20)
+    rig.sense = lambda _: [b'']
+    rig.step(200)
+    assert rig.supervisor.reason is Reason.BAD_MESSAGE
+    assert len(rig.commands) == 220
+
+
 CALLS = {
     'deactivate': lambda guard: guard.deactivate(),
     'activate': lambda guard: guard.starting.activate(),
