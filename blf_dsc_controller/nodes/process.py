@@ -62,7 +62,7 @@ class PlainNode(Node):
         """Save data and release resources while ROS is still up."""
 
     def prepare_to_end(self) -> bool:
-        """Return whether the process may end after a signal; called repeatedly."""
+        """Prepare to end after a signal; return whether it may. Called until all nodes may."""
         return True
 
     def survive(self, error: Exception) -> bool:  # noqa: ARG002
@@ -97,7 +97,7 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
                     ending.callback(_close, nodes[-1])
                     executor.add_node(nodes[-1])
                 with undisturbed_loop():
-                    while not _is_over(nodes):
+                    while not _end(nodes):
                         spin_once(executor, *nodes)
             for failure in filter(None, (node.failure for node in nodes)):
                 raise failure
@@ -111,8 +111,8 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
     return 0
 
 
-def _is_over(nodes: list[PlainNode]) -> bool:
-    """Return whether a node has finished, or all are ready to end after a signal."""
+def _end(nodes: list[PlainNode]) -> bool:
+    """Let nodes prepare to end after a signal; return whether all are, or one has finished."""
     ready = interrupted() and all(node.prepare_to_end() for node in nodes)
     return ready or any(node.finished for node in nodes)
 
