@@ -197,7 +197,12 @@ def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypa
         monkeypatch.setattr(LockstepTicks, 'answers', lockstep_damiao.PATIENCE)
 
     driver = made(at={100: mute, 103: unmute, 150: mute})
+    read, states = driver.read, []
+    monkeypatch.setattr(driver, 'read', lambda: states.append(read()) or states[-1])
     outcome = run(driver)
+    before, bridged = states[100:102]  # the one of state 100 may be there already
+    assert bridged.dq[2] == before.dq[2] != 0.0
+    assert bridged.q[2] == before.q[2] + 0.004 * before.dq[2]
     assert outcome.end is End.LOST
     assert outcome.states in (
         159,
@@ -231,6 +236,30 @@ def test_a_bus_is_left_before_it_is_opened_again(made, monkeypatch):
     driver = made()
     assert DamiaoDriver.connect(driver)  # of the same motors
     assert run(driver, 0.1).end is End.DURATION
+
+
+def test_states_after_a_start_and_after_no_torque_are_measured(made):
+    """Also after another start, of motors that are enabled."""
+    driver = made()
+    for _ in range(2):
+        driver.start()
+        driver.read()
+        assert not driver._missed.any()
+        driver.write(None)
+        driver.read()
+        assert not driver._missed.any()
+
+
+def test_last_frame_holds_with_the_whole_torque_of_the_one_before(made):
+    driver = made()
+    driver.start()
+    q = driver.read().q
+    one = np.ones(7)
+    driver.write_frame(Frame(q + 0.05, 0.0 * one, 40.0 * one, one, 0.5 * one))
+    driver.finish()
+    driver.positions()  # they have got the frame
+    # N m: 40 N m/rad times 0.05 rad, and 0.5; velocities have steps of 22 mrad/s
+    np.testing.assert_allclose(driver.motors.frame.torque, 2.5, atol=0.1)
 
 
 def test_another_client_on_the_bus_ends_the_run(made):

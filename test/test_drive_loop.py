@@ -151,7 +151,7 @@ def test_nothing_is_commanded_to_a_robot_that_took_over_or_is_gone(
     assert_replays(tmp_path / 'bag')
 
 
-def test_a_reflex_while_the_arm_is_brought_to_rest_is_what_ended_the_run(tmp_path):
+def test_a_reflex_while_the_arm_is_brought_to_rest_is_what_ended_the_run():
     driver = PlantDriver('reflex@303', CONFIG, DriveConfig())
     driver.connect()
     with blf.ArmController(CONFIG) as controller:
@@ -231,7 +231,7 @@ def test_a_second_error_of_the_controller_ends_the_motion_at_once(monkeypatch):
         return update(*state, send=send)
 
     monkeypatch.setattr(controller, 'update', failing)
-    with pytest.raises(OSError, match='at state 300$'):
+    with pytest.raises(OSError, match=r'at state 300$'):
         DriveLoop(driver, controller).run()
     assert driver.count == 301
     assert driver.calls[-1] == 'finish'

@@ -93,6 +93,14 @@ def test_no_load_is_told_while_the_law_is_not_in_command():
     assert guard.load_to_tell() is None
 
 
+def test_load_that_the_drives_have_is_left_to_them_by_other_gains():
+    guard = Guard(CONFIG)
+    guard.take_over(DriveLoad(2.5, CENTRE))
+    told = guard.controller.settings.torque.drive_inertias.copy()
+    guard.retune(change(CONFIG, {'learning.weight': 2.0}))
+    np.testing.assert_array_equal(guard.controller.settings.torque.drive_inertias, told)
+
+
 def test_law_leaves_to_the_drives_what_they_were_told_since_it_began(law):
     """After a reset it knows of no load, so what they have been told holds that load."""
     loads = DriveLoads(CONFIG)

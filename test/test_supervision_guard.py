@@ -780,6 +780,32 @@ def test_what_is_not_finite_after_a_gap_is_no_step_of_the_clock(what):
     assert rig.supervisor.reason is Reason.NOT_FINITE
 
 
+def test_start_that_was_planned_before_other_limits_is_planned_again():
+    away = {'initial.position': [2.0, 1.5]}
+    rig = Rig(plant=away)
+    rig.guard.starting.prepare(rig.state().q)
+    slower = {'limits.acceleration': (1.0, 1.0)}  # rad/s^2
+    rig.guard.retune(change(rig.config, slower))
+    rig.step()
+    assert rig.supervisor.running
+    planned = rig.guard.reference.settled
+    rig = Rig(slower, plant=away)
+    rig.step()
+    assert planned == rig.guard.reference.settled
+
+
+def test_reference_begins_anew_after_a_stop_that_was_deactivated():
+    """It has gone on: only that of a law which left command in order is resumed."""
+    rig = Rig()
+    rig.step(100)
+    rig.guard.fail('why')
+    rig.guard.deactivate()
+    rig.guard.starting.activate()
+    stamp = rig.state().stamp
+    rig.step()
+    assert rig.guard.reference.start_stamp == stamp
+
+
 @pytest.mark.parametrize('way', ['fail', 'time_out'])
 def test_stop_without_a_state_begins_at_the_last_command_also_after_a_gap(way):
     """The effort of the state after the gap is older."""
