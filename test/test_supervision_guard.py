@@ -794,6 +794,24 @@ def test_start_that_was_planned_before_other_limits_is_planned_again():
     assert planned == rig.guard.reference.settled
 
 
+def test_arm_that_is_not_seen_is_not_known_to_rest():
+    ramp = SafeTorque(2)
+    ramp.last.take(1, np.zeros(6), np.zeros(2))
+    assert ramp.is_settled
+    ramp.last.miss(1e-3)
+    assert not ramp.is_settled
+
+
+@pytest.mark.parametrize('torque', ['zero', 'damping', 'hold_gravity'])
+def test_only_a_torque_that_holds_carries_a_load(torque):
+    rig = Rig({'safety.torque': torque})
+    rig.step(200)
+    rig.guard.fail('why')
+    rig.step(2)
+    load = rig.guard.safe_stop.carried(rig.config.safety)
+    assert (load is not None) == (torque == 'hold_gravity')
+
+
 def test_reference_begins_anew_after_a_stop_that_was_deactivated():
     """It has gone on: only that of a law which left command in order is resumed."""
     rig = Rig()
