@@ -715,6 +715,23 @@ def test_acceleration_is_unknown_after_a_missed_state():
     assert not last.dq.any()
 
 
+def test_state_after_a_silence_shows_its_measured_velocity_and_no_acceleration():
+    last = LastState(2)
+    last.take_usable(10**9, np.array([0.0, 0.0, 0.5, 0.5, 0.0, 0.0]), 50.0, 1e-3)
+    later = np.array([0.1, 0.1, 0.7, -0.2, 0.0, 0.0])
+    last.take_usable(10**9 + 10**8, later, 50.0, 1e-3)
+    assert last.ddq is None
+    assert last.slow.tolist() == [0.7, -0.2]
+
+
+def test_velocity_of_positions_that_jump_is_within_its_limit():
+    last = LastState(2)
+    last.take_usable(10**9, np.zeros(6), 50.0, 1e-3)
+    jumped = np.array([1.0, -1.0, np.nan, np.nan, 0.0, 0.0])
+    last.take_usable(10**9 + 10**6, jumped, 50.0, 1e-3)
+    assert last.dq.tolist() == [50.0, -50.0]
+
+
 @pytest.mark.parametrize(('stamp', 'q'), [(10**9, 0.2), (10**9 + 10**6, np.nan)])
 def test_positions_that_show_no_arm_leave_the_last_ones_and_no_velocity(stamp, q):
     """Those with the stamp of the state before, and those that are not finite."""
@@ -792,6 +809,20 @@ def test_start_that_was_planned_before_other_limits_is_planned_again():
     rig = Rig(slower, plant=away)
     rig.step()
     assert planned == rig.guard.reference.settled
+
+
+def test_stop_after_a_gap_begins_at_the_torque_that_acts():
+    """Another node, such as the watchdog, may have commanded it meanwhile."""
+    rig = Rig({'robot.effort': 'whole', 'safety.stop_ramp': 1.0})
+    rig.step(1000)
+    rig.sense = lambda _: []
+    rig.step(100)
+    acting = np.array([7.0, -7.0])  # N m
+    rig.sense = lambda state: [state.raw(effort=acting)]
+    rig.step()
+    assert rig.supervisor.reason is Reason.STAMP_JUMP
+    # a tenth of the ramp is over: the time of the gap has passed
+    np.testing.assert_allclose(rig.commands[-1], 0.9 * acting, atol=0.1)
 
 
 def test_arm_that_is_not_seen_is_not_known_to_rest():
