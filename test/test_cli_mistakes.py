@@ -647,7 +647,7 @@ def test_node_names_the_sections_that_it_does_not_read(tmp_path):
         'controller:\n  ros__parameters: {duration: 0.1}\n'
         'sim_plant:\n  ros__parameters: {sede: 1}\n'
     )
-    from blf_dsc_controller.nodes.process import check_sections
+    from blf_dsc_controller.nodes.ros_arguments import check_sections
 
     argv = ['node', '--ros-args', '--params-file', str(path)]
     (remark,) = check_sections(argv, '/sim_plant')

@@ -30,7 +30,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, locate
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.drive import show_joints, ticks
+from blf_dsc_controller.drive import damiao_motors, show_joints, ticks
 from blf_dsc_controller.drive.can_bus import CanBus
 from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.driver import ConnectionLostError, DriverError
@@ -74,6 +74,13 @@ def run(driver, duration=1.0, **options):
         feedback = driver.config.feedback
         loop = DriveLoop(driver, controller, duration=duration, feedback=feedback)
         return loop.run()
+
+
+def assert_holds(frame):
+    """It is stiff and rests, within half a step of 22 mrad/s, and carries the arm."""
+    assert (frame.stiffness > 0.0).all()
+    assert (np.abs(frame.velocity) < 0.02).all()
+    assert np.abs(frame.torque).max() > 1.0  # N m
 
 
 def velocity_of(driver):
@@ -177,9 +184,7 @@ def test_a_motor_that_stops_ends_the_run_and_the_others_hold(made, status, text)
     assert outcome.states in (99, 100)  # the last frame may have been answered already
     assert 'motor 0x07 of openarm_left_joint7 has stopped' in outcome.text
     assert re.search(text, outcome.text)
-    frame = driver.motors.frame
-    assert (frame.stiffness[:6] > 0.0).all()
-    assert (frame.velocity[:6] < 0.02).all()
+    assert_holds(Frame(*np.array(driver.motors.frame)[:, :6]))
 
 
 def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypatch):
@@ -192,7 +197,12 @@ def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypa
         monkeypatch.setattr(LockstepTicks, 'answers', lockstep_damiao.PATIENCE)
 
     driver = made(at={100: mute, 103: unmute, 150: mute})
+    read, states = driver.read, []
+    monkeypatch.setattr(driver, 'read', lambda: states.append(read()) or states[-1])
     outcome = run(driver)
+    before, bridged = states[100:102]  # the one of state 100 may be there already
+    assert bridged.dq[2] == before.dq[2] != 0.0
+    assert bridged.q[2] == before.q[2] + 0.004 * before.dq[2]
     assert outcome.end is End.LOST
     assert outcome.states in (
         159,
@@ -201,6 +211,55 @@ def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypa
     assert (
         'motor 0x03 of openarm_left_joint3 has not answered 11 frames' in outcome.text
     )
+    unmute(driver)
+    driver.positions()  # they have got the frames before
+    assert_holds(driver.motors.frame)
+    assert run(driver, 0.1).end is End.DURATION  # what was lost before counts no more
+
+
+def test_a_bus_is_left_before_it_is_opened_again(made, monkeypatch):
+    """As after a connection that was lost: adapters such as PCAN's are open once at a time."""
+
+    class Once(CanBus):
+        is_open = False
+
+        def __init__(self, *what, **given):
+            assert not Once.is_open
+            super().__init__(*what, **given)
+            Once.is_open = True
+
+        def close(self):
+            super().close()
+            Once.is_open = False
+
+    monkeypatch.setattr(damiao_motors, 'CanBus', Once)
+    driver = made()
+    assert DamiaoDriver.connect(driver)  # of the same motors
+    assert run(driver, 0.1).end is End.DURATION
+
+
+def test_states_after_a_start_and_after_no_torque_are_measured(made):
+    """Also after another start, of motors that are enabled."""
+    driver = made()
+    for _ in range(2):
+        driver.start()
+        driver.read()
+        assert not driver._missed.any()
+        driver.write(None)
+        driver.read()
+        assert not driver._missed.any()
+
+
+def test_last_frame_holds_with_the_whole_torque_of_the_one_before(made):
+    driver = made()
+    driver.start()
+    q = driver.read().q
+    one = np.ones(7)
+    driver.write_frame(Frame(q + 0.05, 0.0 * one, 40.0 * one, one, 0.5 * one))
+    driver.finish()
+    driver.positions()  # they have got the frame
+    # N m: 40 N m/rad times 0.05 rad, and 0.5; velocities have steps of 22 mrad/s
+    np.testing.assert_allclose(driver.motors.frame.torque, 2.5, atol=0.1)
 
 
 def test_another_client_on_the_bus_ends_the_run(made):

@@ -293,6 +293,19 @@ def test_a_script_moves_it_and_takes_command_again_after_a_reflex(wire):
     assert_replays(bag)
 
 
+def test_a_script_takes_command_again_once_a_robot_that_was_lost_is_back(wire):
+    lost = wire.simulate('die@1000')
+    with blf.Drive('fr3_direct', robot=wire.address) as arm:
+        with pytest.raises(LoopEndedError, match='the connection was lost'):
+            arm.follow([(60.0, arm.state.q - 0.2)])
+        lost.wait()
+        wire.simulate()
+        arm.recover()
+        start = arm.state.q
+        arm.move_to(start + 0.1)
+        np.testing.assert_allclose(arm.state.q, start + 0.1, atol=0.5 * BOUND)
+
+
 class ToldRobot:
     """Keeps the load that it was sent last."""
 

@@ -23,7 +23,13 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.drive.driver import DriverError, Facts, disagreements
+from blf_dsc_controller.drive.driver import (
+    ConnectionLostError,
+    DriverError,
+    Facts,
+    ReflexError,
+    disagreements,
+)
 from blf_dsc_controller.drive.driver_declaration import DriverDeclaration
 from blf_dsc_controller.drive.drivers import driver_of, find_driver, is_nearly_simulated
 from blf_dsc_controller.drive.latency import Latency
@@ -60,11 +66,15 @@ def drive(address, tmp_path, duration=LONG):
 
 
 def assert_replays(folder):
-    """The bag holds what the controller needs to compute every torque again."""
+    """The bag holds what the controller needs to compute every torque again.
+
+    Return the kinds of its events.
+    """
     verified = blf.verify(folder)
     assert verified.difference is None
     assert not any(found.missing for found in verified.comparisons)
     assert verified.samples > 0
+    return [event.type for event in verified.events]
 
 
 @pytest.mark.parametrize(
@@ -82,11 +92,15 @@ def test_it_ends_at_rest_and_the_bag_replays_bit_equal(address, end, tmp_path):
     assert driver.calls == ['connect', 'start', 'finish']
     assert driver.velocity < 0.01  # rad/s, at rest
     assert len(driver.torques) == outcome.states
+    assert (
+        outcome.states < 3000
+    )  # it does not wait for settle_time, 3 s, if it rests before
     assert controller.phase is (
         Phase.SAFE_STOP if end is End.STOPPED else Phase.INACTIVE
     )
     assert ('is 0.061 s after the last one' in outcome.text) is (end is End.STOPPED)
-    assert_replays(tmp_path / 'bag')
+    events = assert_replays(tmp_path / 'bag')
+    assert events.count('deactivate') == (end is not End.STOPPED)  # once
     recorded = blf.read_run(tmp_path / 'bag')
     np.testing.assert_array_equal(
         recorded.torque, driver.torques[: len(recorded.torque)]
@@ -137,6 +151,41 @@ def test_nothing_is_commanded_to_a_robot_that_took_over_or_is_gone(
     assert_replays(tmp_path / 'bag')
 
 
+def test_a_reflex_while_the_arm_is_brought_to_rest_is_what_ended_the_run():
+    driver = PlantDriver('reflex@303', CONFIG, DriveConfig())
+    driver.connect()
+    with blf.ArmController(CONFIG) as controller:
+        loop = DriveLoop(driver, controller, duration=0.3)
+        outcome = loop.run()
+    assert outcome.end is End.REFLEX
+    assert controller.phase is Phase.INACTIVE  # it was on its way to rest
+    assert driver.calls[-1] == 'recover'
+
+
+@pytest.mark.parametrize(
+    ('error', 'end'), [(ReflexError, End.REFLEX), (ConnectionLostError, End.LOST)]
+)
+def test_what_the_robot_says_to_a_torque_is_no_error_of_the_controller(
+    error, end, monkeypatch
+):
+    driver = PlantDriver('plant', CONFIG, DriveConfig())
+    driver.connect()
+    write = driver.write
+
+    def refusing(torque):
+        write(torque)
+        if driver.count == 300:
+            raise error('what it says')
+
+    monkeypatch.setattr(driver, 'write', refusing)
+    with blf.ArmController(CONFIG) as controller:
+        outcome = DriveLoop(driver, controller).run()
+    assert outcome.end is end
+    assert outcome.text.startswith('what it says')
+    assert outcome.states == 300
+    assert 'finish' not in driver.calls  # it takes no torque any more
+
+
 def test_a_mistake_of_the_driver_ends_the_motion_and_is_shown(tmp_path):
     with pytest.raises(RuntimeError, match='a mistake of the driver'):
         drive('mistaken@300', tmp_path)
@@ -163,6 +212,28 @@ def test_an_error_of_the_controller_brings_the_arm_to_rest_before_it_is_shown(
         DriveLoop(driver, controller).run()
     assert 'OSError: the disk is full' in controller.reason
     assert driver.velocity < 0.01
+    assert driver.calls[-1] == 'finish'
+    assert len(driver.torques) == len(
+        states
+    )  # the state of the error has its torque, too
+
+
+def test_a_second_error_of_the_controller_ends_the_motion_at_once(monkeypatch):
+    driver = PlantDriver('plant', CONFIG, DriveConfig())
+    driver.connect()
+    controller = blf.ArmController(CONFIG)
+
+    update = controller.update
+
+    def failing(*state, send):
+        if driver.count >= 300:  # the arm moves
+            raise OSError(f'the disk is full at state {driver.count}')
+        return update(*state, send=send)
+
+    monkeypatch.setattr(controller, 'update', failing)
+    with pytest.raises(OSError, match=r'at state 300$'):
+        DriveLoop(driver, controller).run()
+    assert driver.count == 301
     assert driver.calls[-1] == 'finish'
 
 

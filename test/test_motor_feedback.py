@@ -326,6 +326,21 @@ def test_the_loop_sends_frames_whose_sum_is_in_the_bag_which_replays(tmp_path):
     assert np.abs(driver.plant.measure()[1]).max() < 0.03  # rad/s: at rest, to a step
 
 
+@pytest.mark.parametrize('kind', ['zero', 'damping'])
+def test_frames_of_a_stop_damp_the_slow_velocity_unless_its_torque_is_zero(kind):
+    config = change(loop_of(SLOW).controller, {'safety.torque': kind})
+    controller = blf.ArmController(config)
+    last = controller.guard.safe_torque.last
+    q, slow = np.linspace(-0.5, 0.5, 7), np.full(7, 0.2)
+    last.take(10**9, np.concatenate((q, 2.0 * slow, np.zeros(7))), slow)
+    torque = 0.2 * TORQUE
+    frame = MotorFeedback(controller, RANGES, 0.0).frame(torque)
+    assert (frame.stiffness == 0.0).all()
+    assert (frame.damping > 0.0).all() == (kind == 'damping')
+    off = np.abs(frame.torque_at(q, slow) - torque)
+    assert (off <= 0.5 * RANGES.torque.step + 1e-12).all()
+
+
 def test_torques_alone_and_laws_of_files_cannot_have_it():
     config = build(DriveConfig, {'feedback': 'motor'})
     with pytest.raises(DriverError, match='PlantDriver commands torques only'):

@@ -35,8 +35,9 @@ from blf_dsc_controller.nodes import endpoints
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import PollingTimer
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.nodes.process import assigned, drain
+from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
+from blf_dsc_controller.nodes.ros_arguments import assigned
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.studies.runs import cores
 

@@ -378,6 +378,46 @@ def test_held_gravity_fades_out_without_states_and_returns_with_them(raw):
     assert (np.abs(rig.commands[-1]) > 0.1).all()
 
 
+def test_pause_in_which_no_torque_has_faded_ends_with_the_safe_torque():
+    """As of a plant in lock-step, which waits: only a watchdog lets the torque fade."""
+    rig = Rig(HOLDING)
+    rig.step(20)
+    rig.guard.deactivate()
+    rig.base += 3_000_000_000
+    rig.step(2)
+    assert len(rig.commands) == 22
+    assert not rig.guard.silenced
+
+
+def test_states_before_the_first_start_are_not_back_after_a_silence():
+    rig = Rig(live=True)
+    rig.guard.deactivate()
+    rig.step(2)
+    assert not rig.commands
+    assert not rig.guard.silenced
+    assert not rig.supervisor.text
+
+
+def test_arm_that_is_pushed_while_the_law_is_inactive_is_in_no_safe_stop():
+    rig = Rig(HOLDING)
+    rig.step(20)
+    rig.guard.deactivate()
+    rig.push = np.array([10.0, 0.0])
+    rig.step(600)
+    assert rig.guard.readings.speed > 1.0  # rad/s
+    assert not rig.supervisor.text
+
+
+def test_messages_that_cannot_be_read_are_no_silence():
+    """Each gets a torque; those of the watchdog besides would let it fade twice as fast."""
+    rig = Rig(HOLDING, live=True)
+    rig.step(20)
+    rig.sense = lambda _: [b'']
+    rig.step(200)
+    assert rig.supervisor.reason is Reason.BAD_MESSAGE
+    assert len(rig.commands) == 220
+
+
 CALLS = {
     'deactivate': lambda guard: guard.deactivate(),
     'activate': lambda guard: guard.starting.activate(),

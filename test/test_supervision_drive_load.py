@@ -11,6 +11,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.contact import QUIET, TOUCHED
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
+from blf_dsc_controller.supervision.guard import Guard
 
 CONFIG = change(
     load_loop('fr3_direct').controller,
@@ -77,6 +78,27 @@ def test_only_a_load_that_is_well_known_is_told(law, mass, deviations, phase, is
     weigh(law, mass, deviations)
     law.state.contact.phase[0] = phase
     assert (DriveLoads(CONFIG).begin_step(law) is not None) == is_told
+
+
+def test_no_load_is_told_while_the_law_is_not_in_command():
+    guard = Guard(change(CONFIG, {'safety.first_torque': 'send'}))
+    guard.starting.activate()
+    weigh(guard.controller, 2.0)
+    assert guard.load_to_tell() is None
+    rest = np.concatenate((CONFIG.reference.offset, np.zeros(14)))
+    assert guard.update(10**9, rest) is not None
+    weigh(guard.controller, 2.0)
+    assert guard.load_to_tell() is not None
+    guard.fail('why')
+    assert guard.load_to_tell() is None
+
+
+def test_load_that_the_drives_have_is_left_to_them_by_other_gains():
+    guard = Guard(CONFIG)
+    guard.take_over(DriveLoad(2.5, CENTRE))
+    told = guard.controller.settings.torque.drive_inertias.copy()
+    guard.retune(change(CONFIG, {'learning.weight': 2.0}))
+    np.testing.assert_array_equal(guard.controller.settings.torque.drive_inertias, told)
 
 
 def test_law_leaves_to_the_drives_what_they_were_told_since_it_began(law):

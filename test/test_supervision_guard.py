@@ -715,6 +715,23 @@ def test_acceleration_is_unknown_after_a_missed_state():
     assert not last.dq.any()
 
 
+def test_state_after_a_silence_shows_its_measured_velocity_and_no_acceleration():
+    last = LastState(2)
+    last.take_usable(10**9, np.array([0.0, 0.0, 0.5, 0.5, 0.0, 0.0]), 50.0, 1e-3)
+    later = np.array([0.1, 0.1, 0.7, -0.2, 0.0, 0.0])
+    last.take_usable(10**9 + 10**8, later, 50.0, 1e-3)
+    assert last.ddq is None
+    assert last.slow.tolist() == [0.7, -0.2]
+
+
+def test_velocity_of_positions_that_jump_is_within_its_limit():
+    last = LastState(2)
+    last.take_usable(10**9, np.zeros(6), 50.0, 1e-3)
+    jumped = np.array([1.0, -1.0, np.nan, np.nan, 0.0, 0.0])
+    last.take_usable(10**9 + 10**6, jumped, 50.0, 1e-3)
+    assert last.dq.tolist() == [50.0, -50.0]
+
+
 @pytest.mark.parametrize(('stamp', 'q'), [(10**9, 0.2), (10**9 + 10**6, np.nan)])
 def test_positions_that_show_no_arm_leave_the_last_ones_and_no_velocity(stamp, q):
     """Those with the stamp of the state before, and those that are not finite."""
@@ -757,6 +774,101 @@ def test_clock_was_set_if_a_moving_arm_has_moved_for_less_than_half_the_gap(
         gap, share * gap * dq, dq
     )
     assert (fault is not None) == is_set
+
+
+def test_arm_that_was_braked_in_a_gap_is_no_step_of_the_clock():
+    """It has moved for less than the gap, at its mean velocity, since it has stood."""
+    rig = Rig(live=True)
+    rig.step(1000)
+    before = rig.state()
+    rig.base += 35 * 10**6
+    rig.sense = lambda state: [state.raw(q=before.q, dq=0.1 * before.dq)]
+    rig.step()
+    assert 'the clock was set' not in rig.supervisor.text
+
+
+@pytest.mark.parametrize('what', ['q', 'dq'])
+def test_what_is_not_finite_after_a_gap_is_no_step_of_the_clock(what):
+    rig = Rig(live=True)
+    rig.step(1000)
+    rig.base += 35 * 10**6
+    rig.sense = lambda state: [state.raw(**{what: np.full(2, np.nan)})]
+    rig.step()
+    assert rig.supervisor.reason is Reason.NOT_FINITE
+
+
+def test_start_that_was_planned_before_other_limits_is_planned_again():
+    away = {'initial.position': [2.0, 1.5]}
+    rig = Rig(plant=away)
+    rig.guard.starting.prepare(rig.state().q)
+    slower = {'limits.acceleration': (1.0, 1.0)}  # rad/s^2
+    rig.guard.retune(change(rig.config, slower))
+    rig.step()
+    assert rig.supervisor.running
+    planned = rig.guard.reference.settled
+    rig = Rig(slower, plant=away)
+    rig.step()
+    assert planned == rig.guard.reference.settled
+
+
+def test_stop_after_a_gap_begins_at_the_torque_that_acts():
+    """Another node, such as the watchdog, may have commanded it meanwhile."""
+    rig = Rig({'robot.effort': 'whole', 'safety.stop_ramp': 1.0})
+    rig.step(1000)
+    rig.sense = lambda _: []
+    rig.step(100)
+    acting = np.array([7.0, -7.0])  # N m
+    rig.sense = lambda state: [state.raw(effort=acting)]
+    rig.step()
+    assert rig.supervisor.reason is Reason.STAMP_JUMP
+    # a tenth of the ramp is over: the time of the gap has passed
+    np.testing.assert_allclose(rig.commands[-1], 0.9 * acting, atol=0.1)
+
+
+def test_arm_that_is_not_seen_is_not_known_to_rest():
+    ramp = SafeTorque(2)
+    ramp.last.take(1, np.zeros(6), np.zeros(2))
+    assert ramp.is_settled
+    ramp.last.miss(1e-3)
+    assert not ramp.is_settled
+
+
+@pytest.mark.parametrize('torque', ['zero', 'damping', 'hold_gravity'])
+def test_only_a_torque_that_holds_carries_a_load(torque):
+    rig = Rig({'safety.torque': torque})
+    rig.step(200)
+    rig.guard.fail('why')
+    rig.step(2)
+    load = rig.guard.safe_stop.carried(rig.config.safety)
+    assert (load is not None) == (torque == 'hold_gravity')
+
+
+def test_reference_begins_anew_after_a_stop_that_was_deactivated():
+    """It has gone on: only that of a law which left command in order is resumed."""
+    rig = Rig()
+    rig.step(100)
+    rig.guard.fail('why')
+    rig.guard.deactivate()
+    rig.guard.starting.activate()
+    stamp = rig.state().stamp
+    rig.step()
+    assert rig.guard.reference.start_stamp == stamp
+
+
+@pytest.mark.parametrize('way', ['fail', 'time_out'])
+def test_stop_without_a_state_begins_at_the_last_command_also_after_a_gap(way):
+    """The effort of the state after the gap is older."""
+    rig = Rig({'robot.effort': 'whole', 'safety.stop_ramp': 0.1})
+    rig.step(1000)
+    rig.sense = lambda _: []
+    rig.step(35)
+    rig.sense = lambda state: [state.raw(effort=state.effort + 5.0)]
+    rig.step()
+    assert rig.supervisor.running, rig.supervisor.text
+    before = rig.guard.commanded.copy()
+    torque = getattr(rig.guard, way)('why')
+    # N m: 8 ms of a ramp of 0.1 s, from 8.5 N m to none
+    np.testing.assert_allclose(torque, before, atol=1.0)
 
 
 def test_states_that_are_really_missed_are_no_step_of_the_clock():

@@ -178,6 +178,67 @@ def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded
     assert np.abs(restarted.taken[0]).min() > 1.0  # half of gravity
 
 
+def test_it_does_not_stand_down_while_it_commands():
+    rig = Watched(HOLDING)
+    rig.step(100)
+    rig.dead = True
+    rig.step(100)
+    assert not rig.line.stand_down()
+    assert rig.line.active
+    rig.step(100)
+    assert rig.line.takeovers == 1
+
+
+def test_silence_after_a_controller_stood_down_is_meant_although_it_left_a_torque():
+    """The torque that it leaves behind may come after the event that says so."""
+    rig = Watched(HOLDING)
+    rig.step(100)
+    assert rig.line.stand_down()
+    rig.step(1)
+    rig.dead = True
+    rig.step(200)
+    assert not rig.taken
+    rig.line.stand_by()
+    rig.dead = False
+    rig.step(1)
+    rig.dead = True
+    rig.step(200)
+    assert rig.line.active
+
+
+@pytest.mark.parametrize('repeats', [False, True])
+def test_after_a_long_silence_of_the_states_it_waits_for_the_controller(repeats):
+    """Nobody expects a torque any more, as after a restart of the driver.
+
+    A state that `repeats`, with its stamp, is silence too.
+    """
+    rig = Watched(HOLDING)
+    rig.step(100)
+    rig.dead = True
+    state = rig.state()
+    values = np.concatenate((state.q, state.dq, state.effort))
+    for now in np.arange(0.1, 2.2, 1e-3) if repeats else ():
+        rig.line.take_state(state.stamp - MILLISECOND, values, now)
+        assert rig.line.poll(now) is None
+    for k in range(200):  # from 2.1 s later on
+        now = 2.2 + k * 1e-3
+        rig.line.take_state(START + round(now * 1e9), values, now)
+        assert rig.line.poll(now) is None
+
+
+def test_load_that_another_model_lacked_is_forgotten_with_it():
+    rig = Watched(HOLDING)
+    rig.step(800)
+    rig.dead = True
+    rig.step(800)
+    load = rig.line._safe.load
+    assert np.abs(load).max() > 1.0  # N m: half of gravity
+    rig.line.configure(change(rig.config, {'safety.damping': (3.0, 3.0)}))
+    assert load.any()
+    rig.line.configure(change(rig.config, {'robot.gravity': (0.0, -4.9, 0.0)}))
+    assert not load.any()
+
+
 @pytest.mark.parametrize('expected', [False, True])
 def test_watchdog_is_missed_once_it_was_seen_or_after_ten_looks_if_promised(expected):
     presence = WatchdogPresence(expected=expected)

@@ -132,17 +132,13 @@ class Goals:
             self._end(Outcome.ABORTED, INVALID, 'pre-empted by another goal')
         self._inputs.source = ''
         path, arrival = self._tolerances(goal)
-        end = plan.motion.end
-        latest = end
-        if goal.time > 0.0:
-            latest = _last_point(plan) + goal.time
         self._followed = _Followed(
             goal,
             path,
             arrival,
             _begin(plan),
-            end,
-            latest if goal.time > 0.0 else np.inf,
+            plan.motion.end,
+            _last_point(plan) + goal.time if goal.time > 0.0 else np.inf,
             plan.motion.note,
             guard.controller.reference_vector,
         )

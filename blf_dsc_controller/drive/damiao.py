@@ -122,9 +122,10 @@ class DamiaoDriver(Driver):
         self._motors.enable()
         self._missed[:] = 0
         self._stamp = self._ticks.begin()
+        self._motors.ask()
 
     def read(self) -> RobotState:
-        """Return the state with which the motors answered the last frame.
+        """Return the state with which the motors answered the last frame, or `start`.
 
         A motor whose answer is lost is taken to have moved on at its velocity.
         """

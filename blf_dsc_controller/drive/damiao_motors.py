@@ -75,6 +75,7 @@ class DamiaoMotors:
             DriverError: the bus cannot be opened, or a motor does not answer, is in another
                 mode or in error, or is there twice.
         """
+        self.close()  # what was lost: some adapters are open once at a time
         self._open = CanBus(self._address, (*self._ids, damiao.TO_ALL), fd=self._fd)
         self._bus.clear()
         for joint, mode in enumerate(self.registers(Register.MODE)):
@@ -99,6 +100,7 @@ class DamiaoMotors:
         """Leave the bus."""
         if self._open is not None:
             self._open.close()
+            self._open = None
 
     def name(self, joint: int) -> str:
         """Return a motor and its joint in words."""

@@ -36,7 +36,7 @@ from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.nodes.late_answers import LateAnswers
-from blf_dsc_controller.nodes.process import assigned, check_sections
+from blf_dsc_controller.nodes.ros_arguments import assigned, check_sections
 
 Config = TypeVar('Config')
 _PREPARED = 8  # changes kept

@@ -1,18 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running nodes as a process: arguments, scheduling, spinning, and the right exit code.
-
-Arguments are checked for mistakes that ROS ignores, and `-p` is put before files: of
-all sections that match a node, ROS uses the last in the order in which their names
-first appear, so a section `/**/sim_plant` of a file would override `-p`, which belongs
-to `/**`.
-"""
+"""Running nodes as a process: signals, spinning, and the right exit code."""
 
 from __future__ import annotations
 
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from typing import Any
 
@@ -23,16 +17,10 @@ from rclpy.experimental import EventsExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.utilities import remove_ros_args
 
-from blf_dsc_controller.configuration.files import parse
-from blf_dsc_controller.configuration.nodes import (
-    ignored_sections,
-    read,
-    unmatched_sections,
-)
 from blf_dsc_controller.control.realtime import undisturbed_loop
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.ros_arguments import refuse_unknown
 
 _POLL = 0.1  # s; EventsExecutor has no usable spin()
 # s for all topics; a recorder on a busy machine has been seen 2 s behind
@@ -62,7 +50,7 @@ class PlainNode(Node):
         """Save data and release resources while ROS is still up."""
 
     def prepare_to_end(self) -> bool:
-        """Return whether the process may end after a signal; called repeatedly."""
+        """Prepare to end after a signal; return whether it may. Called until all nodes may."""
         return True
 
     def survive(self, error: Exception) -> bool:  # noqa: ARG002
@@ -97,7 +85,7 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
                     ending.callback(_close, nodes[-1])
                     executor.add_node(nodes[-1])
                 with undisturbed_loop():
-                    while not _is_over(nodes):
+                    while not _end(nodes):
                         spin_once(executor, *nodes)
             for failure in filter(None, (node.failure for node in nodes)):
                 raise failure
@@ -111,8 +99,8 @@ def run(*make_nodes: Callable[[], PlainNode]) -> int:
     return 0
 
 
-def _is_over(nodes: list[PlainNode]) -> bool:
-    """Return whether a node has finished, or all are ready to end after a signal."""
+def _end(nodes: list[PlainNode]) -> bool:
+    """Let nodes prepare to end after a signal; return whether all are, or one has finished."""
     ready = interrupted() and all(node.prepare_to_end() for node in nodes)
     return ready or any(node.finished for node in nodes)
 
@@ -161,56 +149,3 @@ def _is_drained(publisher: Publisher, deadline: float) -> bool:
     """Whether every subscriber has received everything by a time of the steady clock [s]."""
     left = max(0.0, deadline - time.monotonic())
     return bool(publisher.wait_for_all_acked(Duration(seconds=left)))
-
-
-def refuse_unknown(argv: Sequence[str]) -> None:
-    """Raise BlfDscError if there are arguments that ROS does not handle itself."""
-    foreign = remove_ros_args(args=list(argv))[1:]
-    if foreign:
-        remedy = 'ROS reads only those after --ros-args'
-        raise BlfDscError(f'unknown arguments {" ".join(foreign)}: {remedy}')
-
-
-def check_sections(argv: Sequence[str], node: str) -> list[str]:
-    """Return remarks on sections of parameter files that no node of this package reads.
-
-    Raises ConfigurationError if a section meant for `node` (a full name) does not match
-    it.
-    """
-    remarks = []
-    for path in parameter_files(argv):
-        sections = read(path)
-        problems = list(unmatched_sections(sections, [node]))
-        if problems:
-            raise ConfigurationError(problems, path)
-        ignored = ignored_sections(sections, [node])
-        if ignored:
-            remarks.append(f'{path}: {ignored}')
-    return remarks
-
-
-def parameter_files(argv: Sequence[str]) -> list[str]:
-    """Return the parameter files that the arguments name."""
-    return [path for option, path in _ros_options(argv) if option == '--params-file']
-
-
-def assigned(argv: Sequence[str]) -> dict[str, object]:
-    """Return the values of `-p name:=value`, except those for one node."""
-    given: dict[str, object] = {}
-    for option, rule in _ros_options(argv):
-        name, _, value = rule.partition(':=')
-        if option != '--params-file' and ':' not in name:
-            (section,) = parse(f'/**:\n  ros__parameters:\n    {name}: {value}\n')
-            given |= {key: entry.value for key, entry in section.entries.items()}
-    return given
-
-
-def _ros_options(argv: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield each parameter option with its value."""
-    for_ros = False
-    words = iter(argv)
-    for word in words:
-        if word in ('--ros-args', '--'):
-            for_ros = word == '--ros-args'
-        elif for_ros and word in ('-p', '--param', '--params-file'):
-            yield word, next(words, '')

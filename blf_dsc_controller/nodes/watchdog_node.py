@@ -49,7 +49,8 @@ from blf_dsc_controller.nodes.endpoints import (
     qos_profile,
 )
 from blf_dsc_controller.nodes.parameters import declare
-from blf_dsc_controller.nodes.process import PlainNode, drain, parameter_files, run
+from blf_dsc_controller.nodes.process import PlainNode, drain, run
+from blf_dsc_controller.nodes.ros_arguments import parameter_files
 from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 from blf_dsc_controller.supervision.watched_journal import Meaning, WatchedJournal
 

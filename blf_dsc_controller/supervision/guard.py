@@ -130,7 +130,7 @@ class Guard(InCommand):
         """Return the fault of a clock that was set while the arm moved."""
         last = self.safe_torque.last
         gap = self.readings.gap
-        if gap < LONG_GAP * self.config.sample_time or last.age > 0.0:
+        if gap < LONG_GAP * self.config.sample_time:
             return None
         q, dq, _ = measurement.reshape(3, -1)
         mean = 0.5 * (dq + last.dq)

@@ -166,7 +166,7 @@ class InCommand:
         was_running = self.supervisor.running
         if not self.supervisor.stop(reason, text):
             return
-        if was_running and reason in WINDING_UP:
+        if reason in WINDING_UP:
             self.estimates.return_to_consistent()
         self.journal.note(EventType.STOP, reason=reason, text=text)
         self.clean = self.reference.resumable = False

@@ -164,10 +164,10 @@ class StateCheck:
         velocity.
         """
         speed = float(dq @ dq)
-        if gap < LONG_GAP * self._sample_time or speed < _MOVING**2:
-            return None
+        if gap < LONG_GAP * self._sample_time or not speed >= _MOVING**2:
+            return None  # also if it is not finite
         moved_for = float(q_step @ dq) / speed
-        if moved_for > _LESS * gap:
+        if not moved_for <= _LESS * gap:
             return None
         text = (
             f'the stamp of a joint state is {gap:.4g} s after the last one, but the arm has moved '
