@@ -23,6 +23,7 @@ from blf_dsc_controller.configuration.robot import (
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.supervision.body_warnings import body_warnings
 from blf_dsc_controller.supervision.bound_warnings import (
     error_warnings,
     width_warnings,
@@ -116,6 +117,7 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
     """Check for implausible figures, and for defaults that are hardly meant."""
     yield from _of_placeholders(config)
     chain = config.robot.chain(config.joints)
+    yield from body_warnings(chain)
     if chain.gripper and not config.robot.tip:
         yield (
             f'robot.tip: without it, {chain.gripper} is one of the joints of the arm. If it is '
