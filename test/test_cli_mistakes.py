@@ -655,6 +655,26 @@ def test_node_names_the_sections_that_it_does_not_read(tmp_path):
     assert '(line 2)' not in remark
 
 
+@pytest.mark.parametrize(
+    'command',
+    [
+        ['doctor', '--config', 'FILE'],
+        ['drive', '--robot', 'simulated', '--duration', '0.01', '--config', 'FILE'],
+        ['commission', '--config', 'FILE', '--out', 'FILE'],
+    ],
+)
+def test_command_names_the_sections_that_no_node_reads(command, tmp_path, capsys):
+    """Bounds and gains of a node of another name would be lost without a word."""
+    path = tmp_path / 'given.yaml'
+    path.write_text(
+        '/**/blf_dsc_controller:\n  ros__parameters: {sample_time: 0.001}\n'
+        '/**/controller:\n  ros__parameters: {barrier: {bound: [0.1, 0.1]}}\n'
+    )
+    main([str(path) if each == 'FILE' else each for each in command])
+    said = ' '.join(''.join(capsys.readouterr()).split())
+    assert 'reads the sections /**/controller (line ' in said
+
+
 TOO_OLD = """
 import sys, types
 import rclpy

@@ -51,6 +51,7 @@ from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     DRIVE,
     dump,
+    ignored_sections,
     load,
     load_loop,
     locate,
@@ -73,6 +74,8 @@ def commission(options: Namespace) -> int:
     """Write the motions to run, or measure, choose and write the gains."""
     _check(options)
     path = locate(options.config)
+    if ignored := ignored_sections(read(path), (CONTROLLER, DRIVE)):
+        print_notice(f'warning: {path}: {ignored}')
     if not options.ros:
         return _commission(options, path, load(path, CONTROLLER, ControllerConfig))
     require_ros()

@@ -21,7 +21,13 @@ from blf_dsc_controller.cli.finding import Finding, Level, note, ok, problem
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.compiled.kernel_cache import SHIPPED, is_quick, place
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    ignored_sections,
+    load,
+    locate,
+    read,
+)
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
 from blf_dsc_controller.supervision.config_warnings import config_warnings
@@ -144,12 +150,11 @@ def _domain() -> Iterator[Finding]:
 def _configuration(path: str) -> Iterator[Finding]:
     """Yield what the controller would say at its start."""
     try:
-        config = load(locate(path), CONTROLLER, ControllerConfig)
-        warnings = [
-            each
-            for each in (*config_warnings(config), not_commissioned(config))
-            if each
-        ]
+        file = locate(path)
+        config = load(file, CONTROLLER, ControllerConfig)
+        found = *config_warnings(config), not_commissioned(config)
+        ignored = ignored_sections(read(file), (CONTROLLER,))
+        warnings = [each for each in (*found, ignored) if each]
     except BlfDscError as error:
         yield problem('config', str(error))
         return

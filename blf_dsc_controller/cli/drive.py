@@ -19,7 +19,14 @@ from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    DRIVE,
+    ignored_sections,
+    load,
+    locate,
+    read,
+)
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.driver import Driver
@@ -50,6 +57,8 @@ def drive(options: Namespace) -> int:
     path = locate(options.config)
     config = load(path, CONTROLLER, ControllerConfig)
     driver = driver_of(options.robot, path, config)
+    if ignored := ignored_sections(read(path), (CONTROLLER, DRIVE)):
+        print_notice(f'warning: {path}: {ignored}')
     _say_before(config, driver)
     with ExitStack() as ending:
         expect_folder(options.out)
