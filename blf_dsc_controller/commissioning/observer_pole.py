@@ -54,7 +54,6 @@ ENOUGH = 0.25
 RESONANT = 20.0
 """Frequency [Hz] from which on gears may resonate."""
 
-
 _UNLIKE = 0.5  # share of the square of efforts that M_l D V may leave
 _AS_COMMANDS = 0.01  # of that, what efforts that are commands leave beside U
 _LATEST = 3  # samples, by which these may be late

@@ -14,9 +14,7 @@ from blf_dsc_controller.arms.urdf import Chain, Joint
 _LONGEST = 10.0  # m, reach of an arm
 _SMALLEST = 0.003  # m, radius of gyration of a body that has a mass worth naming
 _LIGHT = 0.05  # kg
-_HOLLOW = (
-    -0.05
-)  # times the largest eigenvalue of a body's second moments, the least one
+_NEGATIVE = -0.05  # times the largest second moment of a body, the least one
 _TURNS = 4.0  # of a joint, from one limit to the other
 
 
@@ -38,7 +36,7 @@ def body_warnings(chain: Chain) -> Iterator[str]:
 
 
 def _of_inertia(joint: Joint) -> Iterator[str]:
-    """Yield whether nothing has the mass and inertia of what a joint moves."""
+    """Yield what is wrong with the mass and inertia of what a joint moves."""
     J = pseudo_inertia(joint.inertia)
     mass = J[3, 3]
     if mass < _LIGHT:
@@ -51,7 +49,7 @@ def _of_inertia(joint: Joint) -> Iterator[str]:
             f'robot.urdf: what {joint.name} moves has {mass:.3g} kg within {1e3 * radius:.2g} mm '
             'of its centre: are masses in kg, and inertias in kg m^2 and given?'
         )
-    elif moments[0] < _HOLLOW * moments[-1]:
+    elif moments[0] < _NEGATIVE * moments[-1]:
         yield (
             f'robot.urdf: no body has the inertia of what {joint.name} moves: one of its '
             'principal moments is larger than the other two together. Look at the inertia of '
