@@ -72,7 +72,7 @@ def measured(study: Study, number: int) -> Study | None:
         return None
 
 
-def pair_of(robot: str, study: Study, number: int, *, measures: bool) -> Pair:
+def pair_of(robot: str, study: Study, number: int, *, measures: bool = False) -> Pair:
     """Run an arm of a study in the supervised loop, with each law; perhaps commission it first."""
     drawn = draw(study, number)
     own = measured(study, number) if measures else study
