@@ -205,7 +205,8 @@ def _of_errors(config: Checked) -> Iterator[_Doubt]:
             yield _Doubt(
                 'barrier.bound',
                 f'got {bound:g} for {joint}, but past {allowed:.3g}, half of its range or a '
-                f'quarter turn, nothing is bounded: {_unit_of(kind, bound)}',
+                f'quarter turn, nothing is bounded: {_unit_of(kind, bound)}'
+                + ('' if kind == 'prismatic' else f'; in mrad? Give {1e-3 * bound:g}'),
             )
 
 
