@@ -423,13 +423,31 @@ def test_what_the_prior_explains_comes_into_r_without_a_step():
 
 def test_law_that_continues_with_its_disturbance_does_not_have_it_twice():
     state, work = new()
-    load_observer.begin(state, np.zeros(N))
+    load_observer.begin(SETTINGS, state, np.zeros(N))
     assert state.keeps_bias.tolist() == [0.0, 0.0]
-    load_observer.begin(state, np.array([0.0, 2.0]))
+    load_observer.begin(SETTINGS, state, np.array([0.0, 2.0]))
     assert state.keeps_bias.tolist() == [1.0, 1.0]  # of all joints
     sensed = X[:, :P] @ LINKS + [0.0, 2.0]
     r = run(state, work, sensed, 2.0, information=np.eye(M))
     np.testing.assert_allclose(r, [0.0, 2.0 * exp(-4.0)], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('pole', 'steps'),
+    [(10.0, 1.0), (150.0, 1.0), (151.0, 2.0), (300.0, 2.0), (1e4, 3.0)],
+)
+def test_pole_is_slow_until_efforts_are_known_however_fast_it_is_then(pole, steps):
+    """60 rad/s at most, which a Panda bears whose efforts are commands, or three steps."""
+    settings = SETTINGS._replace(observer_bandwidth=pole)
+    state, _ = new(settings)
+    load_observer.begin(settings, state, np.zeros(N))
+    assert state.slowed.tolist() == [steps, steps]
+    slow = load_observer.slower_pole(settings, steps)
+    assert slow <= 60.0 or steps == load_observer.MOST_STEPS
+    np.testing.assert_allclose(1.0 - state.calmed, slow / pole)
+    state.slowed[1] += 1.0  # it has shaken
+    load_observer.end_caution(state)
+    assert state.slowed.tolist() == [0.0, 1.0]
 
 
 def test_what_is_absorbed_of_friction_is_not_taken_back():

@@ -11,6 +11,7 @@ import pytest
 from law_part import part
 
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law import (
     joint_sensors,
@@ -63,15 +64,15 @@ def new():
 def compared(of_command, of_links, seconds=0.5, speed=MOVES):
     """Return what is found of efforts that are away from commands and from the links' torque."""
     state, work = new()
-    slowed = np.ones(2)
+    found = 0
     for k in range(round(seconds / DT)):
         wave = np.sin(2.0 * np.pi * 5.0 * k * DT)
         work.differences[0] = (
             of_command * wave + 1.0
         )  # N m, an offset counts for nothing
         work.differences[1] = of_links * wave - 2.0
-        torque_sensors.compare_with_commands(state, work, slowed, speed, k == 0, DT)
-    assert (slowed == 1.0 - (state.fault[0] == NONE) * state.is_distinct[0]).all()
+        found += torque_sensors.compare_with_commands(state, work, speed, k == 0, DT)
+    assert found == (state.fault[0] == NONE) * state.is_distinct[0]  # said once
     return state
 
 
@@ -97,9 +98,7 @@ def test_an_arm_at_rest_and_a_load_that_comes_later_say_nothing():
     work = new()[1]
     for k in range(2000):  # s, a load, in which efforts are as commanded
         work.differences[1] = 20.0 * np.sin(0.02 * k)
-        torque_sensors.compare_with_commands(
-            state, work, np.ones(2), MOVES, begins=False, dt=DT
-        )
+        torque_sensors.compare_with_commands(state, work, MOVES, begins=False, dt=DT)
     assert state.fault[0] == NONE
 
 
@@ -149,10 +148,8 @@ def test_efforts_are_judged_once(ratio, fault, expected):
     state, _ = new()
     state.fault[0] = fault
     state.square[:] = [[4.0 * ratio, ratio / 4.0], [1.0, 1.0]]
-    slowed = np.ones(2)
-    torque_sensors.decide(state, slowed)
+    assert torque_sensors.decide(state) == (ratio > 0.1)
     assert (state.fault[0], state.is_distinct[0]) == expected
-    assert (slowed == float(ratio < 0.1)).all()
     assert state.joint[0] == float(expected[0] == COMMANDS)  # the nearest
 
 
@@ -252,18 +249,16 @@ def test_nothing_waits_for_r_where_it_is_late_or_cannot_be_the_cause(
 def test_r_that_shakes_before_efforts_are_known_waits_for_that(
     of_command, fault, waits
 ):
-    state, shaken = shaking(0.15, 1, distinct=0.0)
+    state, _ = shaking(0.15, 1, distinct=0.0)
     assert (state.fault[0], state.waits[0]) == (SHAKES, 1.0)
     faded, (_, work) = np.zeros(1), new()
-    slowed = np.array(shaken) + 1.0  # as at the start
     for k in range(500):
         wave = np.sin(2.0 * np.pi * 5.0 * k * DT)
         work.differences[0], work.differences[1] = of_command * wave, wave
-        torque_sensors.compare_with_commands(state, work, slowed, MOVES, k == 0, DT)
+        torque_sensors.compare_with_commands(state, work, MOVES, k == 0, DT)
         torque_sensors.fade(state, faded, is_off=False, dt=DT)
     assert (state.fault[0], state.waits[0]) == (fault, waits)
     assert faded[0] == pytest.approx(waits, abs=1e-3)
-    assert (slowed - shaken).tolist() == [waits, waits]
 
 
 def test_efforts_that_are_off_are_found_after_r_has_shaken():
@@ -428,22 +423,25 @@ def said(record):
 
 
 @lru_cache
-def without_sensors(stiffness):
+def without_sensors(stiffness, pole=150.0):
     """Return the record of a Panda that is said to have sensors, and echoes its commands."""
     loop = loop_of('panda', 1.5, **ECHO, **{'joint.stiffness': [stiffness] * 7})
-    return simulate(loop.controller, loop.plant)
+    law = change(loop.controller, {'disturbance.observer_bandwidth': pole})
+    return simulate(law, loop.plant)
 
 
 @pytest.mark.parametrize(
-    ('stiffness', 'what'),
+    ('stiffness', 'pole', 'what'),
     [
-        (1e4, 'has shaken by the load observer'),
-        (5e4, 'the efforts are what is commanded'),
+        (1e4, 150.0, 'has shaken by the load observer'),
+        (1e4, 300.0, 'has shaken by the load observer'),
+        (5e4, 150.0, 'the efforts are what is commanded'),
+        (5e4, 300.0, 'the efforts are what is commanded'),
     ],
 )
-def test_panda_without_sensors_goes_on_without_the_observer(stiffness, what):
+def test_panda_without_sensors_goes_on_without_the_observer(stiffness, pole, what):
     """With it, gears of 1e4 N m/rad resonate at 30 Hz at once."""
-    record = without_sensors(stiffness)
+    record = without_sensors(stiffness, pole)
     (*_, (time, text)), stops = said(record)
     assert not stops
     assert not record.run().oscillations
@@ -451,6 +449,17 @@ def test_panda_without_sensors_goes_on_without_the_observer(stiffness, what):
     assert what in text
     assert 'robot.torque_loop to false' in text
     assert np.abs(record.run().error[-500:]).max() < 0.01
+
+
+@pytest.mark.parametrize('pole', [150.0, 300.0])
+def test_arm_with_sensors_gets_all_of_its_pole_once_they_are_known(pole):
+    loop = loop_of('panda', 1.0)
+    law = change(loop.controller, {'disturbance.observer_bandwidth': pole})
+    record = simulate(law, loop.plant)
+    state = record.controller.state
+    assert state.sensors.is_distinct[0] == 1.0
+    assert not state.observer.slowed.any()
+    assert not state.observer.calmed.any()
 
 
 @pytest.mark.parametrize('stiffness', [1e4, 5e4])

@@ -28,7 +28,7 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
     """Let `load_observer` find r by the row of the last interval, before its poles."""
     of, now, row = settings.observer, state.observer, signals.row.Xu
     if state.samples[0] <= 1.0:
-        load_observer.begin(now, state.disturbance)
+        load_observer.begin(of, now, state.disturbance)
     if load_observer.is_missing(signals.effort):
         return
     had_settled = load_observer.has_settled(of, now)
@@ -63,9 +63,8 @@ def check_sensors(
     torque_sensors.watch_shaking(now, work, limit, of.torque, of.slowed, dt)
     if settings.observer.most[0] > 0.0:  # else a load is left out of r
         falls = begins or of.elapsed[0] < torque_sensors.FALLS
-        torque_sensors.compare_with_commands(
-            now, work, of.slowed, signals.dqr, falls, dt
-        )
+        if torque_sensors.compare_with_commands(now, work, signals.dqr, falls, dt):
+            load_observer.end_caution(of)
     is_off = torque_sensors.watch_following(
         now, work, limit, signals.dq, signals.dqr, dt
     )

@@ -51,8 +51,12 @@ _SETTLING = 4.0  # 1/L, until r is that of the arm
 _RELEASED = 10.0  # 1/L, in which a plausible bias fades
 _SIGMAS = 3.0  # of what the prior explains
 _MOST = 0.5  # of the torque limit
+_CAUTIOUS = 60.0  # rad/s, at most, until efforts are known to be those of sensors
 SLOWER = 0.4
 """Factor on the pole of r in a joint, a step."""
+
+MOST_STEPS = 3.0
+"""Steps by which r of a joint may be slower."""
 
 
 def most_load(limit: Array) -> Array:
@@ -90,6 +94,7 @@ class State(NamedTuple):
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
     faded: Cell  # share of r that is left out, as the sensors are in doubt
+    cautious: Cell  # steps by which r begins slower than L
     # steps by which r of a joint is slower than L
     slowed: Annotated[Array, 'n * observer.enabled']
     # share of what changes faster than that slower pole that is left out
@@ -256,16 +261,27 @@ def find_bias(
 
 
 @inner
-def begin(state: State, disturbance: Array) -> None:
-    """Begin a step slower, and with d^3 (n,) [N m], which may have what the sensors show."""
+def begin(settings: Settings, state: State, disturbance: Array) -> None:
+    """Begin slower than L, and with d^3 (n,) [N m], which may have what the sensors show."""
+    steps = 1.0
+    while steps < MOST_STEPS and slower_pole(settings, steps) > _CAUTIOUS:
+        steps += 1.0
+    state.cautious[0] = steps
     continues = 0.0
     for i in range(disturbance.size):
         if disturbance[i] != 0.0:
             continues = 1.0
     for i in range(state.keeps_bias.size):
         state.keeps_bias[i] = continues
-        state.slowed[i] = 1.0
-        state.calmed[i] = calmed_share(1.0)
+        state.slowed[i] = steps
+        state.calmed[i] = calmed_share(steps)
+
+
+@inner
+def end_caution(state: State) -> None:
+    """Let r be as fast as if it had not begun slower, but for the steps that it has shaken for."""
+    for i in range(state.slowed.size):
+        state.slowed[i] -= state.cautious[0]
 
 
 @inner

@@ -19,15 +19,15 @@ known, and a load heavier.  So r fades out for good where
 
 - *it shakes*: what r adds oscillates (`oscillation`, of r instead of the error).  Then it becomes
   slower, only in the joints that shake: loads, which stay, are found, if later.  If r of one of
-  these still shakes after `_OFTEN` times, all of r is left out.  Where the arm oscillates, and
+  these still shakes after `MOST_STEPS` times, all of r is left out.  Where the arm oscillates, and
   that does not grow, r takes the blame first: slower, it costs less than softer feedback.
 - *efforts are commands*: in the first motion, efforts behind the filter L are within a
   `_EQUAL` share of the torque that is commanded, as seen against what they are away from
   that of the links, in the geometric mean of the joints.  The mean squares are those of
   what changes faster than `_SLOWEST`.  Between sensor and command are motor and friction,
   also those that a torque loop leaves: they are known to be there as soon as the mean
-  exceeds `_DISTINCT`, and then this question is not asked again.  Until then r is a step
-  slower, and one that shakes is left out.
+  exceeds `_DISTINCT`, and then this question is not asked again.  Until then r is slower,
+  and one that shakes is left out.
 - *efforts do not follow*: drives with a loop around sensors make of them what is commanded,
   whatever load or contact is behind.  An effort that is off by `_OFF` of the torque limit
   leaves r out while that lasts, and if it lasts while the arm follows its reference, for
@@ -43,7 +43,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.lag import filter_gain
-from blf_dsc_controller.law.load_observer import calmed_share
+from blf_dsc_controller.law.load_observer import MOST_STEPS, calmed_share
 
 NONE, MAY_SHAKE, SHAKES, STILL_SHAKES, COMMANDS, OFF = range(6)
 """What is wrong with the efforts, if anything; beyond SHAKES all of r is left out."""
@@ -54,7 +54,6 @@ FALLS = 0.07
 _FADE = 0.02  # s, time constant with which r is left out or comes back
 _SHAKEN = 0.005  # s, likewise of one that shakes: it may grow threefold in 10 ms
 _NOTHING = 1e-6  # of r
-_OFTEN = 3.0  # steps by which r of a joint becomes slower
 _SLOWEST = 0.5  # Hz
 _EQUAL = 0.02
 _DISTINCT = 0.1
@@ -137,20 +136,20 @@ def watch_shaking(
     )
     for i in range(torque.size):
         if oscillation.oscillates(state.shaking, i):
-            note_fault(state, STILL_SHAKES if slowed[i] == _OFTEN else SHAKES, i)
+            note_fault(state, STILL_SHAKES if slowed[i] == MOST_STEPS else SHAKES, i)
             slow_down(state, state.shaking, slowed)
             oscillation.forget_all(state.shaking)
 
 
 @inner
 def slow_down(state: State, oscillating: oscillation.State, slowed: Array) -> None:
-    """Make r a step slower, `_OFTEN` in all, in the joints of what is `oscillating`.
+    """Make r a step slower, `MOST_STEPS` in all, in the joints of what is `oscillating`.
 
     As long as efforts may be commands, all of r waits until it is known that they are not.
     """
     for i in range(slowed.size):
         if oscillating.waves[i] >= oscillation.SOME:
-            slowed[i] = min(slowed[i] + 1.0, _OFTEN)
+            slowed[i] = min(slowed[i] + 1.0, MOST_STEPS)
     if state.is_distinct[0] == 0.0:
         state.waits[0] = 1.0
         state.moved[0] = 0.0
@@ -165,7 +164,7 @@ def take_blame(
     most: Array,
     slowed: Array,
 ) -> bool:
-    """Make r slower where the `arm` oscillates, at most `_OFTEN` times; return whether it did.
+    """Make r slower where the `arm` oscillates, at most `MOST_STEPS` times; return whether it did.
 
     `limit` (n,) [N m] is that of the torques, `most` (n,) [N m] the largest |r|, and `slowed` (n,)
     are the steps.  Nothing waits for r where the oscillation grows, or its torques are violent.
@@ -176,7 +175,7 @@ def take_blame(
             is_violent = arm.amplitude[i] > oscillation.VIOLENT * limit[i]
             if is_violent or oscillation.grows(arm, i):
                 return False
-            if most[i] > 0.0 and slowed[i] < _OFTEN:
+            if most[i] > 0.0 and slowed[i] < MOST_STEPS:
                 blamed = i
     if blamed < 0 or state.fault[0] > SHAKES:
         return False
@@ -196,17 +195,17 @@ def begin_comparison(state: State, work: Work) -> None:
 
 @inner
 def compare_with_commands(
-    state: State, work: Work, slowed: Array, dqr: Array, begins: bool, dt: float
-) -> None:
+    state: State, work: Work, dqr: Array, begins: bool, dt: float
+) -> bool:
     """Find whether efforts are commands, by `work.differences`: `begins` with them.
 
-    If they are not, r becomes faster (`decide`).  dqr (n,) [rad/s] is that of the reference.
+    Return whether they have just been found not to be.  dqr (n,) [rad/s] is that of the reference.
     """
     if state.is_distinct[0] == 1.0:
-        return
+        return False
     if begins:
         begin_comparison(state, work)
-        return
+        return False
     n = dqr.size
     share = filter_gain(1.0 / (2.0 * pi * _SLOWEST), dt)
     moves = False
@@ -220,15 +219,14 @@ def compare_with_commands(
                 state.square[k, i] += dt * fast * fast
     if moves:
         state.moved[0] += dt
-    if state.moved[0] > _LEAST_MOTION:
-        decide(state, slowed)
+    return state.moved[0] > _LEAST_MOTION and decide(state)
 
 
 @inner
-def decide(state: State, slowed: Array) -> None:
+def decide(state: State) -> bool:
     """Decide by the mean squares whether efforts are commands, certainly not, or neither yet.
 
-    If they are not, r is a step faster than it was until now, which `slowed` (n,) says.
+    Return whether they certainly are not.
     """
     product = equal = distinct = 1.0
     nearest = 0
@@ -244,10 +242,9 @@ def decide(state: State, slowed: Array) -> None:
         note_fault(state, STILL_SHAKES if state.waits[0] == 1.0 else COMMANDS, nearest)
     if product > distinct:
         state.waits[0] = 0.0
-        for i in range(slowed.size):
-            slowed[i] -= 1.0
     if product > distinct or state.fault[0] > SHAKES:
         state.is_distinct[0] = 1.0
+    return product > distinct
 
 
 @inner
