@@ -18,6 +18,7 @@ from blf_dsc_controller.arms.linear_loop import (
     TorqueLoop,
     arm_response,
     law_response,
+    low_pass,
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
@@ -29,7 +30,6 @@ from blf_dsc_controller.commissioning.observer_pole import (
     RESONANT,
     ObserverPole,
     SensedLoops,
-    low_pass,
 )
 from blf_dsc_controller.commissioning.page import draw, sentences
 from blf_dsc_controller.commissioning.planned import plan
@@ -111,10 +111,10 @@ def true_singular_values(springs, pole, model, f):
     (G,) = arm_response(loop.links, loop.joints, loop.timing, s)
     (C,) = law_response(loop.feedback, loop.timing, s)
     difference = ((1.0 - 1.0 / z) / 1e-3)[:, None, None]
-    sensed = low_pass(1.0 / result.sensed.sensor_lag, 1e-3, z)[:, None, None]
+    sensed = low_pass(np.exp(-1e-3 / result.sensed.sensor_lag), z)[:, None, None]
     # efforts are the mean of the last sample
     effort = np.exp(-5e-4 * s)[:, None, None] * links() * s[:, None, None] ** 2 @ G
-    r = low_pass(pole, 1e-3, z)[:, None, None] * (
+    r = low_pass(np.exp(-1e-3 * pole), z)[:, None, None] * (
         sensed * effort - model * difference**2 @ G
     )
     return np.linalg.svd(np.eye(2) + C @ G - r, compute_uv=False)[:, -1]

@@ -223,6 +223,17 @@ DISTRUSTED = (
 )
 
 
+def test_section_that_no_node_reads_is_named(tmp_path, caplog):
+    caplog.set_level('INFO')
+    path = tmp_path / 'given.yaml'
+    path.write_text(
+        '/**/blf_dsc_controller:\n  ros__parameters: {sample_time: 0.001}\n'
+        '/**/controller:\n  ros__parameters: {barrier: {bound: [0.1, 0.1]}}\n'
+    )
+    with blf.Drive(path, robot='simulated'):
+        wait_for(lambda: 'reads the sections /**/controller (line ' in caplog.text)
+
+
 def test_efforts_that_are_not_of_sensors_are_told_and_what_a_driver_takes(caplog):
     with drive(sim_plant=ECHO) as arm:
         arm.move_to(arm.state.q + STEP)

@@ -190,13 +190,17 @@ def _of_alpha2(
     dalpha2 = (z - 1.0) / T * alpha2
     xi2 = velocity - alpha2
     d3 = -T / (z - 1.0) * xi2
-    decay = _damping_decay(feedback, T)
-    late = (1.0 - decay) / (1.0 - decay / z) * xi2
+    late = low_pass(_damping_decay(feedback, T), z) * xi2
     return np.asarray(
         feedback.surface[:, None] * late[:, None, :]
         - feedback.inertia[:, None] * dalpha2[:, None, :]
         - feedback.integral[:, None] * d3[:, None, :]
     )
+
+
+def low_pass(decay: float | Floats, z: Complex) -> Complex:
+    """Return the response (...) at z (...) of a lag of which `decay` is left after a sample."""
+    return np.asarray((1.0 - decay) / (1.0 - decay / z))
 
 
 def _diagonals(values: Complex) -> Complex:

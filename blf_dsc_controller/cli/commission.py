@@ -51,7 +51,7 @@ from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     DRIVE,
     dump,
-    ignored_sections,
+    ignored_in,
     load,
     load_loop,
     locate,
@@ -74,8 +74,8 @@ def commission(options: Namespace) -> int:
     """Write the motions to run, or measure, choose and write the gains."""
     _check(options)
     path = locate(options.config)
-    if ignored := ignored_sections(read(path), (CONTROLLER, DRIVE)):
-        print_notice(f'warning: {path}: {ignored}')
+    if ignored := ignored_in(path, (CONTROLLER, DRIVE)):
+        print_notice(f'warning: {ignored}')
     if not options.ros:
         return _commission(options, path, load(path, CONTROLLER, ControllerConfig))
     require_ros()

@@ -23,10 +23,9 @@ from blf_dsc_controller.compiled.kernel_cache import SHIPPED, is_quick, place
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
-    ignored_sections,
+    ignored_in,
     load,
     locate,
-    read,
 )
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
@@ -152,9 +151,8 @@ def _configuration(path: str) -> Iterator[Finding]:
     try:
         file = locate(path)
         config = load(file, CONTROLLER, ControllerConfig)
-        found = *config_warnings(config), not_commissioned(config)
-        ignored = ignored_sections(read(file), (CONTROLLER,))
-        warnings = [each for each in (*found, ignored) if each]
+        found = not_commissioned(config), ignored_in(file, (CONTROLLER,))
+        warnings = [*config_warnings(config), *filter(None, found)]
     except BlfDscError as error:
         yield problem('config', str(error))
         return

@@ -22,10 +22,9 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     DRIVE,
-    ignored_sections,
+    ignored_in,
     load,
     locate,
-    read,
 )
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
@@ -57,8 +56,8 @@ def drive(options: Namespace) -> int:
     path = locate(options.config)
     config = load(path, CONTROLLER, ControllerConfig)
     driver = driver_of(options.robot, path, config)
-    if ignored := ignored_sections(read(path), (CONTROLLER, DRIVE)):
-        print_notice(f'warning: {path}: {ignored}')
+    if ignored := ignored_in(path, (CONTROLLER, DRIVE)):
+        print_notice(f'warning: {ignored}')
     _say_before(config, driver)
     with ExitStack() as ending:
         expect_folder(options.out)

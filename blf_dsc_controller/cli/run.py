@@ -29,11 +29,10 @@ from blf_dsc_controller.configuration.nodes import (
     PLANT,
     LoopConfig,
     dump,
-    ignored_sections,
+    ignored_in,
     load,
     load_loop,
     locate,
-    read,
 )
 from blf_dsc_controller.configuration.plant import PlantConfig, Truth
 from blf_dsc_controller.configuration.schema import change
@@ -185,8 +184,8 @@ def _turned_reference(config: LoopConfig) -> str:
 def _unused(given: str) -> Iterator[str]:
     """Yield what a file says that this command does not use."""
     path = locate(given)
-    if ignored := ignored_sections(read(path), (PLANT, CONTROLLER)):
-        yield f'{path}: {ignored}'
+    if ignored := ignored_in(path, (PLANT, CONTROLLER)):
+        yield ignored
     if load(path, DRIVE, DriveConfig).feedback == 'motor':
         yield (
             f'{path}: drive.feedback is motor, but this simulates torques over the bus, with the '

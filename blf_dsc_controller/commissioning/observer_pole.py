@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains
-from blf_dsc_controller.arms.linear_loop import SLOWEST
+from blf_dsc_controller.arms.linear_loop import SLOWEST, low_pass
 from blf_dsc_controller.commissioning.choice import (
     BARELY,
     Loops,
@@ -140,7 +140,7 @@ class SensedLoops(NamedTuple):
         """Return the response (f,) of the lag of velocities."""
         if self.sensor_lag == 0.0:
             return np.ones_like(z)
-        return low_pass(1.0 / self.sensor_lag, self.loops.sample_time, z)
+        return low_pass(np.exp(-self.loops.sample_time / self.sensor_lag), z)
 
     def _margins(self, gains: JointGains, pole: float) -> tuple[Margin, float]:
         """Return the margin from `RESONANT` on, and that below with noise not counted."""
@@ -177,11 +177,10 @@ class SensedLoops(NamedTuple):
         T = self.loops.sample_time
         z: Complex = np.exp(2j * np.pi * response.frequency * T)
         quotient = (1.0 - 1.0 / z) / T
+        F_L = low_pass(np.exp(-T * pole), z)
         # r from [effort; velocity]
-        of_effort = (low_pass(pole, T, z) * self._late(z))[:, None, None] * np.eye(
-            len(links)
-        )
-        of_velocity = -(low_pass(pole, T, z) * quotient)[:, None, None] * links
+        of_effort = (F_L * self._late(z))[:, None, None] * np.eye(len(links))
+        of_velocity = -(F_L * quotient)[:, None, None] * links
         C_y, C_v = self.loops.law(response, gains)
         L = C_y @ response.position + (C_v - of_velocity) @ response.velocity
         L -= of_effort @ sensed.effort
@@ -199,12 +198,6 @@ class SensedLoops(NamedTuple):
         ).real
         own = np.sqrt(variance.clip(0.0))
         return np.asarray(own[:, :, None] * response.columns[:, None, :])
-
-
-def low_pass(pole: float, T: float, z: Complex) -> Complex:
-    """Return the response (f,) of a sampled pole [rad/s] at z (f,)."""
-    left = np.exp(-T * pole)
-    return np.asarray((1.0 - left) / (1.0 - left / z))
 
 
 def _square(values: Complex) -> Floats:

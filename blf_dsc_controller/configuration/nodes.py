@@ -406,6 +406,12 @@ def unmatched_sections(
             )
 
 
+def ignored_in(path: str | Path, nodes: Iterable[str]) -> str:
+    """Return `ignored_sections` of a file, with its name."""
+    found = ignored_sections(read(path), nodes)
+    return f'{path}: {found}' if found else ''
+
+
 def ignored_sections(sections: Sequence[Section], nodes: Iterable[str]) -> str:
     """Return the sections that no node of this package reads, in words; empty: none.
 

@@ -18,7 +18,13 @@ from typing import Any
 
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.configuration.nodes import (
+    CONTROLLER,
+    DRIVE,
+    ignored_in,
+    load,
+    locate,
+)
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.beside import LinkLog
@@ -65,9 +71,9 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
     path = locate(wanted['config'])
     config = load(path, CONTROLLER, ControllerConfig, _HOLD | given)
     driver = driver_of(wanted['robot'], path, config, overrides)
-    unmeasured = not_commissioned(config)
     judged = as_in_motors(config) if driver.config.feedback == 'motor' else config
-    for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
+    of_file = ignored_in(path, (CONTROLLER, DRIVE)), not_commissioned(config)
+    for warning in [*config_warnings(judged), *filter(None, of_file)]:
         log.info(warning)
     record = Path(wanted['record']) if wanted['record'] else None
     with announced_compilation(lambda text: sys.stderr.write(f'{text}\n')):
