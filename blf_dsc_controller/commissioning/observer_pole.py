@@ -9,8 +9,8 @@ all joints, with the measured response G_e of the efforts and the inertia M_l of
 F_L is the pole, F_s the lag of velocities, which efforts wait for, and D the difference quotient
 of a sample.  As r is faster, I + L comes nearer to being singular where gears resonate: an arm
 whose r shakes has next to no modulus margin there.  So poles are tried from slow to fast as long as
-`ENOUGH` is left, noise counted against it.  That is less than the gains alone must have, since r
-that shakes all the same becomes slower by itself.
+`ENOUGH` is left, and `BARELY` with noise counted against it.  That is less than the gains alone
+must have, since r that shakes all the same becomes slower by itself, and a slow r costs accuracy.
 
 Below `RESONANT`, r makes an arm that holds an unknown load as light as the model: of its torque
 no more than M_l / M is left, by design, whatever the pole.  There `BARELY` is enough, noise not
@@ -49,7 +49,7 @@ POLES = (10.0, 16.0, 25.0, 40.0, 60.0, 100.0, 150.0, 200.0, 300.0)
 """Poles of r [rad/s] that are tried, from slow to fast."""
 
 ENOUGH = 0.25
-"""Modulus margin that r leaves where gears resonate."""
+"""Modulus margin that r leaves where gears resonate, noise not counted."""
 
 RESONANT = 20.0
 """Frequency [Hz] from which on gears may resonate."""
@@ -90,8 +90,8 @@ class SensedLoops(NamedTuple):
         if why := self.why_no_sensors:
             return chosen._replace(why_none=why)
         for pole in POLES:
-            margin, below = self._margins(gains, pole)
-            if margin.value < ENOUGH or below < BARELY:
+            margin, with_noise, below = self._margins(gains, pole)
+            if margin.value < ENOUGH or min(with_noise, below) < BARELY:
                 break
             chosen = ObserverPole(pole, margin)
         return chosen
@@ -142,20 +142,22 @@ class SensedLoops(NamedTuple):
             return np.ones_like(z)
         return low_pass(np.exp(-self.loops.sample_time / self.sensor_lag), z)
 
-    def _margins(self, gains: JointGains, pole: float) -> tuple[Margin, float]:
-        """Return the margin from `RESONANT` on, and that below with noise not counted."""
-        margins, below = [], []
+    def _margins(self, gains: JointGains, pole: float) -> tuple[Margin, float, float]:
+        """Return the margin from `RESONANT` on, the same with noise counted, and that below."""
+        margins, with_noise, below = [], [], []
         for k, (response, (value, doubt, direction)) in enumerate(
             zip(self.loops.responses, self._least(gains, pole), strict=True)
         ):
             f = response.frequency
             rigid = response.seen & (f >= SLOWEST) & (f < RESONANT)
             below.append(float(value[rigid].min(initial=np.inf)))
-            counted = np.where(response.seen & (f >= RESONANT), value - doubt, np.inf)
+            resonant = response.seen & (f >= RESONANT)
+            with_noise.append(float((value - doubt)[resonant].min(initial=np.inf)))
+            counted = np.where(resonant, value, np.inf)
             at = int(counted.argmin())
             joint = int(np.abs(direction[at]).argmax())
             margins.append(Margin(float(counted[at]), float(f[at]), k, joint))
-        return min(margins), min(below)
+        return min(margins), min(with_noise), min(below)
 
     def _least(
         self, gains: JointGains, pole: float

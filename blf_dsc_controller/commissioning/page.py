@@ -198,7 +198,7 @@ def _of_observer(found: Commissioned) -> Iterator[str]:
     if pole == 0.0:
         yield (
             f'NO LOAD OBSERVER: with the slowest pole, {POLES[0]:g} rad/s, it would leave a '
-            f'modulus margin of {limit.value:.2g} {where}, or too little for a load'
+            f'modulus margin of {limit.value:.2g} {where}, or too little for noise or for a load'
         )
         return
     yield (
@@ -207,7 +207,7 @@ def _of_observer(found: Commissioned) -> Iterator[str]:
         + (
             'a faster one gains little'
             if pole == POLES[-1]
-            else f'a faster one less than {ENOUGH:g}, or too little for a load'
+            else f'a faster one less than {ENOUGH:g}, or too little for noise or for a load'
         )
     )
 
