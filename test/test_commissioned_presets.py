@@ -11,7 +11,8 @@ from blf_dsc_controller.commissioning import files
 from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop, read
 
-PRESETS = ('fr3_direct', 'panda', 'ur5e')
+PRESETS = {'fr3_direct': '', 'panda': '', 'ur5e': ' --ripple'}
+"""The option with which the file of a preset was written."""
 FOLDER = share_folder() / 'config'
 
 
@@ -44,6 +45,8 @@ class Chosen:
         if config.disturbance.observer_bandwidth:  # joint torque sensors are used
             bandwidth = config.disturbance.observer_bandwidth
             self.values['disturbance.observer_bandwidth'] = bandwidth
+        if config.learning.ripple_cycles:  # a slow motion shows torque ripple
+            self.values['learning.ripple_cycles'] = config.learning.ripple_cycles
         if config.robot.rotor_inertia:  # no drive hides the motors
             self.values['robot.rotor_inertia'] = config.robot.rotor_inertia
             self.values['safety.damping'] = config.safety.damping
@@ -58,7 +61,8 @@ def test_it_is_its_preset_with_what_was_chosen(preset):
     path = path_of(preset)
     (command, *_) = path.read_text(encoding='utf-8').splitlines()
     assert command == (
-        f'# blf_dsc commission --config {preset} --out config/{path.name}'
+        f'# blf_dsc commission --config {preset}{PRESETS[preset]} '
+        f'--out config/{path.name}'
     )
     written = files.of_commissioned(read(FOLDER / f'{preset}.yaml'), Chosen(preset))
     sections = {each.pattern: each.entries for each in read(path)}

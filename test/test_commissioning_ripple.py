@@ -395,14 +395,13 @@ def test_simulated_arm_that_stops_keeps_its_gains(arm, capsys, monkeypatch):
 def ur5e(*, has_ripple):
     """Return what the slow motion shows of a simulated UR5e with its chosen gains."""
     loop = blf.load_loop('ur5e_commissioned')
+    controller = change(loop.controller, {'learning.ripple_cycles': []})
     if not has_ripple:  # half a minute shows as well that there is none
         with pytest.MonkeyPatch.context() as monkeypatch:
             for module in (slow_motion, ripple):
                 monkeypatch.setattr(module, 'SECONDS', 30.0)
-            return shown_by(
-                loop.controller, change(loop.plant, {'actuator.ripple': 0.0})
-            )
-    return shown_by(loop.controller, loop.plant)
+            return shown_by(controller, change(loop.plant, {'actuator.ripple': 0.0}))
+    return shown_by(controller, loop.plant)
 
 
 def shown_by(controller, plant):
