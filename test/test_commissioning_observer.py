@@ -271,15 +271,16 @@ def test_efforts_wait_for_velocities_as_those_of_the_law_do():
 def test_pole_leaves_enough_and_barely_what_noise_may_take(
     monkeypatch, at_10_hz, at_40_hz, noise, is_borne
 ):
+    result = found()
     f = np.array([4.0, 10.0, 40.0])
     values = np.array([0.0, at_10_hz, at_40_hz])
     directions = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     least = values, noise * np.ones(3), directions
     monkeypatch.setattr(SensedLoops, '_least', lambda *_: iter([least]))
     monkeypatch.setattr(SensedLoops, 'why_no_sensors', '')
-    response = found().responses[0]._replace(frequency=f, seen=np.ones(3, bool))
-    loops = found().loops._replace(responses=[response])
-    chosen = found().sensed._replace(loops=loops).fastest_pole(found().choice.gains)
+    response = result.responses[0]._replace(frequency=f, seen=np.ones(3, bool))
+    sensed = result.sensed._replace(loops=result.loops._replace(responses=[response]))
+    chosen = sensed.fastest_pole(result.choice.gains)
     assert chosen.pole == (POLES[-1] if is_borne else 0.0)
     assert chosen.margin == (at_40_hz, 40.0, 0, 1)
 
