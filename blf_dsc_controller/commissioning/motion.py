@@ -61,7 +61,6 @@ _SLOWEST, _FASTEST = 2.0, 120.0  # Hz
 _SECONDS = 4.0  # of the period, for each joint
 _SLOW, _SWING = 1.0, 4.0  # Hz, of slow tones and of swings
 _LEAST_SWING = 0.05  # of slow tones, below which the lines shrink, too
-_SHRINKS = 40  # until travel and speeds are within their limits
 _SPEED = 0.25  # of the limit of velocity
 _SEED = 0
 _NEWTON = 50  # steps at most
@@ -217,14 +216,13 @@ def _shrunk(
 ) -> tuple[Floats, _Moves]:
     """Return the amplitudes (n, K + 2) of a motion that has room, and how it moves."""
     factors = np.ones((len(lines), 2))  # of lines and of slow tones or swings
-    for _ in range(_SHRINKS):
+    while True:
         amplitude = np.column_stack((factors[:, :1] * lines, factors[:, 1:] * swing))
         moves = shape.motion(amplitude)
         excess = room.excess(moves)
-        if (excess <= 1.0).all():
-            break
+        if not (excess > 1.0).any():
+            return amplitude, moves
         shrink(factors, excess)
-    return amplitude, moves
 
 
 def _shrink_all(factors: Floats, excess: Floats) -> None:
