@@ -33,8 +33,6 @@ from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
 from blf_dsc_controller.commissioning.choice import (
     LAGS,
-    Loops,
-    RigidArm,
     _most,
     _one_by_one,
     _with_lags,
@@ -43,6 +41,7 @@ from blf_dsc_controller.commissioning.choice import (
 from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
 from blf_dsc_controller.commissioning.commissioning import commissioned
 from blf_dsc_controller.commissioning.findings import findings_of
+from blf_dsc_controller.commissioning.margin import Loops, RigidArm, SingularValues
 from blf_dsc_controller.commissioning.motion import (
     SETTLING,
     SLOW_TONES,
@@ -396,7 +395,9 @@ def test_noise_is_counted_against_the_margin():
         Loops([response_of(each, lines_in(config), 1e-3)], inertia, 1e-3)
         for each in (run, noisy)
     ]
-    (true, none), (value, doubt) = (each.singular_values(gains)[0] for each in loops)
+    (true, none, _), (value, doubt, _) = (
+        each.singular_values(gains)[0] for each in loops
+    )
     assert np.median(doubt) > 3.0 * np.median(none)
     inside = np.abs(value - true) < doubt
     assert inside.mean() > 0.9
@@ -431,12 +432,13 @@ def test_joint_of_a_margin_is_the_one_that_moves_most_in_any_phase(direction, jo
     response = SimpleNamespace(
         seen=np.array([True, True, False]),
         frequency=np.array([30.0, 40.0, 50.0]),
-        rest=(np.array([0.7, 0.5, 0.1]), np.array([0.0, 0.1, 0.0])),
     )
-    directions = np.array([[1.0, 0.0], direction, [1.0, 0.0]])
-    loops = SimpleNamespace(
-        responses=[response], _least=lambda of, _: (*of.rest, directions)
+    values = SingularValues(
+        least=np.array([0.7, 0.5, 0.1]),
+        doubt=np.array([0.0, 0.1, 0.0]),
+        direction=np.array([[1.0, 0.0], direction, [1.0, 0.0]]),
     )
+    loops = SimpleNamespace(responses=[response], singular_values=lambda _: [values])
     assert Loops.margin(loops, None) == pytest.approx((0.4, 40.0, 0, joint))
     assert Loops.margin(loops, None, noise=False)[0] == 0.5
 
@@ -448,7 +450,7 @@ def test_noise_of_velocities_is_counted_as_that_of_positions_is():
 
     def doubt_of(**noise):
         loops = Loops([response._replace(**noise)], np.ones(2), 1e-3)
-        return loops.singular_values(found().start)[0][1]
+        return loops.singular_values(found().start)[0].doubt
 
     whole = doubt_of()
     for left_out in ('position_noise', 'velocity_noise'):
@@ -523,7 +525,9 @@ def test_doubt_counts_what_two_responses_share_in_both_at_once():
     alone = mean._replace(shared=np.zeros_like(mean.shared))
     low = mean.frequency <= 12.0
     doubts = [
-        Loops([each], np.array([5.0, 2.0]), 1e-3).singular_values(found().start)[0][1]
+        Loops([each], np.array([5.0, 2.0]), 1e-3)
+        .singular_values(found().start)[0]
+        .doubt
         for each in (mean, alone)
     ]
     assert (doubts[0][low] < 0.5 * doubts[1][low]).all()
@@ -538,7 +542,7 @@ def test_sharing_gains_nothing_where_both_directions_are_as_well_known():
     gains, both = JointGains(np.full(2, 300.0), np.full(2, 20.0)), np.ones((2, 2))
     off = response._replace(shared=response.shared | (both > np.eye(2)))
     doubts = [
-        Loops([each], np.full(2, 5.0), 1e-3).singular_values(gains)[0][1]
+        Loops([each], np.full(2, 5.0), 1e-3).singular_values(gains)[0].doubt
         for each in (response, off)
     ]
     np.testing.assert_allclose(doubts[1], doubts[0], rtol=1e-9)

@@ -22,8 +22,8 @@ from blf_dsc_controller.arms.linear_loop import (
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
-from blf_dsc_controller.commissioning.choice import BARELY
 from blf_dsc_controller.commissioning.commissioning import commissioned
+from blf_dsc_controller.commissioning.margin import BARELY, SingularValues
 from blf_dsc_controller.commissioning.observer_pole import (
     ENOUGH,
     POLES,
@@ -138,7 +138,7 @@ def test_margin_with_the_observer_is_that_of_the_linear_arm(pole, factor):
     """Also where the model of the links is wrong."""
     result = found(SOFT)
     sensed = result.sensed._replace(links=factor * result.sensed.links)
-    ((value, doubt),) = sensed.singular_values(result.choice.gains, pole)
+    ((value, doubt, _),) = sensed.singular_values(result.choice.gains, pole)
     f = result.responses[0].frequency
     true = true_singular_values(SOFT, pole, factor * links(), f)
     counted = result.responses[0].seen & (f > 5.0) & (f < 100.0)
@@ -157,11 +157,11 @@ def test_pole_is_the_fastest_with_the_margin():
     assert margin.value >= ENOUGH
     assert margin.frequency >= RESONANT
     f = result.responses[0].frequency
-    ((value, doubt),) = result.sensed.singular_values(result.choice.gains, pole)
+    ((value, doubt, _),) = result.sensed.singular_values(result.choice.gains, pole)
     counted = result.responses[0].seen & (f >= RESONANT)
     assert (value - doubt)[counted].min() == margin.value
     faster = dict(pairwise(POLES))[pole]
-    ((value, doubt),) = result.sensed.singular_values(result.choice.gains, faster)
+    ((value, doubt, _),) = result.sensed.singular_values(result.choice.gains, faster)
     assert (value - doubt)[counted].min() < ENOUGH
 
 
@@ -199,8 +199,8 @@ def nothing(z, _):
 def test_observer_of_an_exact_model_changes_no_margin(pole):
     """r is zero then."""
     result, exact = sensed_loops(nothing)
-    ((value, _),) = exact.singular_values(result.choice.gains, pole)
-    ((without, _),) = result.loops.singular_values(result.choice.gains)
+    ((value, _, _),) = exact.singular_values(result.choice.gains, pole)
+    ((without, _, _),) = result.loops.singular_values(result.choice.gains)
     np.testing.assert_allclose(value, without, rtol=1e-9)
 
 
@@ -224,7 +224,7 @@ def test_what_shakes_a_link_is_no_noise_of_r_but_that_of_sensors_is():
     doubts = []
     for noise in (nothing, of_links, of_sensors):
         result, loops = sensed_loops(noise)
-        ((_, doubt),) = loops.singular_values(result.choice.gains, 250.0)
+        ((_, doubt, _),) = loops.singular_values(result.choice.gains, 250.0)
         doubts.append(doubt)
     np.testing.assert_allclose(doubts[1], doubts[0], rtol=1e-4, atol=1e-5)
     assert np.median(doubts[2]) > 2.0 * np.median(doubts[0])
@@ -238,11 +238,11 @@ def test_noise_of_a_run_shows_that_what_shakes_a_link_is_none():
     f = result.responses[0].frequency
     moved = (f > 5.0) & (f < 40.0)  # where the lags of both are about equal
     gains = result.choice.gains
-    ((_, without),) = result.loops.singular_values(gains)
-    ((_, doubt),) = result.sensed.singular_values(gains, 250.0)
+    ((_, without, _),) = result.loops.singular_values(gains)
+    ((_, doubt, _),) = result.sensed.singular_values(gains, 250.0)
     (sensed,) = result.sensed.sensed
     apart = sensed._replace(noise=sensed.noise * np.eye(4))
-    ((_, uncorrelated),) = result.sensed._replace(sensed=(apart,)).singular_values(
+    ((_, uncorrelated, _),) = result.sensed._replace(sensed=(apart,)).singular_values(
         gains, 250.0
     )
     cost = doubt - without
@@ -267,8 +267,8 @@ def test_little_margin_where_gears_are_stiff_is_by_design_but_nearly_none_is_not
         directions = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         monkeypatch.setattr(
             SensedLoops,
-            '_least',
-            lambda *_: iter([(values, 0.01 * np.ones(3), directions)]),
+            'singular_values',
+            lambda *_: [SingularValues(values, 0.01 * np.ones(3), directions)],
         )
         monkeypatch.setattr(SensedLoops, 'why_no_sensors', '')
         response = found().responses[0]._replace(frequency=f, seen=np.ones(3, bool))

@@ -8,7 +8,9 @@ joints, and these the stiffest gains with a margin.
 
     motion          the reference that shakes all joints at once
     response        the responses (f, n, n) from a run of it, with their uncertainty
-    choice          gains by the modulus margin, at all postures measured
+    margin          the modulus margin of the measured arm, by its gains
+    choice          the stiffest gains with a margin, at all postures measured
+    observer_pole   likewise, the fastest load observer
     better_known    the stiffer configuration with which a hardly known arm is measured again
     strength        whether a run shows enough, and the torque of the next one
     chosen          the configuration with the chosen gains, and bounds that they keep

@@ -21,14 +21,7 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.better_known import as_measured, known_friction
-from blf_dsc_controller.commissioning.choice import (
-    BARELY,
-    LAGS,
-    Choice,
-    Loops,
-    RigidArm,
-    choose,
-)
+from blf_dsc_controller.commissioning.choice import LAGS, Choice, choose
 from blf_dsc_controller.commissioning.chosen import (
     as_parameters,
     capped_stop_damping,
@@ -36,6 +29,7 @@ from blf_dsc_controller.commissioning.chosen import (
     with_gains,
 )
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
+from blf_dsc_controller.commissioning.margin import BARELY, Loops, RigidArm
 from blf_dsc_controller.commissioning.observer_pole import ObserverPole, SensedLoops
 from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import Response, response_of
@@ -76,9 +70,8 @@ class Commissioned(NamedTuple):
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
     coulomb: Floats | None  # (n,) N m, robot.coulomb, if the last runs compensated it
-    sensed: (
-        SensedLoops | None
-    )  # None: there are no joint torque sensors, or they are not used
+    # None: there are no joint torque sensors, or they are not used
+    sensed: SensedLoops | None
     observer: ObserverPole | None  # likewise
     ripples: tuple[Ripples, ...] = ()  # of each joint; empty: there was no slow motion
 

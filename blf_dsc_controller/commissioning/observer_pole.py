@@ -26,7 +26,6 @@ Poles end with `POLES`: a faster one gains little and hands the noise of velocit
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -34,11 +33,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST, low_pass
-from blf_dsc_controller.commissioning.choice import (
+from blf_dsc_controller.commissioning.margin import (
     BARELY,
     Loops,
     Margin,
-    least_singular_values,
+    SingularValues,
+    singular_values,
 )
 from blf_dsc_controller.commissioning.response import Response, Sensed
 
@@ -75,11 +75,10 @@ class SensedLoops(NamedTuple):
     links: Floats  # M_l (k, n, n), kg m^2
     sensor_lag: float  # of velocities, s
 
-    def singular_values(
-        self, gains: JointGains, pole: float
-    ) -> list[tuple[Floats, Floats]]:
-        """Return for each posture the least singular value of I + L (f,), and its doubt."""
-        return [each[:2] for each in self._least(gains, pole)]
+    def singular_values(self, gains: JointGains, pole: float) -> list[SingularValues]:
+        """Return the least singular values of I + L in each posture."""
+        of_each = zip(self.loops.responses, self.sensed, self.links, strict=True)
+        return [self._singular_values(*each, gains, pole) for each in of_each]
 
     def fastest_pole(self, gains: JointGains) -> ObserverPole:
         """Return the fastest pole that is borne, with all that are slower.
@@ -145,35 +144,24 @@ class SensedLoops(NamedTuple):
     def _margins(self, gains: JointGains, pole: float) -> tuple[Margin, float]:
         """Return the margin from `RESONANT` on, and that below with noise not counted."""
         margins, below = [], []
-        for k, (response, (value, doubt, direction)) in enumerate(
-            zip(self.loops.responses, self._least(gains, pole), strict=True)
+        for k, (response, values) in enumerate(
+            zip(self.loops.responses, self.singular_values(gains, pole), strict=True)
         ):
-            f = response.frequency
-            rigid = response.seen & (f >= SLOWEST) & (f < RESONANT)
-            below.append(float(value[rigid].min(initial=np.inf)))
-            counted = np.where(response.seen & (f >= RESONANT), value - doubt, np.inf)
-            at = int(counted.argmin())
-            joint = int(np.abs(direction[at]).argmax())
-            margins.append(Margin(float(counted[at]), float(f[at]), k, joint))
+            f, counts = response.frequency, response.seen
+            margins.append(values.margin(f, counts & (f >= RESONANT), k))
+            rigid = counts & (f >= SLOWEST) & (f < RESONANT)
+            below.append(float(values.least[rigid].min(initial=np.inf)))
         return min(margins), min(below)
 
-    def _least(
-        self, gains: JointGains, pole: float
-    ) -> Iterator[tuple[Floats, Floats, Complex]]:
-        """Yield least singular values (f,), their doubt (f,) and directions (f, n)."""
-        of_each = zip(self.loops.responses, self.sensed, self.links, strict=True)
-        for response, sensed, links in of_each:
-            yield self._least_of(response, sensed, links, gains, pole)
-
-    def _least_of(
+    def _singular_values(
         self,
         response: Response,
         sensed: Sensed,
         links: Floats,
         gains: JointGains,
         pole: float,
-    ) -> tuple[Floats, Floats, Complex]:
-        """Return the same in one posture, with M_l (n, n) of the `links`."""
+    ) -> SingularValues:
+        """Return them in one posture, with M_l (n, n) of the `links`."""
         T = self.loops.sample_time
         z: Complex = np.exp(2j * np.pi * response.frequency * T)
         quotient = (1.0 - 1.0 / z) / T
@@ -187,7 +175,7 @@ class SensedLoops(NamedTuple):
         position, velocity = response.deviations()
         dL = np.abs(C_y) @ position + np.abs(C_v) @ velocity
         dL += self._deviation(response, sensed, np.dstack((of_effort, of_velocity)))
-        return least_singular_values(L, dL, response.shared)
+        return singular_values(L, dL, response.shared)
 
     def _deviation(
         self, response: Response, sensed: Sensed, of_both: Complex

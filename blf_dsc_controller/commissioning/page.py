@@ -358,7 +358,7 @@ def errors_table(config: ControllerConfig, errors: Errors) -> str:
 def _doubt_at(found: Commissioned) -> float:
     """Return what noise takes from the margin where it is least."""
     limit = found.choice.margin
-    doubt = found.loops.singular_values(found.choice.gains)[limit.posture][1]
+    doubt = found.loops.singular_values(found.choice.gains)[limit.posture].doubt
     at = found.responses[limit.posture].frequency
     return float(doubt[int(np.abs(at - limit.frequency).argmin())])
 
@@ -390,15 +390,11 @@ def _draw_margin(
 ) -> None:
     """Draw the least singular value over the frequency, with what noise takes from it."""
     values = found.loops.singular_values(gains)
-    for k, ((value, doubt), response) in enumerate(
-        zip(values, found.responses, strict=True)
-    ):
+    for k, (each, response) in enumerate(zip(values, found.responses, strict=True)):
         seen = response.seen
-        f, least, doubted = response.frequency[seen], value[seen], doubt[seen]
+        f, least, doubt = response.frequency[seen], each.least[seen], each.doubt[seen]
         axes.semilogx(f, least, color=_colour(k), label=names[k])
-        axes.fill_between(
-            f, least - doubted, least, color=_colour(k), alpha=0.2, lw=0.0
-        )
+        axes.fill_between(f, least - doubt, least, color=_colour(k), alpha=0.2, lw=0.0)
     axes.axhline(found.aim, color=ALARM, lw=1.0, ls='--')
     axes.axvspan(axes.get_xlim()[0], SLOWEST, color=SHADE, alpha=0.5, lw=0.0)
     axes.set_ylim(0.0, 1.5)
@@ -413,11 +409,8 @@ def _draw_observer(axes: Axes, found: Commissioned) -> None:
     pole = found.observer.pole
     values = found.sensed.singular_values(found.choice.gains, pole)
     lines = []
-    for k, ((value, _), response) in enumerate(
-        zip(values, found.responses, strict=True)
-    ):
-        seen = response.seen
-        f, least = response.frequency[seen], value[seen]
+    for k, (each, response) in enumerate(zip(values, found.responses, strict=True)):
+        f, least = response.frequency[response.seen], each.least[response.seen]
         lines += axes.semilogx(f, least, color=_colour(k), ls=':', lw=1.0)
     label = f'with the load observer, {pole:g} rad/s'
     axes.legend(lines[:1], [label], frameon=False, fontsize=8, loc='upper left')
