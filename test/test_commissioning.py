@@ -1202,7 +1202,7 @@ def test_arm_that_is_known_enough_is_not_measured_again():
     """Its inertias are seen and it bears little more; or its gains are given, whatever it hides."""
     run = simulated.measured(planned(), ARM)
     calm = blf.Commissioning(CONFIG, [POSTURE])
-    assert calm.better_known(planned(), run[0]) is None
+    assert calm.better_known(planned(), run.run) is None
     _, soft, second, _ = better_known()
     gains = {
         f'feedback.joint_{name}': getattr(
@@ -1448,7 +1448,7 @@ def test_a_posture_that_noise_hides_is_measured_again_with_more_torque():
     run = simulated.measured(weak, coarse(5e-5))
     factor = shown_by(*run).factor
     assert 2.0 < factor < MOST
-    again = commissioning.plan_repeat(weak, run[0])
+    again = commissioning.plan_repeat(weak, run.run)
     # the next posture begins with it
     assert commissioning.motion(POSTURE).torque == again.torque == factor * 0.01
     shares = again.excitation.amplitude / weak.excitation.amplitude
@@ -1468,7 +1468,7 @@ def test_the_second_motion_shows_a_margin_that_noise_had_hidden():
     (weak,) = commissioning.motions
     runs = [simulated.measured(weak, coarse(3e-4))]
     runs.append(
-        simulated.measured(commissioning.plan_repeat(weak, runs[0][0]), coarse(3e-4))
+        simulated.measured(commissioning.plan_repeat(weak, runs[0].run), coarse(3e-4))
     )
     found = [commissioning.result([each]) for each in runs]
     assert [each.has_margin for each in found] == [False, True]
@@ -1528,9 +1528,9 @@ def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
         result.parameters()
     assert any('a smaller feedback.stiffness' in each for each in sentences(result))
     # friction and coarse encoders look alike, but for what the controller reports
-    assert commissioning.plan_repeat(first, run[0]).share == 1.0
+    assert commissioning.plan_repeat(first, run.run).share == 1.0
     reported = Oscillation(FIRST_STAMP, 'joint2', 25.0, 8.0, 1.0, 'it oscillates')
-    again = commissioning.plan_repeat(first, replace(run[0], oscillations=(reported,)))
+    again = commissioning.plan_repeat(first, replace(run.run, oscillations=(reported,)))
     assert (first.share, again.share) == (1.0, 0.5)
     assert again.config.feedback.gain == tuple(0.5 * stiff.damping)
     assert (

@@ -23,12 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
-from blf_dsc_controller.commissioning.own_loop import (
-    REPEATS,
-    Commissioning,
-    Measured,
-    measured_in,
-)
+from blf_dsc_controller.commissioning.measurement import Measured, measured_in
+from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import (
     Errors,
@@ -106,7 +102,7 @@ def plan_repeat_by_bag(
     Raises BlfDscError if it is None, and the bag does not show the response.
     """
     measured = measured_in(bag)
-    again = commissioning.plan_repeat(planned, measured[0], posture)
+    again = commissioning.plan_repeat(planned, measured.run, posture)
     if again is None:
         _check(measured)
     return again
@@ -119,7 +115,7 @@ def better_known_by_bag(
 
     Raises BlfDscError if the bag does not show the response.
     """
-    return commissioning.better_known(planned, measured_in(bag)[0])
+    return commissioning.better_known(planned, measured_in(bag).run)
 
 
 def ripples_by_bags(bags: Sequence[Path]) -> tuple[Ripples, ...]:
@@ -136,8 +132,8 @@ def check(bag: Path) -> None:
 
 
 def _check(measured: Measured) -> None:
-    run, config = measured
-    response_of(run, motion.lines_in(config), config.sample_time)
+    config = measured.config
+    response_of(measured.run, motion.lines_in(config), config.sample_time)
 
 
 @contextmanager
