@@ -7,6 +7,8 @@ its reference.  The torques sent and the positions measured give the responses o
 joints, and these the stiffest gains with a margin.
 
     motion          the reference that shakes all joints at once
+    planned         the motions in some postures, and the gains of the arm meanwhile
+    run_parameters  what else such runs have in common, and those of moves and proofs
     measurement     a run of it, with the configuration that it had
     response        the responses (f, n, n) from a run of it, with their uncertainty
     margin          the modulus margin of the measured arm, by its gains

@@ -19,7 +19,6 @@ from blf_dsc_controller.arms.joint_gains import (
 from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
-from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.better_known import as_measured, known_friction
 from blf_dsc_controller.commissioning.choice import LAGS, Choice, choose
 from blf_dsc_controller.commissioning.chosen import (
@@ -31,6 +30,7 @@ from blf_dsc_controller.commissioning.chosen import (
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.margin import BARELY, Loops, RigidArm
 from blf_dsc_controller.commissioning.measurement import Measured
+from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.observer_pole import ObserverPole, SensedLoops
 from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import Response, response_of
@@ -177,7 +177,7 @@ def commissioned(
     T = config.sample_time
     measured_with = as_measured(config, [made for _, made in runs])
     arm, _ = design_of(measured_with)
-    responses = tuple(response_of(run, motion.lines_in(made), T) for run, made in runs)
+    responses = tuple(response_of(run, lines_in(made), T) for run, made in runs)
     found = findings_of([run for run, _ in runs], responses)
     assumed = _assumed_inertia(arm, responses)
     inertia = _largest_inertia(arm, found, assumed)
