@@ -31,7 +31,8 @@ from blf_dsc_controller.commissioning.observer_pole import (
     ObserverPole,
     SensedLoops,
 )
-from blf_dsc_controller.commissioning.page import draw, sentences
+from blf_dsc_controller.commissioning.page import sentences
+from blf_dsc_controller.commissioning.picture import draw
 from blf_dsc_controller.commissioning.planned import plan
 from blf_dsc_controller.commissioning.response import Sensed
 from blf_dsc_controller.configuration.controller import ControllerConfig

@@ -29,6 +29,7 @@ joints, and these the stiffest gains with a margin.
     ripple          what runs of it show
     ripple_page     the same in words, and how sure it is
     limit_cycle     whether an arm shakes at rest or in motion
-    page            table, sentences and picture of what was found and chosen
+    page            tables and sentences of what was found and chosen
+    picture         margins of the gains, and responses of the joints
     files           the parameter files of motions, and with what was chosen
 """
