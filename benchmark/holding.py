@@ -27,7 +27,7 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 from sim_plant.mujoco_plant import MujocoPlant
 
 _MOVING = 3.0  # s, to each target
@@ -111,7 +111,7 @@ def with_position_loop(case: Case) -> list[Reached]:
 
     def torque(_: int, measurement: np.ndarray, qr: np.ndarray) -> np.ndarray:
         q, dq = measurement.reshape(3, -1)[:2]
-        gravity = case.gravity * model_torque(law.settings, initial, q)
+        gravity = case.gravity * gravity_torque(law.settings, initial, q)
         return np.asarray(np.clip(kp * (qr - q) - kd * dq + gravity, -limit, limit))
 
     return _visit(case, arm, torque)

@@ -54,7 +54,7 @@ from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.drive.motor_feedback import MotorFeedback
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.motors import MotorPlant
 
@@ -174,7 +174,7 @@ def frames_of(
     )
 
     def maker(_: np.ndarray, q: np.ndarray) -> Frame:
-        gravity = model_torque(settings, settings.initial_estimate, q)
+        gravity = gravity_torque(settings, settings.initial_estimate, q)
         return Frame(controller.reference.q, still, stiffness, damping, gravity)
 
     return maker

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A parameter file of two links with elastic joints, postures of it, and shorter motions."""
 
-from blf_dsc_controller.commissioning import motion, postures, response
+from blf_dsc_controller.commissioning import motion, planned, postures, response
 
 BEGIN = (0.1, 0.8)  # rad, where the arm rests
 NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
@@ -29,7 +29,7 @@ def shorten_motions(monkeypatch):
 
     That is enough for an arm whose springs ring at 26 Hz.
     """
-    for module in (motion, response):
+    for module in (motion, planned, response):
         monkeypatch.setattr(module, 'SETTLING', 2.0)
     monkeypatch.setattr(motion, '_SECONDS', 2.0)
 

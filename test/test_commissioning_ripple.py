@@ -29,7 +29,7 @@ from blf_dsc_controller.commissioning import (
     slow_motion,
 )
 from blf_dsc_controller.commissioning.driven import Driven
-from blf_dsc_controller.commissioning.own_loop import measured_in
+from blf_dsc_controller.commissioning.measurement import Measured, measured_in
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.planned import FROM_LIMITS
 from blf_dsc_controller.commissioning.postures import EndedError
@@ -189,7 +189,7 @@ def test_commands_lack_the_gravity_that_drives_add(preset, effort, whole, monkey
     shorten(monkeypatch)
     monkeypatch.setattr(ripple, 'find_ripples', lambda *given: given[2])
     run = blf.read_run(whole.arm.with_name('out_bags') / 'slow_motion')
-    assert ripples_in([(run, blf.load_loop(preset).controller)]) == effort
+    assert ripples_in([Measured(run, blf.load_loop(preset).controller)]) == effort
 
 
 def test_run_that_goes_on_after_a_stop_shows_no_ripple(whole, monkeypatch):
@@ -197,7 +197,7 @@ def test_run_that_goes_on_after_a_stop_shows_no_ripple(whole, monkeypatch):
     run, config = measured_in(whole.arm.with_name('out_bags') / 'slow_motion')
     stopped = replace(run, stops=(Stop(int(run.stamp[7000]), 'fault', 'a push'),))
     with pytest.raises(BlfDscError, match=r'the arm stopped 7 s after .* a push'):
-        ripples_in([(stopped, config)])
+        ripples_in([Measured(stopped, config)])
 
 
 def test_slow_motion_alone_gives_no_gains(whole, monkeypatch, capsys):

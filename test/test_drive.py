@@ -26,7 +26,7 @@ from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.first_torque import is_like
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
+from blf_dsc_controller.supervision.model_torque import friction_torque, gravity_torque
 from blf_dsc_controller.supervision.safe_torque import safe_torque
 from blf_dsc_controller.supervision.support import check_support
 
@@ -246,7 +246,7 @@ def test_restart_on_a_drive_that_holds_a_torque():
     config = change(loop_of('panda_rigid').controller, {'robot.effort': 'commanded'})
     law = controller_of(config)
     q = np.array(loop_of('panda_rigid').plant.initial.position)
-    gravity = model_torque(law.settings, law.settings.initial_estimate, q)
+    gravity = gravity_torque(law.settings, law.settings.initial_estimate, q)
     held = np.concatenate((q, np.zeros(7), gravity))
     steps = {'torque.first_step': [5.0] * 7}
     for given in (config, change(config, steps)):

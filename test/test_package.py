@@ -272,6 +272,14 @@ def test_public_names_are_documented_and_imported_on_first_use(tmp_path):
     subprocess.run([sys.executable, '-c', program], cwd=tmp_path, check=True)
 
 
+@pytest.mark.parametrize('package', ['commissioning', 'control', 'supervision'])
+def test_docstring_of_a_package_that_lists_its_modules_lists_them_all(package):
+    folder = Path(blf_dsc_controller.__file__).parent / package
+    listed = ast.get_docstring(ast.parse((folder / '__init__.py').read_text()))
+    modules = {file.stem for file in folder.glob('*.py')} - {'__init__'}
+    assert modules <= set(re.findall(r'\w+', listed))
+
+
 def test_errors_to_catch_are_public():
     kinds = vars(errors).values()
     names = {each.__name__ for each in kinds if isinstance(each, type)}

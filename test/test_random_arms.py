@@ -31,7 +31,7 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.controller import controller_of
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 
 ARMS = 300
 
@@ -141,7 +141,7 @@ def test_joint_pd_is_a_pd_over_gravity_with_the_published_gains(study):
         each[:] = rng.uniform(-0.5, 0.5, settings.n)
     law = joint_pd.LAW(scale=2.0)
     law.compute_demand(settings, controller.state, signals, 0.0, 1e-3)
-    expected = model_torque(settings, settings.initial_estimate, signals.q)
+    expected = gravity_torque(settings, settings.initial_estimate, signals.q)
     expected -= 2.0 * settings.barrier.weight * signals.xi1
     expected -= 2.0 * settings.feedback.gain * (signals.dq - signals.dqr)
     np.testing.assert_allclose(signals.demand, expected, atol=1e-9)
@@ -157,7 +157,7 @@ def test_momentum_observer_feeds_forward_what_holds_a_load(study):
     signals.q[:] = rng.uniform(-0.5, 0.5, n)
     for each in (signals.dq, signals.dqr, signals.ddqr, signals.xi1):
         each[:] = 0.0
-    gravity = model_torque(settings, settings.initial_estimate, signals.q)
+    gravity = gravity_torque(settings, settings.initial_estimate, signals.q)
     held = rng.uniform(-9.0, 9.0, n)
     signals.applied[:] = gravity + held
     law = momentum_observer.LAW(scale=1.0, bandwidth=10.0)
@@ -362,7 +362,7 @@ def test_rise_is_a_pid_over_the_model_and_the_integral_of_a_sign():
     settings, signals = controller.settings, controller.signals
     rng = np.random.default_rng(1)
     signals.qr[:] = rng.uniform(-0.5, 0.5, settings.n)
-    gravity = model_torque(settings, settings.initial_estimate, signals.qr)
+    gravity = gravity_torque(settings, settings.initial_estimate, signals.qr)
     K = settings.barrier.weight
     error = rng.uniform(-0.01, 0.01, settings.n)
     law = rise.LAW(scale=0.8, rate=3.0, sign=0.2)

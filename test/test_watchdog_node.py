@@ -35,7 +35,7 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import RawMessage, RawSubscriptions
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 from sim_plant.plant import plant_of
 
 FR3 = CONFIG / 'fr3.yaml'
@@ -173,7 +173,7 @@ class ByHand:
         self._q = np.full(len(config.joints), 0.3)
         settings = settings_of_config(config)
         # by which the arm rests
-        self.holding = model_torque(settings, settings.initial_estimate, self._q)
+        self.holding = gravity_torque(settings, settings.initial_estimate, self._q)
         self._encoder = JointStateEncoder(config.joints)
         self.torques = []  # of the watchdog
         self._sent = 0

@@ -37,11 +37,9 @@ from blf_dsc_controller.commissioning import (
 )
 from blf_dsc_controller.commissioning.choice import LAGS
 from blf_dsc_controller.commissioning.commissioning import Commissioned
-from blf_dsc_controller.commissioning.own_loop import (
-    Commissioning,
-    Measured,
-    measured_in,
-)
+from blf_dsc_controller.commissioning.measurement import Measured, measured_in
+from blf_dsc_controller.commissioning.own_loop import Commissioning
+from blf_dsc_controller.commissioning.picture import draw
 from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
 from blf_dsc_controller.commissioning.slow_motion import slow_motion
 from blf_dsc_controller.compiled.announcement import announced_compilation
@@ -211,7 +209,7 @@ def _written(
     content: Content = aside(file.content, found)
     print('\n'.join(['', *content.lines]))
     picture = _picture(file.path)
-    aside(page.draw, found, names, picture)
+    aside(draw, found, names, picture)
     print(f'wrote {picture}')
     if not found.has_margin:
         print(f'not written: {file.path}')

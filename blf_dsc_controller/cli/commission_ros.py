@@ -20,10 +20,10 @@ from rclpy.parameter import Parameter
 
 from blf_dsc_controller.cli.commission_robot import prepared_folder
 from blf_dsc_controller.cli.drive import signals_to
-from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.over_ros import OverRos
 from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.commissioning.postures import PostureByPosture, move
+from blf_dsc_controller.commissioning.run_parameters import undisturbed_parameters
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, read
 from blf_dsc_controller.configuration.robot import TOPIC
@@ -105,7 +105,7 @@ def robot_over_ros(
 
 def made(config: ControllerConfig, **options: object) -> RunByRunNode:
     """Return the node for a configuration, which commands nothing yet."""
-    values = flatten(change(config, motion.undisturbed_parameters(config)))
+    values = flatten(change(config, undisturbed_parameters(config)))
     overrides = [
         Parameter(name, value=list(value) if isinstance(value, tuple) else value)
         for name, value in values.items()

@@ -7,8 +7,13 @@ its reference.  The torques sent and the positions measured give the responses o
 joints, and these the stiffest gains with a margin.
 
     motion          the reference that shakes all joints at once
+    planned         the motions in some postures, and the gains of the arm meanwhile
+    run_parameters  what else such runs have in common, and those of moves and proofs
+    measurement     a run of it, with the configuration that it had
     response        the responses (f, n, n) from a run of it, with their uncertainty
-    choice          gains by the modulus margin, at all postures measured
+    margin          the modulus margin of the measured arm, by its gains
+    choice          the stiffest gains with a margin, at all postures measured
+    observer_pole   likewise, the fastest load observer
     better_known    the stiffer configuration with which a hardly known arm is measured again
     strength        whether a run shows enough, and the torque of the next one
     chosen          the configuration with the chosen gains, and bounds that they keep
@@ -24,6 +29,7 @@ joints, and these the stiffest gains with a margin.
     ripple          what runs of it show
     ripple_page     the same in words, and how sure it is
     limit_cycle     whether an arm shakes at rest or in motion
-    page            table, sentences and picture of what was found and chosen
+    page            tables and sentences of what was found and chosen
+    picture         margins of the gains, and responses of the joints
     files           the parameter files of motions, and with what was chosen
 """

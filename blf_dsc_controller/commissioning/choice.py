@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains by what was measured: the stiffest with a modulus margin, in every posture.
 
-With responses G_y, G_v and the law's C_y, C_v (`arms.linear_loop`) the loop, cut at the
-torques of all joints, is L = C_y G_y + C_v G_v, and the modulus margin is the least
-singular value of I + L over the frequencies, less what noise may make of it.  With small
-gains the loop is stable.  Raised step by step, they can only make it unstable where a
-singular value passes zero, so every step on the way must have the margin.
+With small gains the loop is stable.  Raised step by step, they can only make it unstable
+where a singular value of I + L (`margin`) passes zero, so every step on the way must have
+the margin.
 
 First the stiffness and damping of all joints grow together, then those of each joint by
 itself, in turns, as far as the margin allows.  Then the damping of one joint after the other
@@ -28,41 +26,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.joint_gains import JointGains, linear
+from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.known_gears import MARGIN
-from blf_dsc_controller.arms.linear_loop import (
-    SLOWEST,
-    Joints,
-    Loop,
-    Timing,
-    law_responses,
-)
-from blf_dsc_controller.commissioning.response import DEVIATIONS, Response
+from blf_dsc_controller.commissioning.margin import Loops, Margin, RigidArm
 
 Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-
-BARELY = 0.1
-"""Modulus margin, noise not counted, with which an arm nearly oscillates."""
 
 LAGS = (0.002, 0.003, 0.005)
 """Lags of the damping of a joint [s] that are tried, one after the other."""
 
-_STEP = 1.1
+_STEP = 1.1  # from one factor on the gains that is tried to the next
 _PAYS = 2  # steps of gains, of all joints together, for which a lag is chosen
 _LEAST, _MOST = 0.05, 100.0  # times the damping of the measurement
 _RAISED = _STEP ** np.arange(-30.0, 0.0)  # of gains, from small ones
 # Of one joint by itself, times that of all joints, or that of the measurement, if this is more.
 _OF_ONE = 5.0
-
-
-class Margin(NamedTuple):
-    """A modulus margin, and where it is least."""
-
-    value: float
-    frequency: float  # Hz
-    posture: int
-    joint: int  # with the largest part in it
 
 
 class Choice(NamedTuple):
@@ -73,85 +51,8 @@ class Choice(NamedTuple):
     without_lag: Floats  # (n,) likewise, of the gains if no damping lagged
     margin: Margin
     measured: Margin  # of the gains with which the arm was measured
-    by_inertia: NDArray[
-        np.bool_
-    ]  # (n,) of which joints more is too much for a rigid arm
-
-
-class RigidArm(NamedTuple):
-    """Rigid joints without friction, the others held: what inertias and lags alone bear."""
-
-    inertias: Floats  # (n,) kg m^2, the least of each joint
-    timing: Timing
-
-    def margin(self, gains: JointGains, inertia: Floats) -> float:
-        """Return the modulus margin of gains; 0 if a loop is unstable.
-
-        `inertia` (n,) [kg m^2] is the largest of each joint.
-        """
-        nothing = np.zeros(len(inertia))
-        M = np.diag(self.inertias)[None]
-        joints = Joints(motors=nothing, viscous=nothing)
-        return Loop(M, joints, self.timing, linear(gains, inertia, 1)).margin().value
-
-
-class Loops(NamedTuple):
-    """Measured arms in k postures, and the law by its gains."""
-
-    responses: Sequence[Response]
-    inertia: Floats  # (n,) kg m^2, the largest of each joint
-    sample_time: float  # s
-
-    def singular_values(self, gains: JointGains) -> list[tuple[Floats, Floats]]:
-        """Return for each posture the least singular value of I + L (f,), and its doubt."""
-        return [self._least(each, gains)[:2] for each in self.responses]
-
-    def margin(self, gains: JointGains, *, noise: bool = True) -> Margin:
-        """Return the margin of gains, `noise` counted against it or not."""
-        margins = []
-        for k, response in enumerate(self.responses):
-            value, doubt, direction = self._least(response, gains)
-            counts = response.seen & (response.frequency >= SLOWEST)
-            counted = np.where(counts, value - noise * doubt, np.inf)
-            at = int(counted.argmin())
-            joint = int(np.abs(direction[at]).argmax())
-            frequency = float(response.frequency[at])
-            margins.append(Margin(float(counted[at]), frequency, k, joint))
-        return min(margins)
-
-    def _least(
-        self, response: Response, gains: JointGains
-    ) -> tuple[Floats, Floats, Complex]:
-        """Return least singular values (f,), their doubt (f,) and directions (f, n)."""
-        C_y, C_v = self.law(response, gains)
-        L = C_y @ response.position + C_v @ response.velocity
-        position, velocity = response.deviations()
-        dL = np.abs(np.diagonal(C_y, axis1=1, axis2=2))[:, :, None] * position
-        dL += np.abs(np.diagonal(C_v, axis1=1, axis2=2))[:, :, None] * velocity
-        return least_singular_values(L, dL, response.shared)
-
-    def law(self, response: Response, gains: JointGains) -> tuple[Complex, Complex]:
-        """Return C_y [N m/rad] and C_v [N m s/rad] (f, n, n) at the frequencies of a response."""
-        s: Complex = np.asarray(2j * np.pi * response.frequency, complex)
-        feedback = linear(gains, self.inertia, 1)
-        C_y, C_v = (each[0] for each in law_responses(feedback, self.sample_time, s))
-        return C_y, C_v
-
-
-def least_singular_values(
-    L: Complex, dL: Floats, shared: NDArray[np.bool_]
-) -> tuple[Floats, Floats, Complex]:
-    """Return the least singular values (f,) of I + L, their doubt (f,) and directions (f, n).
-
-    `dL` (f, n, n) are the standard deviations of L, and `shared` as in `Response`.
-    """
-    left, values, right = np.linalg.svd(np.eye(L.shape[-1]) + L)
-    # u^H (I + L) v changes by u^H dL v; what two share changes in both at once
-    parts = np.abs(left[:, :, -1, None]) * dL * np.abs(right[:, -1, None, :])
-    both = parts + np.swapaxes(parts, 1, 2)
-    squares = np.where(shared, 0.5 * both**2, parts**2)
-    doubt = DEVIATIONS * np.sqrt(squares.sum(axis=(1, 2)))
-    return values[:, -1], np.asarray(doubt), right[:, -1].conj()
+    # (n,), joints for which more is too much for a rigid arm
+    by_inertia: NDArray[np.bool_]
 
 
 def choose(

@@ -149,7 +149,7 @@ def widened_bounds(config: ControllerConfig) -> dict[str, Value]:
     _check_bound(config, least)
     if barrier.bounds_tool:
         return _widened_at_tool(config, least)
-    wide = np.array([float(f'{each:.2g}') for each in np.maximum(barrier.bound, least)])
+    wide = np.maximum(barrier.bound, [float(f'{each:.2g}') for each in least])
     values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
     arm, _ = design_of(config)
     usual = gains_of(arm, _given_bound(config))['barrier.initial_bound']

@@ -19,16 +19,8 @@ from blf_dsc_controller.arms.joint_gains import (
 from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.tuning import Design
-from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.better_known import as_measured, known_friction
-from blf_dsc_controller.commissioning.choice import (
-    BARELY,
-    LAGS,
-    Choice,
-    Loops,
-    RigidArm,
-    choose,
-)
+from blf_dsc_controller.commissioning.choice import LAGS, Choice, choose
 from blf_dsc_controller.commissioning.chosen import (
     as_parameters,
     capped_stop_damping,
@@ -36,6 +28,9 @@ from blf_dsc_controller.commissioning.chosen import (
     with_gains,
 )
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
+from blf_dsc_controller.commissioning.margin import BARELY, Loops, RigidArm
+from blf_dsc_controller.commissioning.measurement import Measured
+from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.observer_pole import ObserverPole, SensedLoops
 from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import Response, response_of
@@ -45,7 +40,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, design
 from blf_dsc_controller.configuration.schema import Value
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.ripple import Ripples
-from blf_dsc_controller.run import Run
 from blf_dsc_controller.supervision.digits import two_digits
 
 Floats = NDArray[np.float64]
@@ -76,9 +70,8 @@ class Commissioned(NamedTuple):
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
     coulomb: Floats | None  # (n,) N m, robot.coulomb, if the last runs compensated it
-    sensed: (
-        SensedLoops | None
-    )  # None: there are no joint torque sensors, or they are not used
+    # None: there are no joint torque sensors, or they are not used
+    sensed: SensedLoops | None
     observer: ObserverPole | None  # likewise
     ripples: tuple[Ripples, ...] = ()  # of each joint; empty: there was no slow motion
 
@@ -169,7 +162,7 @@ class Commissioned(NamedTuple):
 
 def commissioned(
     config: ControllerConfig,
-    runs: Sequence[tuple[Run, ControllerConfig]],
+    runs: Sequence[Measured],
     margin: float = MARGIN,
     lags: Sequence[float] = LAGS,
 ) -> Commissioned:
@@ -182,18 +175,18 @@ def commissioned(
     """
     _check_runs(config, runs)
     T = config.sample_time
-    measured = as_measured(config, [each for _, each in runs])
-    arm, _ = design_of(measured)
-    responses = tuple(response_of(run, motion.lines_in(each), T) for run, each in runs)
+    measured_with = as_measured(config, [made for _, made in runs])
+    arm, _ = design_of(measured_with)
+    responses = tuple(response_of(run, lines_in(made), T) for run, made in runs)
     found = findings_of([run for run, _ in runs], responses)
     assumed = _assumed_inertia(arm, responses)
     inertia = _largest_inertia(arm, found, assumed)
     loops = Loops(responses, inertia, T)
-    start = measuring_gains(measured)
+    start = measuring_gains(measured_with)
     rigid = RigidArm(_least(found.inertias, assumed), found.timing(T, arm.lag))
     by_factors = _gains_by_factors(config, start, inertia)
     choice = choose(loops, start, by_factors, rigid, margin, lags)
-    lag = _lag(measured, found)
+    lag = _lag(measured_with, found)
     sensed = _sensed_loops(config, arm, loops, lag)
     return Commissioned(
         joints=config.joints,
@@ -212,17 +205,15 @@ def commissioned(
         before=config,
         coulomb=(
             None
-            if measured is config
-            else np.maximum(known_friction(measured), found.friction)
+            if measured_with is config
+            else np.maximum(known_friction(measured_with), found.friction)
         ),
         sensed=sensed,
         observer=None if sensed is None else sensed.fastest_pole(choice.gains),
     )
 
 
-def _check_runs(
-    config: ControllerConfig, runs: Sequence[tuple[Run, ControllerConfig]]
-) -> None:
+def _check_runs(config: ControllerConfig, runs: Sequence[Measured]) -> None:
     """Raise BlfDscError if there is none, or if one is of other joints."""
     if not runs:
         raise BlfDscError(

@@ -29,11 +29,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.joint_gains import BESIDE
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.arms.tuning import gains_of
 from blf_dsc_controller.arms.urdf import Chain, frames
-from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.errors import BlfDscError
 
@@ -61,7 +59,6 @@ _SLOWEST, _FASTEST = 2.0, 120.0  # Hz
 _SECONDS = 4.0  # of the period, for each joint
 _SLOW, _SWING = 1.0, 4.0  # Hz, of slow tones and of swings
 _LEAST_SWING = 0.05  # of slow tones, below which the lines shrink, too
-_SHRINKS = 40  # until travel and speeds are within their limits
 _SPEED = 0.25  # of the limit of velocity
 _SEED = 0
 _NEWTON = 50  # steps at most
@@ -217,14 +214,13 @@ def _shrunk(
 ) -> tuple[Floats, _Moves]:
     """Return the amplitudes (n, K + 2) of a motion that has room, and how it moves."""
     factors = np.ones((len(lines), 2))  # of lines and of slow tones or swings
-    for _ in range(_SHRINKS):
+    while True:
         amplitude = np.column_stack((factors[:, :1] * lines, factors[:, 1:] * swing))
         moves = shape.motion(amplitude)
         excess = room.excess(moves)
-        if (excess <= 1.0).all():
-            break
+        if not (excess > 1.0).any():
+            return amplitude, moves
         shrink(factors, excess)
-    return amplitude, moves
 
 
 def _shrink_all(factors: Floats, excess: Floats) -> None:
@@ -286,64 +282,6 @@ class _Shape:
         moved = _over_a_period(amplitude, phase, self._bins)
         rate = np.gradient(moved, self._period / len(moved), axis=0)
         return _Moves(phase, moved, np.abs(rate).max(axis=0))
-
-
-def shaking_parameters(
-    config: ControllerConfig, excitation: Excitation, posture: Floats
-) -> dict[str, object]:
-    """Return the parameters that hold an arm by its own gains and shake it.
-
-    The law learns nothing, so that it is the same at the end as at the beginning.  Torques limit
-    the motion, not accelerations: those of fast tones are high, but hardly move a light wrist.
-    """
-    count = len(config.learning.initial_estimate)
-    limit = np.maximum(config.limits.acceleration, excitation.acceleration)
-    return (
-        undisturbed_parameters(config)
-        | excitation.reference(posture)
-        | {
-            'learning.weight': 0.0,
-            'learning.adaptation_gain': [0.0] * count,
-            'limits.acceleration': _listed(limit),
-            'safety.oscillation': 'warn',  # with softer gains another arm would be measured
-        }
-    )
-
-
-def undisturbed_parameters(config: ControllerConfig) -> dict[str, object]:
-    """Return the parameters of a run with soft gains that goes on as planned, or stops.
-
-    The bounds are wide, loads are not declared, and a contact stops an arm that would react to it.
-    The integral is slow, since coarse encoders make a quick one swing.
-    """
-    barrier = config.barrier
-    wide = np.maximum(np.maximum(barrier.bound, barrier.initial_bound), _WIDE_BOUND)
-    values: dict[str, object] = {
-        'barrier.bound': _listed(wide),
-        'barrier.initial_bound': [0.0] * len(wide),
-        'disturbance.gain': _listed(_slow_integral(config)),
-    }
-    if barrier.bounds_tool:
-        values |= {'barrier.tool_bound': 0.0, 'barrier.tool_angle_bound': 0.0}
-    if config.load.tell_drive:
-        values |= {'load.tell_drive': False, 'load.service': ''}
-    if config.contact.reaction != 'none':
-        values['contact.reaction'] = 'stop'
-    return values
-
-
-def _slow_integral(config: ControllerConfig) -> Floats:
-    """Return gamma (n,) [N m/rad] as beside another integral, or less if it is less."""
-    usual = np.array(config.disturbance.gain)
-    arm, _ = design_of(config)
-    if arm.joints is None:
-        return usual
-    beside = arm._replace(joints=arm.joints._replace(share=BESIDE))
-    slow = np.asarray(gains_of(beside, None)['disturbance.gain'], float)
-    return np.asarray(np.minimum(usual, slow))
-
-
-_WIDE_BOUND = 0.1  # rad, bound of the errors
 
 
 def _bins(n: int, period: float, sample_time: float) -> Ints:

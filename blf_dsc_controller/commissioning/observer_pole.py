@@ -26,7 +26,6 @@ Poles end with `POLES`: a faster one gains little and hands the noise of velocit
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -34,11 +33,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST, low_pass
-from blf_dsc_controller.commissioning.choice import (
+from blf_dsc_controller.commissioning.margin import (
     BARELY,
     Loops,
     Margin,
-    least_singular_values,
+    SingularValues,
+    singular_values,
 )
 from blf_dsc_controller.commissioning.response import Response, Sensed
 
@@ -65,6 +65,17 @@ class ObserverPole(NamedTuple):
     pole: float  # L, rad/s; 0: none
     margin: Margin  # with it, or with the slowest that is tried, where gears resonate
     why_none: str = ''  # of efforts that are no torques of the links
+    noise_hides: bool = (
+        False  # whether it is noise alone that speaks against a faster one
+    )
+
+
+class _Left(NamedTuple):
+    """The modulus margins that a pole leaves."""
+
+    resonant: Margin  # from `RESONANT` on, noise not counted
+    with_noise: float  # the same with noise counted
+    below: float  # below `RESONANT`, noise not counted
 
 
 class SensedLoops(NamedTuple):
@@ -75,25 +86,25 @@ class SensedLoops(NamedTuple):
     links: Floats  # M_l (k, n, n), kg m^2
     sensor_lag: float  # of velocities, s
 
-    def singular_values(
-        self, gains: JointGains, pole: float
-    ) -> list[tuple[Floats, Floats]]:
-        """Return for each posture the least singular value of I + L (f,), and its doubt."""
-        return [each[:2] for each in self._least(gains, pole)]
+    def singular_values(self, gains: JointGains, pole: float) -> list[SingularValues]:
+        """Return the least singular values of I + L in each posture."""
+        of_each = zip(self.loops.responses, self.sensed, self.links, strict=True)
+        return [self._singular_values(*each, gains, pole) for each in of_each]
 
     def fastest_pole(self, gains: JointGains) -> ObserverPole:
         """Return the fastest pole that is borne, with all that are slower.
 
         0 if none is, or if the efforts are not those of sensors at the links.
         """
-        chosen = ObserverPole(0.0, self._margins(gains, POLES[0])[0])
+        chosen = ObserverPole(0.0, self._left(gains, POLES[0]).resonant)
         if why := self.why_no_sensors:
             return chosen._replace(why_none=why)
         for pole in POLES:
-            margin, with_noise, below = self._margins(gains, pole)
-            if margin.value < ENOUGH or min(with_noise, below) < BARELY:
-                break
-            chosen = ObserverPole(pole, margin)
+            left = self._left(gains, pole)
+            is_borne = left.resonant.value >= ENOUGH and left.below >= BARELY
+            if not is_borne or left.with_noise < BARELY:
+                return chosen._replace(noise_hides=is_borne)
+            chosen = ObserverPole(pole, left.resonant)
         return chosen
 
     @property
@@ -142,40 +153,29 @@ class SensedLoops(NamedTuple):
             return np.ones_like(z)
         return low_pass(np.exp(-self.loops.sample_time / self.sensor_lag), z)
 
-    def _margins(self, gains: JointGains, pole: float) -> tuple[Margin, float, float]:
-        """Return the margin from `RESONANT` on, the same with noise counted, and that below."""
-        margins, with_noise, below = [], [], []
-        for k, (response, (value, doubt, direction)) in enumerate(
-            zip(self.loops.responses, self._least(gains, pole), strict=True)
+    def _left(self, gains: JointGains, pole: float) -> _Left:
+        """Return the margins that a pole leaves, over all postures."""
+        resonant, with_noise, below = [], [], []
+        for k, (response, values) in enumerate(
+            zip(self.loops.responses, self.singular_values(gains, pole), strict=True)
         ):
-            f = response.frequency
-            rigid = response.seen & (f >= SLOWEST) & (f < RESONANT)
-            below.append(float(value[rigid].min(initial=np.inf)))
-            resonant = response.seen & (f >= RESONANT)
-            with_noise.append(float((value - doubt)[resonant].min(initial=np.inf)))
-            counted = np.where(resonant, value, np.inf)
-            at = int(counted.argmin())
-            joint = int(np.abs(direction[at]).argmax())
-            margins.append(Margin(float(counted[at]), float(f[at]), k, joint))
-        return min(margins), min(with_noise), min(below)
+            f, seen = response.frequency, response.seen
+            counts = seen & (f >= RESONANT)
+            resonant.append(values.margin(f, counts, k, noise=False))
+            with_noise.append(values.margin(f, counts, k).value)
+            rigid = seen & (f >= SLOWEST) & (f < RESONANT)
+            below.append(values.margin(f, rigid, k, noise=False).value)
+        return _Left(min(resonant), min(with_noise), min(below))
 
-    def _least(
-        self, gains: JointGains, pole: float
-    ) -> Iterator[tuple[Floats, Floats, Complex]]:
-        """Yield least singular values (f,), their doubt (f,) and directions (f, n)."""
-        of_each = zip(self.loops.responses, self.sensed, self.links, strict=True)
-        for response, sensed, links in of_each:
-            yield self._least_of(response, sensed, links, gains, pole)
-
-    def _least_of(
+    def _singular_values(
         self,
         response: Response,
         sensed: Sensed,
         links: Floats,
         gains: JointGains,
         pole: float,
-    ) -> tuple[Floats, Floats, Complex]:
-        """Return the same in one posture, with M_l (n, n) of the `links`."""
+    ) -> SingularValues:
+        """Return them in one posture, with M_l (n, n) of the `links`."""
         T = self.loops.sample_time
         z: Complex = np.exp(2j * np.pi * response.frequency * T)
         quotient = (1.0 - 1.0 / z) / T
@@ -189,7 +189,7 @@ class SensedLoops(NamedTuple):
         position, velocity = response.deviations()
         dL = np.abs(C_y) @ position + np.abs(C_v) @ velocity
         dL += self._deviation(response, sensed, np.dstack((of_effort, of_velocity)))
-        return least_singular_values(L, dL, response.shared)
+        return singular_values(L, dL, response.shared)
 
     def _deviation(
         self, response: Response, sensed: Sensed, of_both: Complex

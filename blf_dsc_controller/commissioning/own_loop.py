@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blf_dsc_controller.arms.known_gears import MARGIN
-from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.commissioning.better_known import (
     ABOVE_IF_HIDDEN,
     FAR_ABOVE,
@@ -24,6 +22,7 @@ from blf_dsc_controller.commissioning.better_known import (
 )
 from blf_dsc_controller.commissioning.choice import LAGS
 from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.measurement import Measured, measured_in
 from blf_dsc_controller.commissioning.motion import SLOW_TONES
 from blf_dsc_controller.commissioning.planned import (
     TORQUE,
@@ -45,9 +44,6 @@ REPEATS = 2
 
 _SOFTER = 0.5  # of the gains, with which an arm is measured that nearly oscillates
 _WORTHWHILE = 1.2  # times the amplitude, from which a posture is measured again
-
-Measured = tuple[Run, ControllerConfig]
-"""The run of a motion, with its parameters."""
 
 
 class Commissioning:
@@ -213,7 +209,9 @@ class Commissioning:
         if not self.anew_left:
             return None
         # the next measurement has no lag either
-        found = commissioned(self.config, [(run, motion.config)], self.margin, ())
+        found = commissioned(
+            self.config, [Measured(run, motion.config)], self.margin, ()
+        )
         hidden = np.isnan(found.findings.inertia)
         if found.choice.factors.max() <= (
             ABOVE_IF_HIDDEN if hidden.any() else FAR_ABOVE
@@ -250,7 +248,9 @@ class Commissioning:
         )
         return motion
 
-    def result(self, runs: Sequence[str | Path | Measured]) -> Commissioned:
+    def result(
+        self, runs: Sequence[str | Path | tuple[Run, ControllerConfig]]
+    ) -> Commissioned:
         """Return what runs of motions show, and the gains that follow.
 
         Args:
@@ -263,7 +263,8 @@ class Commissioning:
                 before its time, or lacks joint states.
         """
         measured = [
-            each if isinstance(each, tuple) else measured_in(each) for each in runs
+            Measured(*each) if isinstance(each, tuple) else measured_in(each)
+            for each in runs
         ]
         slow = [each for each in measured if self.is_slow_motion(each)]
         shaken = [each for each in measured if not self.is_slow_motion(each)]
@@ -271,15 +272,7 @@ class Commissioning:
         found = commissioned(self.config, shaken, self.margin, self._lags)
         return found._replace(ripples=ripples)
 
-    def is_slow_motion(self, measured: Measured) -> bool:
+    def is_slow_motion(self, measured: tuple[Run, ControllerConfig]) -> bool:
         """Whether a run is the slow motion that shows the torque ripple."""
-        return is_slow_motion(measured[1], self.config)
-
-
-def measured_in(bag: str | Path) -> Measured:
-    """Return the run of a bag, with its parameters.
-
-    Raises BagError if it cannot be read, or has none.
-    """
-    content = read_content(Path(bag))
-    return recorded_run(content, np.asarray), content.controller_config()
+        _, made = measured
+        return is_slow_motion(made, self.config)

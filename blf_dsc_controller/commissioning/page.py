@@ -1,20 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The result of a commissioning: a table, sentences and a picture."""
+"""The result of a commissioning in words: tables and sentences."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
-from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.output import aligned
-from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
-from blf_dsc_controller.arms.joint_gains import JointGains
-from blf_dsc_controller.arms.linear_loop import SLOWEST
 from blf_dsc_controller.commissioning.better_known import FAR_ABOVE, known_friction
 from blf_dsc_controller.commissioning.commissioning import CREEPING, Commissioned
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
@@ -31,10 +24,6 @@ from blf_dsc_controller.run import unit_of_all
 from blf_dsc_controller.supervision.digits import two_digits
 from blf_dsc_controller.supervision.expected_errors import expectation
 
-Floats = NDArray[np.float64]
-
-_COLOURS = (BLUE, ORANGE, MUTED, ALARM)
-_SIZE = (5.6, 3.4)  # inches, of a panel
 _DECIMALS = 6  # of a position
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said
 
@@ -190,25 +179,31 @@ def _of_observer(found: Commissioned) -> Iterator[str]:
     """Yield how fast the load observer is, and what limits it."""
     if found.observer is None:
         return
-    pole, limit, why_none = found.observer
+    pole, limit, why_none, noise_hides = found.observer
     where = f'near {two_digits(limit.frequency)} Hz, by {found.joints[limit.joint]}'
     if why_none:
         yield f'NO LOAD OBSERVER: {why_none}. Set robot.effort and robot.torque_loop as they are'
         return
     if pole == 0.0:
-        yield (
-            f'NO LOAD OBSERVER: with the slowest pole, {POLES[0]:g} rad/s, it would leave a '
-            f'modulus margin of {limit.value:.2g} {where}, or too little for noise or for a load'
+        slowest = f'the slowest pole, {POLES[0]:g} rad/s'
+        yield 'NO LOAD OBSERVER: ' + (
+            f'noise hides whether {slowest}, is borne: a larger --torque may show it'
+            if noise_hides
+            else f'with {slowest}, it would leave a modulus margin of {limit.value:.2g} {where}, '
+            'or too little for a load'
         )
         return
+    if noise_hides:
+        limited = (
+            'noise hides whether a faster one is borne; a larger --torque may show it'
+        )
+    elif pole == POLES[-1]:
+        limited = 'a faster one gains little'
+    else:
+        limited = f'a faster one less than {ENOUGH:g}, or too little for a load'
     yield (
         f'the load observer has a pole of {pole:g} rad/s, which leaves a modulus margin of '
-        f'{limit.value:.2g} {where}: '
-        + (
-            'a faster one gains little'
-            if pole == POLES[-1]
-            else f'a faster one less than {ENOUGH:g}, or too little for noise or for a load'
-        )
+        f'{limit.value:.2g} {where}: {limited}'
     )
 
 
@@ -358,85 +353,9 @@ def errors_table(config: ControllerConfig, errors: Errors) -> str:
 def _doubt_at(found: Commissioned) -> float:
     """Return what noise takes from the margin where it is least."""
     limit = found.choice.margin
-    doubt = found.loops.singular_values(found.choice.gains)[limit.posture][1]
+    doubt = found.loops.singular_values(found.choice.gains)[limit.posture].doubt
     at = found.responses[limit.posture].frequency
     return float(doubt[int(np.abs(at - limit.frequency).argmin())])
-
-
-def draw(found: Commissioned, names: Sequence[str], path: Path) -> None:
-    """Draw the margins of measured and chosen gains, and the response of each joint.
-
-    `names` are those of the runs.
-    """
-    n = len(found.joints)
-    rows = 1 + -(-n // 2)  # two joints in each, below the margins
-    title = 'Commissioning: margins and responses'
-    picture = Picture(rows, 2, title, _SIZE, share_time=False)
-    before, after = picture.axes[0]
-    _draw_margin(before, found, found.start, 'as measured', names)
-    _draw_margin(after, found, found.choice.gains, 'as chosen', names)
-    _draw_observer(after, found)
-    before.legend(frameon=False, fontsize=8, loc='lower right')
-    panels = list(picture.axes[1:].flat)
-    for j, axes in enumerate(panels[:n]):
-        _draw_response(axes, found, j)
-    for axes in panels[n:]:
-        axes.set_visible(False)
-    picture.save(path)
-
-
-def _draw_margin(
-    axes: Axes, found: Commissioned, gains: JointGains, label: str, names: Sequence[str]
-) -> None:
-    """Draw the least singular value over the frequency, with what noise takes from it."""
-    values = found.loops.singular_values(gains)
-    for k, ((value, doubt), response) in enumerate(
-        zip(values, found.responses, strict=True)
-    ):
-        seen = response.seen
-        f, least, doubted = response.frequency[seen], value[seen], doubt[seen]
-        axes.semilogx(f, least, color=_colour(k), label=names[k])
-        axes.fill_between(
-            f, least - doubted, least, color=_colour(k), alpha=0.2, lw=0.0
-        )
-    axes.axhline(found.aim, color=ALARM, lw=1.0, ls='--')
-    axes.axvspan(axes.get_xlim()[0], SLOWEST, color=SHADE, alpha=0.5, lw=0.0)
-    axes.set_ylim(0.0, 1.5)
-    axes.set_title(f'least singular value of I + L, gains {label}', loc='left')
-    axes.set_xlabel('frequency [Hz]')
-
-
-def _draw_observer(axes: Axes, found: Commissioned) -> None:
-    """Draw the least singular value with the load observer, dotted, if there is one."""
-    if found.sensed is None or found.observer is None or found.observer.pole == 0.0:
-        return
-    pole = found.observer.pole
-    values = found.sensed.singular_values(found.choice.gains, pole)
-    lines = []
-    for k, ((value, _), response) in enumerate(
-        zip(values, found.responses, strict=True)
-    ):
-        seen = response.seen
-        f, least = response.frequency[seen], value[seen]
-        lines += axes.semilogx(f, least, color=_colour(k), ls=':', lw=1.0)
-    label = f'with the load observer, {pole:g} rad/s'
-    axes.legend(lines[:1], [label], frameon=False, fontsize=8, loc='upper left')
-
-
-def _draw_response(axes: Axes, found: Commissioned, j: int) -> None:
-    """Draw the acceleration of joint j by its own torque, over the frequency."""
-    for k, response in enumerate(found.responses):
-        f = response.frequency
-        own = np.abs(response.position[:, j, j])
-        axes.loglog(f, own * (2.0 * np.pi * f) ** 2, color=_colour(k))
-    axes.set_title(f'{found.joints[j]}: acceleration by torque', loc='left')
-    axes.set_ylabel(found.before.units[j].of('rad/(s^2 N m)'))
-    axes.set_xlabel('frequency [Hz]')
-
-
-def _colour(k: int) -> str:
-    """Return the colour of the k-th run."""
-    return _COLOURS[k % len(_COLOURS)]
 
 
 def _known(value: float) -> str:

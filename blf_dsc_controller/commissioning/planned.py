@@ -9,8 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.joint_gains import BESIDE, JointGains, unknown_arm
-from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
+from blf_dsc_controller.commissioning.motion import (
+    BEAT,
+    SETTLING,
+    Excitation,
+    excitation,
+)
+from blf_dsc_controller.commissioning.run_parameters import shaking_parameters
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.plausibility import hint_at_degrees
 from blf_dsc_controller.configuration.schema import Value, change
@@ -37,7 +43,7 @@ class Planned(NamedTuple):
     # parameters of `config` that differ from those of the arm in use
     values: dict[str, object]
     posture: Floats  # (n,) rad
-    excitation: motion.Excitation
+    excitation: Excitation
     share: float = 1.0  # of the gains of the arm in use
     torque: float = TORQUE  # rms, as a share of the rated one, at most
 
@@ -47,8 +53,8 @@ class Planned(NamedTuple):
 
         Swings end where they vanish.
         """
-        more = motion.BEAT if self.excitation.sliding else 0.5
-        return motion.SETTLING + self.excitation.period + more
+        more = BEAT if self.excitation.sliding else 0.5
+        return SETTLING + self.excitation.period + more
 
 
 def postures_of(
@@ -101,10 +107,10 @@ def plan(
     planned = []
     for posture in postures:
         _check_posture(config, posture)
-        excitation = motion.excitation(arm, posture, torque, travel, sliding=sliding)
-        values = {**gains, **motion.shaking_parameters(arm, excitation, posture)}
+        tones = excitation(arm, posture, torque, travel, sliding=sliding)
+        values = {**gains, **shaking_parameters(arm, tones, posture)}
         made = change(arm, values)
-        planned.append(Planned(made, values, posture, excitation, share, torque))
+        planned.append(Planned(made, values, posture, tones, share, torque))
     return planned
 
 

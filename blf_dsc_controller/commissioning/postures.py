@@ -21,14 +21,10 @@ from typing import NamedTuple, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
-from blf_dsc_controller.commissioning.own_loop import (
-    REPEATS,
-    Commissioning,
-    Measured,
-    measured_in,
-)
+from blf_dsc_controller.commissioning.measurement import Measured, measured_in
+from blf_dsc_controller.commissioning.motion import lines_in
+from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import (
     Errors,
@@ -39,6 +35,7 @@ from blf_dsc_controller.commissioning.proof import (
 )
 from blf_dsc_controller.commissioning.response import response_of
 from blf_dsc_controller.commissioning.ripple import ripples_in
+from blf_dsc_controller.commissioning.run_parameters import undisturbed_parameters
 from blf_dsc_controller.commissioning.slow_motion import SlowMotion
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
@@ -90,7 +87,7 @@ def move(
     speed = np.minimum(SPEED, 0.5 * np.array(config.limits.velocity))
     acceleration = np.minimum(_ACCELERATION, 0.5 * np.array(config.limits.acceleration))
     duration = max(_SHORTEST, duration_of(far, speed, acceleration))
-    values = motion.undisturbed_parameters(config) | {
+    values = undisturbed_parameters(config) | {
         'reference.type': 'waypoints',
         'reference.times': [0.0, duration],
         'reference.waypoints': [*here.tolist(), *target.tolist()],
@@ -106,7 +103,7 @@ def plan_repeat_by_bag(
     Raises BlfDscError if it is None, and the bag does not show the response.
     """
     measured = measured_in(bag)
-    again = commissioning.plan_repeat(planned, measured[0], posture)
+    again = commissioning.plan_repeat(planned, measured.run, posture)
     if again is None:
         _check(measured)
     return again
@@ -119,7 +116,7 @@ def better_known_by_bag(
 
     Raises BlfDscError if the bag does not show the response.
     """
-    return commissioning.better_known(planned, measured_in(bag)[0])
+    return commissioning.better_known(planned, measured_in(bag).run)
 
 
 def ripples_by_bags(bags: Sequence[Path]) -> tuple[Ripples, ...]:
@@ -136,8 +133,8 @@ def check(bag: Path) -> None:
 
 
 def _check(measured: Measured) -> None:
-    run, config = measured
-    response_of(run, motion.lines_in(config), config.sample_time)
+    config = measured.config
+    response_of(measured.run, lines_in(config), config.sample_time)
 
 
 @contextmanager

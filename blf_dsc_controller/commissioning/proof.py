@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.commissioning import motion
 from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
 from blf_dsc_controller.commissioning.limit_cycle import (
     AT_REST,
@@ -24,6 +23,7 @@ from blf_dsc_controller.commissioning.limit_cycle import (
     LimitCycle,
     limit_cycles,
 )
+from blf_dsc_controller.commissioning.run_parameters import undisturbed_parameters
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
@@ -82,7 +82,7 @@ def steps(config: ControllerConfig) -> list[Step]:
             'feedback.joint_stiffness is empty: prove the file that blf_dsc commission has written'
         )
     calm: dict[str, Value] = {'safety.oscillation': 'stop'}
-    soft = change(config, motion.undisturbed_parameters(config) | calm)
+    soft = change(config, undisturbed_parameters(config) | calm)
     found = []
     for share in SHARES[:-1]:
         factor = share * gains.stiffness

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from blf_dsc_controller.commissioning.measurement import Measured
 from blf_dsc_controller.commissioning.slow_motion import SECONDS
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.identify import find_ripples
 from blf_dsc_controller.identification.problem import Effort
@@ -22,15 +22,13 @@ from blf_dsc_controller.identification.ripple import (
 from blf_dsc_controller.run import NANOSECOND, TURNING, Run
 
 
-def ripples_in(
-    runs: Sequence[tuple[Run, ControllerConfig]],
-) -> tuple[Ripples, ...]:
+def ripples_in(runs: Sequence[Measured]) -> tuple[Ripples, ...]:
     """Return what runs of a slow motion together show of each joint.
 
     Raises BlfDscError if the arm stopped in one, or if one ended before its time.
     """
     recording, _ = joined(*(_recording(run) for run, _ in runs))
-    robot = runs[0][1].robot
+    robot = runs[0].config.robot
     effort: Effort = 'command'
     if robot.drive_compensates != 'none':  # commands lack gravity
         effort = 'without-gravity'

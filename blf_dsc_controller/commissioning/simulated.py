@@ -10,11 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
-from blf_dsc_controller.commissioning.own_loop import (
-    REPEATS,
-    Commissioning,
-    Measured,
-)
+from blf_dsc_controller.commissioning.measurement import Measured
+from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import cycles_of
 from blf_dsc_controller.commissioning.slow_motion import SlowMotion
@@ -66,7 +63,7 @@ def _run(
     run = simulate(config, change(plant, arm)).run()
     for stop in run.stops:
         raise BlfDscError(f'the simulated arm stopped: {stop.text}')
-    return run, config
+    return Measured(run, config)
 
 
 def proof(loop: LoopConfig) -> Proof:
@@ -102,12 +99,12 @@ def runs_of(
     ]
     motions = []
     for k, posture in enumerate(postures, 1):
-        planned, run = _measure(commissioning, posture, plant)
-        while k == 1 and (better := commissioning.better_known(planned, run[0])):
+        planned, seen = _measure(commissioning, posture, plant)
+        while k == 1 and (better := commissioning.better_known(planned, seen.run)):
             commissioning = better
-            planned, run = _measure(commissioning, posture, plant)
+            planned, seen = _measure(commissioning, posture, plant)
         motions.append(planned)
-        yield f'posture {k}', run
+        yield f'posture {k}', seen
     payload = loop.controller.robot.payload
     name = f'posture 1 with {payload:g} kg'
     try:
@@ -121,10 +118,10 @@ def _measure(
 ) -> tuple[Planned, Measured]:
     """Measure around a posture (n,) [rad], again if need be; return the last motion and its run."""
     planned = commissioning.motion(posture)
-    run = measured(planned, plant)
+    seen = measured(planned, plant)
     for _ in range(REPEATS):
-        again = commissioning.plan_repeat(planned, run[0])
+        again = commissioning.plan_repeat(planned, seen.run)
         if again is None:
             break
-        planned, run = again, measured(again, plant)
-    return planned, run
+        planned, seen = again, measured(again, plant)
+    return planned, seen

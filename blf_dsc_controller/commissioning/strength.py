@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.commissioning.choice import BARELY, Loops
 from blf_dsc_controller.commissioning.findings import rubs
+from blf_dsc_controller.commissioning.margin import BARELY, Loops
 from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import HiddenError, response_of

@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.reference.approach import AT_REST
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 
 Vector = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ def check_first_torque(
     q, dq, effort = measurement.reshape(3, -1)
     gravity = np.zeros_like(q)
     if config.robot.urdf and acting is None:
-        gravity = model_torque(controller.settings, controller.state.estimate, q)
+        gravity = gravity_torque(controller.settings, controller.state.estimate, q)
         _check_gravity(config, dq, effort, gravity, torque)
     # Of an effort that only contains commands, a torque is held that this one replaces.
     held = effort if config.robot.effort == 'commanded' else np.zeros_like(q)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques of the estimated model: of a motion, and of friction."""
+"""Torques of the estimated model: of a motion, of gravity alone, and of friction."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ from blf_dsc_controller.law.torque import added_torque
 Vector = NDArray[np.float64]
 
 
-def model_torque(settings: Settings, estimate: Vector, *motion: Vector) -> Vector:
-    """Return H(q, dq, dq, ddq) P^ (n,) [N m] of a motion q, dq, ddq (n,); at rest of q alone."""
-    q, dq, ddq = motion if len(motion) > 1 else (*motion, *np.zeros((2, settings.n)))
+def gravity_torque(settings: Settings, estimate: Vector, q: Vector) -> Vector:
+    """Return H(q, 0, 0, 0) P^ (n,) [N m], which holds the model at rest at q (n,) [rad]."""
+    return model_torque(settings, estimate, q, *np.zeros((2, settings.n)))
+
+
+def model_torque(
+    settings: Settings, estimate: Vector, q: Vector, dq: Vector, ddq: Vector
+) -> Vector:
+    """Return H(q, dq, dq, ddq) P^ (n,) [N m] of a motion q, dq, ddq (n,)."""
     (H,) = regressors_at(
         settings.model, *(vector[np.newaxis] for vector in (q, dq, dq, ddq))
     )

@@ -11,7 +11,7 @@ from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 from blf_dsc_controller.supervision.safe_torque import SafeTorque
 from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Reason
@@ -104,8 +104,8 @@ class SafeStop:
         if safety.torque != 'hold_gravity' or not self._torque.carries:
             return None
         settings, q = self._controller.settings, self._torque.last.q
-        held = model_torque(settings, self._estimates.estimate, q) + self._torque.load
-        return held - model_torque(settings, settings.initial_estimate, q)
+        held = gravity_torque(settings, self._estimates.estimate, q) + self._torque.load
+        return held - gravity_torque(settings, settings.initial_estimate, q)
 
     def advance(self, safety: Safety, dt: float) -> Vector | None:
         """Return the torque (n,) [N m] `dt` [s] later; None before a usable state."""

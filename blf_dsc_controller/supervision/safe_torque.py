@@ -16,7 +16,7 @@ from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.model_torque import model_torque, needed_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque, needed_torque
 from blf_dsc_controller.supervision.observed_load import ObservedLoad
 from blf_dsc_controller.supervision.swing import Swing
 
@@ -56,7 +56,7 @@ def safe_torque(
             torque -= borne * last.slow
         if safety.torque == 'hold_gravity':
             torque -= braking_matrix(settings, damping, last.q, last.gap) @ last.slow
-            torque += model_torque(settings, estimate, last.q) + load
+            torque += gravity_torque(settings, estimate, last.q) + load
             torque -= added_torque(settings.torque, last.q)
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
@@ -237,7 +237,7 @@ class SafeTorque:
         self, settings: Settings, estimate: Vector, needed: Vector, dt: float
     ) -> None:
         if not self._reached:
-            still = model_torque(settings, estimate, self.last.q)
+            still = gravity_torque(settings, estimate, self.last.q)
             still -= added_torque(settings.torque, self.last.q)
             limit = settings.torque.limit
             self._effect.update(needed - still, limit, dt)

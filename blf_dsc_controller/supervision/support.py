@@ -11,7 +11,7 @@ from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.first_torque import MATTERS, is_like
-from blf_dsc_controller.supervision.model_torque import model_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 
 Vector = NDArray[np.float64]
 
@@ -29,11 +29,11 @@ def check_support(
     if not robot.urdf or is_known or config.safety.first_torque == 'send':
         return
     q, dq, effort = measurement.reshape(3, -1)
-    gravity = model_torque(controller.settings, controller.state.estimate, q)
+    gravity = gravity_torque(controller.settings, controller.state.estimate, q)
     unlimited = np.where(np.array(config.torque.first_step) > 0.0, 0.0, np.abs(gravity))
     worst = int(np.argmax(unlimited))
     matters = unlimited[worst] > MATTERS * config.torque.limit[worst]
-    # which the check above sees
+    # of an effort like gravity, `check_first_torque` says more
     is_held = np.isfinite(effort).all() and is_like(effort, gravity)
     if matters and not is_held and not np.abs(dq).max() > AT_REST:
         unit = config.units[worst].torque
