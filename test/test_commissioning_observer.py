@@ -370,8 +370,8 @@ def test_page_says_the_pole_and_what_limits_it():
 def test_page_says_where_noise_hides_whether_a_faster_pole_is_borne():
     slow = found(SOFT)
     for pole, what in (
-        (60.0, 'noise hides whether a faster one is borne; a larger --torque may'),
-        (0.0, 'noise hides whether the slowest pole, 10 rad/s, is borne: a larger'),
+        (60.0, 'noise, friction or play hide whether a faster one is borne'),
+        (0.0, 'friction or play hide whether the slowest pole, 10 rad/s, is borne'),
     ):
         observer = ObserverPole(pole, slow.observer.margin, noise_hides=True)
         text = ' '.join(sentences(slow._replace(observer=observer)))

@@ -187,16 +187,14 @@ def _of_observer(found: Commissioned) -> Iterator[str]:
     if pole == 0.0:
         slowest = f'the slowest pole, {POLES[0]:g} rad/s'
         yield 'NO LOAD OBSERVER: ' + (
-            f'noise hides whether {slowest}, is borne: a larger --torque may show it'
+            f'noise, friction or play hide whether {slowest}, is borne'
             if noise_hides
             else f'with {slowest}, it would leave a modulus margin of {limit.value:.2g} {where}, '
             'or too little for a load'
         )
         return
     if noise_hides:
-        limited = (
-            'noise hides whether a faster one is borne; a larger --torque may show it'
-        )
+        limited = 'noise, friction or play hide whether a faster one is borne'
     elif pole == POLES[-1]:
         limited = 'a faster one gains little'
     else:
