@@ -57,7 +57,7 @@ class Commissioned(NamedTuple):
 
     joints: tuple[str, ...]
     responses: tuple[Response, ...]
-    loops: Loops
+    loops: Loops  # of these responses
     start: JointGains  # of the measurement
     choice: Choice
     findings: Findings
@@ -65,7 +65,7 @@ class Commissioned(NamedTuple):
     rotors: Floats  # (n,) kg m^2, robot.rotor_inertia: measured, unless drives hide it
     friction: Floats  # (n,) N m, to expect: of joints that creep more than measured
     unseen: Floats  # (n,) kg m^2, that friction may hide beyond the model's
-    lag: float  # s, robot.lag: likewise
+    lag: float  # s, robot.lag: measured, or that of the file where it is not seen
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured

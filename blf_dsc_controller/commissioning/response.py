@@ -65,7 +65,7 @@ class Response(NamedTuple):
     frequency: Floats  # (f,) Hz
     position: Complex  # G_y (f, n, n), rad/(N m)
     velocity: Complex  # G_v (f, n, n), rad/(s N m)
-    # what Y and V - G U have beside the motion, at each line: (f, n) rms of the sensor
+    # (f, n), rms of each sensor beside the motion: of Y - G_y U and V - G_v U
     position_noise: Floats  # rad
     velocity_noise: Floats  # rad/s
     columns: Floats  # (f, n) 1/(N m), size of the columns of U^-1
