@@ -55,8 +55,8 @@ from blf_dsc_controller.commissioning.postures import PostureByPosture
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.commissioning.response import (
     Response,
-    _noise,
     _period,
+    _Sent,
     reciprocal,
     refined,
     response_of,
@@ -570,7 +570,8 @@ def test_noise_is_looked_for_as_far_as_there_are_waves_between_the_lines():
     between[60:160] = False
     U = np.zeros((count, 2), complex)
     measured = 0.3 * np.ones((count, 2), complex)
-    noise = _noise(measured, U, np.zeros((1, 2, 2), complex), at, between)
+    none = np.zeros((1, 2, 2), complex)
+    noise = _Sent(U, at, between, none).noise(measured, none)
     np.testing.assert_allclose(noise, 0.3)
 
 
