@@ -269,12 +269,12 @@ def _gains_by_factors(
     Where the configuration gives a stiffness, it grows with the damping; else it follows
     from the damping and the inertia (n,) [kg m^2].
     """
-    follow = not config.feedback.joint_stiffness
+    follows_damping = not config.feedback.joint_stiffness
     share = largest_share(has_torque_loop=config.robot.torque_loop)
 
     def gains(factors: Floats) -> JointGains:
         scaled = start.scaled(factors)
-        found = damped_arm(scaled.damping, inertia) if follow else scaled
+        found = damped_arm(scaled.damping, inertia) if follows_damping else scaled
         return found._replace(share=share)
 
     return gains
