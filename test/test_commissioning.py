@@ -188,6 +188,21 @@ def test_travel_is_what_is_permitted(travel, slides):
     assert (made.speed <= 0.25 * np.array(CONFIG.limits.velocity)).all()
 
 
+@pytest.mark.parametrize('slides', [False, True])
+def test_a_joint_that_hardly_moves_the_tool_stays_within_its_limits(slides):
+    """The last wrist of a YAM, 50 mrad from its limit, would swing by 97 mrad otherwise."""
+    config = load_loop(share_folder() / 'config' / 'yam.yaml').controller
+    posture = np.zeros(6)
+    posture[1:3] = 1.2
+    posture[5] = config.limits.position_upper[5] - 0.05
+    (near,) = plan(config, posture[None], sliding=slides)
+    times = np.linspace(0.0, near.excitation.period, 20_000)
+    q = sampled(reference_of(near.config), times)[:, 0]
+    assert (q >= config.limits.position_lower).all()
+    # a fifth of the way is left for errors, and the last step of getting smaller is 5 % or less
+    assert 0.036 < (q[:, 5] - posture[5]).max() < 0.0401
+
+
 def test_travel_of_strong_lines_is_what_is_permitted():
     """Those of twice the rated torque travel 20 mm alone: slow tones have to shrink a lot."""
     assert excitation(CONFIG, POSTURE, 2.0, 0.0205).travel <= 0.0205
