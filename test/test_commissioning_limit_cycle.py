@@ -11,8 +11,8 @@ import pytest
 from blf_dsc_controller.cli import commission
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.limit_cycle import (
-    AT_REST,
     IN_MOTION,
+    STILL,
     LimitCycle,
     limit_cycles,
 )
@@ -27,7 +27,7 @@ def wave(amplitude, frequency):
     return amplitude * np.sin(2.0 * np.pi * frequency * T + 0.3)
 
 
-def found(error, when=AT_REST):
+def found(error, when=STILL):
     """Return the limit cycles of a run of two joints, of which the second has an error (N,)."""
     run = SimpleNamespace(
         joints=('elbow', 'wrist'),
@@ -38,7 +38,7 @@ def found(error, when=AT_REST):
     return limit_cycles(run, when)
 
 
-@pytest.mark.parametrize('when', [AT_REST, IN_MOTION])
+@pytest.mark.parametrize('when', [STILL, IN_MOTION])
 @pytest.mark.parametrize('frequency', [3.7, 6.15, 12.0])
 def test_wave_that_lasts_is_found_with_its_amplitude_and_frequency(frequency, when):
     noise = np.random.default_rng(0).normal(0.0, 1e-4, T.size)
@@ -51,7 +51,7 @@ def test_wave_that_lasts_is_found_with_its_amplitude_and_frequency(frequency, wh
     assert of_limit_cycle(cycle).startswith(said)
 
 
-@pytest.mark.parametrize('when', [AT_REST, IN_MOTION])
+@pytest.mark.parametrize('when', [STILL, IN_MOTION])
 @pytest.mark.parametrize('rows', [1, 2, 150, 1000])
 def test_run_that_is_too_short_for_slow_waves_shows_none(rows, when):
     run = SimpleNamespace(
@@ -107,7 +107,7 @@ def test_what_is_no_limit_cycle_is_not_told(error):
 
 def test_joint_at_rest_may_shake_more_slowly():
     assert found(wave(2e-3, 2.0), IN_MOTION) == []
-    (cycle,) = found(wave(2e-3, 2.0), AT_REST)
+    (cycle,) = found(wave(2e-3, 2.0), STILL)
     assert cycle.frequency == pytest.approx(2.0, abs=0.2)
 
 

@@ -137,9 +137,9 @@ def _on_robot(options: Namespace, path: Path, commissioning: Commissioning) -> i
         if options.ripple:
             given = options, path, arm, commissioning, runs, measured
             code = _still_held(lambda: _with_ripple(*given))
+            arm.hold_after()
+            return code
         arm.hold_after()
-    if options.ripple:
-        return code
     runs += [(name, measured_in(bag)) for name, bag in measured]
     found = _chosen(commissioning, runs)
     return _written(_file(options, path), found, _names(commissioning, runs))
@@ -324,9 +324,9 @@ def _prove_on_robot(
         if options.ripple:
             print_proof(config, *found)
             code = _still_held(lambda: after_proof(options, arm, config, path))
+            arm.hold_after()
+            return code
         arm.hold_after()
-    if options.ripple:
-        return code
     print_proof(config, *found)
     return 0
 

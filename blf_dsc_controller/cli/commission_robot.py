@@ -228,8 +228,8 @@ def _of_repeats(
     """Yield when a posture is measured again, and how; `slid` are the motions with swings."""
     most = _rated(commissioning.config, MOST * options.torque)
     yield (
-        f'where noise hides too much, a posture is measured once more, with {most} at most; '
-        f'the tool then travels {1e3 * options.travel:.3g} mm at most'
+        f'where noise hides too much, a posture is measured again, up to {REPEATS} times, with '
+        f'{most} at most; the tool then travels {1e3 * options.travel:.3g} mm at most'
     )
     swing = np.max([each.excitation.swing for each in slid], axis=0)
     swings = ', '.join(f'{torque:.2g}' for torque in swing)

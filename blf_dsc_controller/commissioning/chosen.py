@@ -37,7 +37,8 @@ FOLLOWED = (
 )
 """Gains of the law that are always those of the joints, whatever a file gives."""
 
-_BOUNDS = 'barrier.bound', 'barrier.initial_bound'  # not of gains, with one at the tool
+# with a bound at the tool, these follow from that one and not from gains
+_BOUNDS = 'barrier.bound', 'barrier.initial_bound'
 
 _SOFT = 'noise or friction hide the response: measure again with a larger --torque or --travel'
 
@@ -88,12 +89,12 @@ def _with_gains(
         given = np.array(values['barrier.bound'], float)
     after = gains_of(known, given)
     present = flatten(config)
-    of_tool = _BOUNDS if config.barrier.bounds_tool else ()
+    by_tool = _BOUNDS if config.barrier.bounds_tool else ()
     followed = {
         name: value
         for name, value in after.items()
         if name in FOLLOWED
-        or (name in present and present[name] == before[name] and name not in of_tool)
+        or (name in present and present[name] == before[name] and name not in by_tool)
     }
     return change(config, {**followed, **values})
 

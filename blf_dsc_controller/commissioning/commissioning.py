@@ -57,7 +57,7 @@ class Commissioned(NamedTuple):
 
     joints: tuple[str, ...]
     responses: tuple[Response, ...]
-    loops: Loops
+    loops: Loops  # of these responses
     start: JointGains  # of the measurement
     choice: Choice
     findings: Findings
@@ -65,7 +65,7 @@ class Commissioned(NamedTuple):
     rotors: Floats  # (n,) kg m^2, robot.rotor_inertia: measured, unless drives hide it
     friction: Floats  # (n,) N m, to expect: of joints that creep more than measured
     unseen: Floats  # (n,) kg m^2, that friction may hide beyond the model's
-    lag: float  # s, robot.lag: likewise
+    lag: float  # s, robot.lag: measured, or that of the file where it is not seen
     date: str  # when the gains were chosen
     aim: float  # the modulus margin that was asked for
     before: ControllerConfig  # for which the arm was measured
@@ -269,12 +269,12 @@ def _gains_by_factors(
     Where the configuration gives a stiffness, it grows with the damping; else it follows
     from the damping and the inertia (n,) [kg m^2].
     """
-    follow = not config.feedback.joint_stiffness
+    follows_damping = not config.feedback.joint_stiffness
     share = largest_share(has_torque_loop=config.robot.torque_loop)
 
     def gains(factors: Floats) -> JointGains:
         scaled = start.scaled(factors)
-        found = damped_arm(scaled.damping, inertia) if follow else scaled
+        found = damped_arm(scaled.damping, inertia) if follows_damping else scaled
         return found._replace(share=share)
 
     return gains

@@ -9,8 +9,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.commissioning.postures import PostureByPosture
@@ -19,8 +18,6 @@ from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError
-
-Floats = NDArray[np.float64]
 
 
 class Driven(PostureByPosture):

@@ -36,7 +36,9 @@ def of_commissioned(
     rotors of the simulated arm, which those that were measured have.
     """
     chosen = found.parameters()
-    of_robot = {name: value for name, value in chosen.items() if 'robot.' in name}
+    of_robot = {
+        name: value for name, value in chosen.items() if name.startswith('robot.')
+    }
     own = {name: value for name, value in chosen.items() if name not in of_robot}
     given = {'/**': of_robot, f'/**/{CONTROLLER}': own}
     return _with(sections, given, removed=(*FOLLOWED, 'truth.rotor_factor'))
@@ -65,7 +67,7 @@ def _with(
         kept |= {
             name: entry.value
             for name, entry in section.entries.items()
-            if name not in names and not name.startswith(removed or ' ')
+            if name not in names and not name.startswith(removed)
         }
     for pattern, values in given.items():
         nodes[pattern] = {**nodes.get(pattern, {}), **values}

@@ -46,6 +46,8 @@ _OUT_OF_PHASE = 0.1  # mean square of what is left of D, that is believed to be 
 _SHOWN = 10.0  # times the doubt of a response, from which it shows resonances
 _PEAK = 1.5  # over its neighbours
 _APART = 16  # frequencies to either side of a peak, that it is compared with
+# samples: a torque arrives after one and is held for another, a velocity is a difference of two
+_TORQUE_DELAY, _VELOCITY_DELAY = 1.5, 0.5
 
 
 class Resonance(NamedTuple):
@@ -88,8 +90,8 @@ class Findings(NamedTuple):
 
     def _lags(self, sample_time: float) -> tuple[float, float]:
         """Return the lags of drives and velocities [s] beyond those of sampling."""
-        drives = np.maximum(0.0, self.drive_lag - 1.5 * sample_time)
-        velocity = np.maximum(0.0, self.velocity_lag - 0.5 * sample_time)
+        drives = np.maximum(0.0, self.drive_lag - _TORQUE_DELAY * sample_time)
+        velocity = np.maximum(0.0, self.velocity_lag - _VELOCITY_DELAY * sample_time)
         return float(drives), float(velocity)
 
 

@@ -29,25 +29,25 @@ Floats = NDArray[np.float64]
 HOLD = 6.0
 """Time [s] for which an arm rests after a move, to see whether it shakes."""
 
-AT_REST, IN_MOTION = 'while the arm holds still', 'in motion'
+STILL, IN_MOTION = 'while the arm holds still', 'in motion'
 
 _LEAST = 5e-4  # rad or m, amplitude from which a limit cycle is told
-_SEEN = {AT_REST: 5.0, IN_MOTION: 10.0}  # s, the last ones of a run
-_SLOWEST = {AT_REST: 1.5, IN_MOTION: 3.0}  # Hz: below, a motion has errors of its own
-_BELOW = 3.0  # of the slowest, down to which nothing is larger
+_SEEN = {STILL: 5.0, IN_MOTION: 10.0}  # s, the last ones of a run
+_SLOWEST = {STILL: 1.5, IN_MOTION: 3.0}  # Hz: below, a motion has errors of its own
+_BELOW = 3.0  # times as slow, down to where a larger line makes a peak doubtful
 _FASTEST = 40.0  # Hz
 _LASTS = 0.5  # of the amplitude of one half of the time, that the other has at least
 _PURE = 0.5  # of the mean square in the band, that the peak has at least
 _WIDE, _LINES = 0.2, 2  # reach of a peak: of its frequency, and lines at least
 _STEADY = 0.6  # of its rms, that the median of the amplitude over the time has at least
-_OF_WINDOW = 1.5  # lines of noise that one of a window of Hann has
+_NOISE_BANDWIDTH = 1.5  # of a window of Hann, in lines
 
 
 class LimitCycle(NamedTuple):
     """A joint that shakes."""
 
     joint: str
-    when: str  # AT_REST or IN_MOTION
+    when: str  # STILL or IN_MOTION
     unit: str  # of `amplitude`
     amplitude: float
     frequency: float  # Hz
@@ -56,7 +56,7 @@ class LimitCycle(NamedTuple):
 def limit_cycles(run: Run, when: str) -> list[LimitCycle]:
     """Return the limit cycles in the last seconds of a run, in which the arm moves or not.
 
-    `when` is AT_REST or IN_MOTION.
+    `when` is STILL or IN_MOTION.
     """
     if run.error is None:
         return []
@@ -86,14 +86,14 @@ def _peak(error: Floats, T: float, slowest: float) -> tuple[float, float] | None
     k = int(band[square[band].argmax()])
     if k == band[0]:  # the end of something slower
         return None
-    reach = max(_WIDE * frequency[k], _LINES * frequency[1])
+    at = float(frequency[k])
+    reach = max(_WIDE * at, _LINES * frequency[1])
 
-    def around(frequency: Floats, square: Floats) -> float:
-        return float(square[np.abs(frequency - frequency_at) <= reach].sum())
+    def around_peak(frequency: Floats, square: Floats) -> float:
+        return float(square[np.abs(frequency - at) <= reach].sum())
 
-    frequency_at = float(frequency[k])
-    whole = around(frequency, square)
-    halves = [around(*_spectrum(each, T)) for each in np.split(error, 2)]
+    whole = around_peak(frequency, square)
+    halves = [around_peak(*_spectrum(each, T)) for each in np.split(error, 2)]
     pure = whole >= _PURE * square[band].sum()
     lasts = min(halves) >= _LASTS**2 * max(halves)
     if whole < _LEAST**2 or not (pure and lasts):
@@ -101,9 +101,9 @@ def _peak(error: Floats, T: float, slowest: float) -> tuple[float, float] | None
     slower = (frequency >= slowest / _BELOW) & (frequency < slowest)
     if square[slower].max() > square[k]:
         sums = np.convolve(square, np.ones(2 * _LINES + 1), 'same')
-        if sums[slower].max() > whole or not _is_steady(error, T, frequency_at, reach):
+        if sums[slower].max() > whole or not _is_steady(error, T, at, reach):
             return None
-    return float(np.sqrt(whole)), frequency_at
+    return float(np.sqrt(whole)), at
 
 
 def _is_steady(error: Floats, T: float, frequency: float, reach: float) -> bool:
@@ -116,10 +116,13 @@ def _is_steady(error: Floats, T: float, frequency: float, reach: float) -> bool:
 
 
 def _spectrum(error: Floats, T: float) -> tuple[Floats, Floats]:
-    """Return frequencies [Hz] and squares of amplitudes of an error (N,), without its drift."""
+    """Return frequencies [Hz] and squares of amplitudes of an error (N,), without its drift.
+
+    A wave spreads over some lines, whose sum has the square of its amplitude.
+    """
     at = np.arange(error.size)
     straight = np.polyval(np.polyfit(at, error, 1), at)
     window = np.hanning(error.size)
     amplitude = 2.0 * np.abs(np.fft.rfft(window * (error - straight))) / window.sum()
     frequency = np.asarray(np.fft.rfftfreq(error.size, T), np.float64)
-    return frequency, np.asarray(amplitude**2 / _OF_WINDOW, np.float64)
+    return frequency, np.asarray(amplitude**2 / _NOISE_BANDWIDTH, np.float64)

@@ -60,6 +60,7 @@ _SECONDS = 4.0  # of the period, for each joint
 _SLOW, _SWING = 1.0, 4.0  # Hz, of slow tones and of swings
 _LEAST_SWING = 0.05  # of slow tones, below which the lines shrink, too
 _SPEED = 0.25  # of the limit of velocity
+_RANGE = 0.8  # of the way to a limit of position; the rest is for errors
 _SEED = 0
 _NEWTON = 50  # steps at most
 _AT_REST = 1e-12  # of the amplitude
@@ -157,8 +158,8 @@ def excitation(
 
     Its torques are `share` of the rated ones (rms), by the inertias of the URDF and
     `robot.rotor_inertia`.  They are less where the tool would travel farther than `travel` [m],
-    or a joint would be faster than a quarter of its limit.  With swings (`sliding`), the motion
-    of each joint is made smaller by itself, swings and lines alike.
+    or a joint would come near its limits, or be faster than a quarter of what it may.  With swings
+    (`sliding`), the motion of each joint is made smaller by itself, swings and lines alike.
     """
     n = len(config.joints)
     period = _SECONDS * n
@@ -172,7 +173,14 @@ def excitation(
     swing = np.full(slow.shape, SLIDING / rates / SLOW_TONES)
     held = SLOW_TONES if sliding else 0
     shape = _Shape(np.column_stack((bins, slow)), period, held)
-    room = _Room(chain, posture, travel, _SPEED * np.array(config.limits.velocity))
+    room = _Room(
+        chain=chain,
+        posture=posture,
+        most=travel,
+        speed=_SPEED * np.array(config.limits.velocity),
+        below=_RANGE * (posture - np.array(config.limits.position_lower)),
+        above=_RANGE * (np.array(config.limits.position_upper) - posture),
+    )
     shrink = _shrink_each if sliding else _shrink_all
     amplitude, moves = _shrunk(lines, swing, shape, room, shrink)
     accelerations = amplitude * shape.rates**2
@@ -248,7 +256,9 @@ class _Room(NamedTuple):
     chain: Chain
     posture: Floats  # (n,) rad
     most: float  # m, travel of the tool
-    limit: Floats  # (n,) rad/s
+    speed: Floats  # (n,) rad/s
+    below: Floats  # (n,) rad, downwards
+    above: Floats  # (n,) rad, upwards
 
     def travel(self, moves: _Moves) -> float:
         """Return how far the tool moves from its middle [m]."""
@@ -258,7 +268,11 @@ class _Room(NamedTuple):
 
     def excess(self, moves: _Moves) -> Floats:
         """Return for each joint (n,) how many times more it moves than it may."""
-        return np.maximum(moves.speed / self.limit, self.travel(moves) / self.most)
+        down, up = -moves.moved.min(axis=0), moves.moved.max(axis=0)
+        of_range = np.maximum(down / self.below, up / self.above)
+        of_speed = moves.speed / self.speed
+        of_travel = self.travel(moves) / self.most
+        return np.asarray(np.maximum(np.maximum(of_speed, of_range), of_travel))
 
 
 class _Shape:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
 from blf_dsc_controller.commissioning.limit_cycle import (
-    AT_REST,
     IN_MOTION,
+    STILL,
     LimitCycle,
     limit_cycles,
 )
@@ -104,12 +104,12 @@ def start_of(config: ControllerConfig, here: Floats) -> Floats:
 def cycles_of(run: Run, config: ControllerConfig) -> list[LimitCycle]:
     """Return the limit cycles of a run along the reference of its configuration."""
     rests = config.reference.type == 'hold'
-    return limit_cycles(run, AT_REST if rests else IN_MOTION)
+    return limit_cycles(run, STILL if rests else IN_MOTION)
 
 
 def cycles_in(still: Path, moved: Path, config: ControllerConfig) -> list[LimitCycle]:
     """Return the limit cycles in bags of an arm that rests, and follows its reference."""
-    at_rest = limit_cycles(read_run(still), AT_REST)
+    at_rest = limit_cycles(read_run(still), STILL)
     return at_rest + cycles_of(read_run(moved), config)
 
 

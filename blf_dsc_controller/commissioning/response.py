@@ -65,7 +65,7 @@ class Response(NamedTuple):
     frequency: Floats  # (f,) Hz
     position: Complex  # G_y (f, n, n), rad/(N m)
     velocity: Complex  # G_v (f, n, n), rad/(s N m)
-    # what Y and V - G U have beside the motion, at each line: (f, n) rms of the sensor
+    # (f, n), rms of each sensor beside the motion: of Y - G_y U and V - G_v U
     position_noise: Floats  # rad
     velocity_noise: Floats  # rad/s
     columns: Floats  # (f, n) 1/(N m), size of the columns of U^-1
@@ -100,36 +100,29 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
     U, Y, V = (
         _spectrum(each) for each in (run.torque[rows], position, run.velocity[rows])
     )
-    at = lines.bins.T  # (f, n): the lines of each experiment
-    U_at, Y_at, V_at = (_at_lines(each, at) for each in (U, Y, V))
+    at = lines.bins.T
+    Y_at = _at_lines(Y, at)
     if (np.linalg.matrix_rank(Y_at) < Y_at.shape[-1]).any():
         raise HiddenError(
             'the positions do not show the motion: friction holds the arm, or it moves by less '
             'than a step of its encoders. Measure with a larger --torque and --travel'
         )
-    inverse = np.linalg.inv(U_at)
-    between = _between(lines, len(U))
-    noises = [
-        _noise(measured, U, response, at, between)
-        for measured, response in ((Y, Y_at @ inverse), (V, V_at @ inverse))
-    ]
+    inverse: Complex = np.asarray(np.linalg.inv(_at_lines(U, at)), complex)
+    sent = _Sent(U, at, _between(lines, len(U)), inverse)
+    G_y, G_v = sent.response(Y), sent.response(V)
     sensed = None
     if run.effort is not None and np.isfinite(run.effort[rows]).all():
         E = _spectrum(run.effort[rows])
-        G_e = np.asarray(_at_lines(E, at) @ inverse)
-        both = np.concatenate((G_e, V_at @ inverse), axis=1)
-        noise = [
-            rest.T @ rest.conj() / len(rest)
-            for rest in _rests(np.hstack((E, V)), U, both, at, between)
-        ]
-        sensed = Sensed(G_e, np.array(noise))
+        G_e = sent.response(E)
+        both = np.concatenate((G_e, G_v), axis=1)
+        sensed = Sensed(G_e, sent.covariance(np.hstack((E, V)), both))
     speed, friction = _rubbing(U, Y, lines)
     at_lines = Response(
         frequency=lines.frequencies,
-        position=np.asarray(Y_at @ inverse),
-        velocity=np.asarray(V_at @ inverse),
-        position_noise=noises[0],
-        velocity_noise=noises[1],
+        position=G_y,
+        velocity=G_v,
+        position_noise=sent.noise(Y, G_y),
+        velocity_noise=sent.noise(V, G_v),
         columns=np.asarray(np.linalg.norm(inverse, axis=1)),
         shared=np.zeros(Y_at.shape, bool),
         posture=np.asarray(position.mean(axis=0)),
@@ -141,8 +134,47 @@ def response_of(run: Run, lines: Lines, sample_time: float) -> Response:
     return refined(reciprocal(at_lines))
 
 
+class _Sent(NamedTuple):
+    """The torques that were sent, and what they say of what was measured meanwhile."""
+
+    U: Complex  # (N, n), spectrum
+    at: NDArray[np.int64]  # (f, n), the lines of each motion in it
+    between: NDArray[np.bool_]  # (N,), waves that no motion has
+    inverse: Complex  # (f, n, n), U^-1 at the lines
+
+    def response(self, measured: Complex) -> Complex:
+        """Return the response G (f, m, n) that a spectrum (N, m) shows at the lines."""
+        return np.asarray(_at_lines(measured, self.at) @ self.inverse)
+
+    def noise(self, measured: Complex, response: Complex) -> Floats:
+        """Return the rms (f, m) of what is measured between the lines beside G U."""
+        rests = self._rests(measured, response)
+        return np.array([np.sqrt((np.abs(rest) ** 2).mean(axis=0)) for rest in rests])
+
+    def covariance(self, measured: Complex, response: Complex) -> Complex:
+        """Return the covariance (f, m, m) of the same."""
+        rests = self._rests(measured, response)
+        return np.array([rest.T @ rest.conj() / len(rest) for rest in rests])
+
+    def _rests(self, measured: Complex, response: Complex) -> Iterator[Complex]:
+        """Yield for each line what is measured between the lines around it beside G U (r, m).
+
+        That is as far around as it takes to have two such waves for each joint.
+        """
+        U, n = self.U, self.at.shape[1]
+        for k, line in enumerate(self.at[:, 0]):
+            reach = _BETWEEN * n
+            while True:
+                low, high = max(1, line - reach), min(len(U), line + n + reach)
+                rows = low + np.flatnonzero(self.between[low:high])
+                if rows.size >= 2 * n or reach > len(U):
+                    break
+                reach *= 2
+            yield measured[rows] - U[rows] @ response[k].T
+
+
 def _at_lines(spectrum: Complex, at: NDArray[np.int64]) -> Complex:
-    """Return waves (f, n, n) of a spectrum (N, n): of each sensor by the line of each motion."""
+    """Return waves (f, m, n) of a spectrum (N, m): of each sensor by the line of each motion."""
     return np.asarray(np.swapaxes(spectrum[at], 1, 2))
 
 
@@ -190,7 +222,7 @@ def refined(response: Response) -> Response:
 
     square = (2j * np.pi * f)[:, None, None] ** 2
     fine_square = (2j * np.pi * fine)[:, None, None] ** 2
-    inverse = np.linalg.inv(response.position)
+    inverse: Complex = np.asarray(np.linalg.inv(response.position), complex)
     inverse_between = between(inverse / square) * fine_square
     low = np.minimum(np.arange(fine.size) // _FINER, f.size - 2)
     position = np.linalg.inv(inverse_between)
@@ -216,7 +248,7 @@ def refined(response: Response) -> Response:
 
 
 def _is_seen(
-    response: Response, inverse: NDArray[Any], between: NDArray[Any], low: NDArray[Any]
+    response: Response, inverse: Complex, between: Complex, low: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
     """Whether G_y is of the arm where its inverse is interpolated (g,): `between`.
 
@@ -325,35 +357,3 @@ def _between(lines: Lines, count: int) -> NDArray[np.bool_]:
     free[lines.slow.ravel()] = False
     free[0] = False
     return free
-
-
-def _noise(
-    measured: Complex,
-    U: Complex,
-    response: Complex,
-    at: NDArray[np.int64],
-    between: NDArray[np.bool_],
-) -> Floats:
-    """Return the rms (f, n) of what is measured between the lines beside G U."""
-    rests = _rests(measured, U, response, at, between)
-    return np.array([np.sqrt((np.abs(rest) ** 2).mean(axis=0)) for rest in rests])
-
-
-def _rests(
-    measured: Complex,
-    U: Complex,
-    response: Complex,
-    at: NDArray[np.int64],
-    between: NDArray[np.bool_],
-) -> Iterator[Complex]:
-    """Yield for each line what is measured between the lines around it beside G U (r, m)."""
-    n = at.shape[1]
-    for k, line in enumerate(at[:, 0]):
-        reach = _BETWEEN * n
-        while True:
-            low, high = max(1, line - reach), min(len(U), line + n + reach)
-            rows = low + np.flatnonzero(between[low:high])
-            if rows.size >= 2 * n or reach > len(U):
-                break
-            reach *= 2
-        yield measured[rows] - U[rows] @ response[k].T

@@ -72,9 +72,11 @@ def proof(loop: LoopConfig) -> Proof:
     duration = min(plant.duration or _PROOF, _PROOF)
     run = simulate(loop.controller, change(plant, {'duration': duration})).run()
     stop = next((each.text for each in run.stops), '')
-    error = np.zeros(1) if run.error is None else run.error
     cycles = [] if stop else cycles_of(run, loop.controller)
-    return Proof(duration, np.nanmax(np.abs(error), axis=0), stop, cycles)
+    largest = np.zeros(len(run.joints))
+    if run.error is not None:
+        largest = np.nanmax(np.abs(run.error), axis=0)
+    return Proof(duration, largest, stop, cycles)
 
 
 def slow_run(motion: SlowMotion, plant: PlantConfig) -> Measured:

@@ -66,12 +66,10 @@ def undisturbed_loop() -> Iterator[None]:
 
 
 def _schedule(priority: int) -> None:
-    """Schedule all threads alike.
+    """Schedule all threads of the process alike.
 
-    States and torques also pass through the middleware's threads.
-
-    A single thread left behind, even at the next lower priority, delays the others
-    [measured].
+    States and torques also pass through those of the middleware, and a single thread that is
+    left behind delays the others, even at the next lower priority.
     """
     for thread in _THREADS.iterdir():
         with suppress(ProcessLookupError):  # it has ended in the meantime

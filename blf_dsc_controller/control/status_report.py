@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,9 +24,6 @@ WARN = b'\x01'
 ERROR = b'\x02'
 STALE = b'\x03'
 
-Part = tuple[str, bytes, str, Mapping[str, Any]]
-"""Status of a part: its name, level, message and values."""
-
 _PHASES = {
     Phase.INACTIVE: (STALE, 'not in command'),
     Phase.STARTING: (WARN, 'waiting for a joint state to start from'),
@@ -36,12 +33,21 @@ _PHASES = {
 }
 
 
+class Part(NamedTuple):
+    """Status of a part of a controller."""
+
+    name: str
+    level: bytes
+    message: str
+    values: Mapping[str, Any]
+
+
 class StatusReport:
     """The parts of a controller's status.
 
     Attributes:
         rejected: disturbance columns that are not estimated, and why.
-        trajectories: accepted and rejected trajectories.
+        trajectories: counts accepted and rejected trajectories; None: nobody sends any.
     """
 
     def __init__(self, log: Log) -> None:
@@ -83,18 +89,18 @@ class StatusReport:
             values['safe torque'] = guard.config.safety.torque
         if supervisor.text:
             message += f': {supervisor.text}'
-        return 'state', level, message, values
+        return Part('state', level, message, values)
 
     def _loop(self, guard: Guard, others: int, missing: str) -> Part:
         values = self._loop_values(guard)
         if others:
-            return 'loop', ERROR, 'another node commands torques, too', values
+            return Part('loop', ERROR, 'another node commands torques, too', values)
         if message := missing or _unusual(guard):
-            return 'loop', WARN, message, values
+            return Part('loop', WARN, message, values)
         if chatter := chatter_of(guard.controller, guard.config):
             self._warn_once(chatter)
-            return 'loop', WARN, chatter, values
-        return 'loop', OK, _PHASES[guard.supervisor.phase][1], values
+            return Part('loop', WARN, chatter, values)
+        return Part('loop', OK, _PHASES[guard.supervisor.phase][1], values)
 
     def _loop_values(self, guard: Guard) -> dict[str, Any]:
         """Return counts of states and samples, cuts of the torque, and oscillations."""
@@ -136,13 +142,9 @@ class StatusReport:
             f'{REJECTED}{column}': reason for column, reason in self.rejected.items()
         }
         if self.rejected:
-            return (
-                'learning',
-                WARN,
-                f'not estimated: {", ".join(self.rejected)}',
-                values,
-            )
-        return 'learning', OK, learning, values
+            message = f'not estimated: {", ".join(self.rejected)}'
+            return Part('learning', WARN, message, values)
+        return Part('learning', OK, learning, values)
 
 
 def _unusual(guard: Guard) -> str:
@@ -178,7 +180,7 @@ def _at_tool(guard: Guard) -> Mapping[str, str]:
 def _load(guard: Guard) -> Part:
     load = guard.controller.sample.load.tolist()
     values = {name: f'{value:.6g}' for name, value in zip(LOAD, load, strict=True)}
-    return 'load', OK, f'held: {load_text(load)}', values
+    return Part('load', OK, f'held: {load_text(load)}', values)
 
 
 def _contact(guard: Guard) -> Part:
@@ -199,10 +201,10 @@ def _contact(guard: Guard) -> Part:
             'model error and noise': f'{last.interval:.3g} {unit}',
         }
     if not guard.supervisor.running:
-        return 'contact', OK, 'not monitored: the law is not in command', values
+        return Part('contact', OK, 'not monitored: the law is not in command', values)
     if last is not None and is_touched(guard.controller.state.contact):
-        return 'contact', WARN, last.text, values
-    return 'contact', OK, 'nothing touches the arm', values
+        return Part('contact', WARN, last.text, values)
+    return Part('contact', OK, 'nothing touches the arm', values)
 
 
 def _by_joint(guard: Guard, counts: np.ndarray) -> str:

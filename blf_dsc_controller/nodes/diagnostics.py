@@ -26,7 +26,15 @@ from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.supervision.guard import Guard
 
-__all__ = ['ERROR', 'OK', 'STALE', 'WARN', 'ControllerStatus', 'DiagnosticsPublisher']
+__all__ = [
+    'ERROR',
+    'OK',
+    'STALE',
+    'WARN',
+    'ControllerStatus',
+    'DiagnosticsPublisher',
+    'Part',
+]
 
 
 class DiagnosticsPublisher:
@@ -42,11 +50,11 @@ class DiagnosticsPublisher:
         """Publish the status of each part on /diagnostics; return that of the first."""
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
-        for part, level, message, values in parts:
+        for name, level, message, values in parts:
             status = DiagnosticStatus(
                 level=level, message=message, hardware_id=self._hardware
             )
-            status.name = f'{self._name}/{part}'
+            status.name = f'{self._name}/{name}'
             status.values = [
                 KeyValue(key=key, value=f'{value}') for key, value in values.items()
             ]

@@ -43,6 +43,7 @@ from blf_dsc_controller.nodes.diagnostics import (
     STALE,
     WARN,
     DiagnosticsPublisher,
+    Part,
 )
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
@@ -387,7 +388,7 @@ class PlantNode(LoopNode[PlantConfig]):
         elif rejected > self._reported_rejected:
             level, message = WARN, self.input.problem
         self._reported_rejected = rejected
-        self._diagnostics.publish(('torque', level, message, values))
+        self._diagnostics.publish(Part('torque', level, message, values))
 
 
 main = partial(process.run, PlantNode)

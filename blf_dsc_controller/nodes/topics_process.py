@@ -35,7 +35,7 @@ from blf_dsc_controller.messages.topic_link import (
     TOPICS,
 )
 from blf_dsc_controller.nodes import process
-from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher
+from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher, Part
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import connect
 
@@ -98,7 +98,7 @@ class LoopTopics:
 
     def _report(self, status: dict[str, Any]) -> None:
         parts = (
-            (name, bytes([level]), message, values)
+            Part(name, bytes([level]), message, values)
             for name, level, message, values in status['parts']
         )
         state: DiagnosticStatus = self._diagnostics.publish(*parts)

@@ -37,7 +37,13 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.messages.topics import READY, Quality
-from blf_dsc_controller.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher
+from blf_dsc_controller.nodes.diagnostics import (
+    ERROR,
+    OK,
+    WARN,
+    DiagnosticsPublisher,
+    Part,
+)
 from blf_dsc_controller.nodes.endpoints import (
     PollingTimer,
     RawMessage,
@@ -319,7 +325,7 @@ class WatchdogNode(PlainNode):
         status = self.status()
         takeovers = 0 if self.watchdog is None else self.watchdog.takeovers
         values = {'takeovers': takeovers, READY: status.is_ready}
-        part = ('torque', status.level, status.text, values)
+        part = Part('torque', status.level, status.text, values)
         message = self._diagnostics.publish(part)
         if status != self._reported:
             self._latched.publish(message)

@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -34,8 +33,6 @@ from blf_dsc_controller.supervision.expected_errors import (
 from blf_dsc_controller.supervision.gain_limits import exceeded_limits
 from blf_dsc_controller.supervision.gear_warnings import gear_warnings
 from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
-
-Floats = NDArray[np.float64]
 
 _FIRST_ERROR = 1.5  # recommended bound over the first error
 _PERIODS = 0.02  # periods by which a window may differ from a whole number

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 _MARGIN = 1.25  # recommended torque limit over what the reference needs
 
 
-class Finding(NamedTuple):
+class Limit(NamedTuple):
     """A limit of the gains: what it is on, how much is used, what follows above 1."""
 
     subject: str
@@ -30,7 +30,7 @@ class Finding(NamedTuple):
     text: str  # goes on after the subject
 
 
-def exceeded_limits(config: ControllerConfig, load: ReferenceLoad) -> list[Finding]:
+def exceeded_limits(config: ControllerConfig, load: ReferenceLoad) -> list[Limit]:
     """Return the limits that gains and torque limits exceed with this load of the reference."""
     # a limit of next to nothing is exceeded infinitely
     with np.errstate(over='ignore'):
@@ -49,9 +49,7 @@ def worsened(
     ]
 
 
-def _limits_of_gains(
-    config: ControllerConfig, load: ReferenceLoad
-) -> Iterator[Finding]:
+def _limits_of_gains(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Limit]:
     """Yield what the gains and torque limits use of their limits; above 1 is too much."""
     settings = settings_in_loop(config)
     yield from _limits_of_torque(config, load)
@@ -61,13 +59,11 @@ def _limits_of_gains(
         yield from _limits_of_slope(config, settings, load)
 
 
-def _limits_of_torque(
-    config: ControllerConfig, load: ReferenceLoad
-) -> Iterator[Finding]:
+def _limits_of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Limit]:
     for joint, (_, unit, _), need, limit in zip(
         config.joints, config.units, load.torque, config.torque.limit, strict=True
     ):
-        yield Finding(
+        yield Limit(
             f'torque.limit: {joint}',
             _MARGIN * need / limit,
             f'has {limit:g} {unit}, but with learning.initial_estimate the reference alone needs '
@@ -78,10 +74,10 @@ def _limits_of_torque(
 
 def _limits_of_feedback(
     config: ControllerConfig, settings: Settings, load: ReferenceLoad
-) -> Iterator[Finding]:
+) -> Iterator[Limit]:
     T = config.sample_time
     rate = load.rate(settings)
-    yield Finding(
+    yield Limit(
         'feedback.gain: K_p over the inertia',
         rate * T,
         f'is {rate:.3g} 1/s with learning.initial_estimate, {rate * T:.2g} times the inverse of '
@@ -89,7 +85,7 @@ def _limits_of_feedback(
         'the limits: lower feedback.gain or sample_time',
     )
     absorbed = float(np.max(settings.disturbance.gain * T / _damping(settings, load)))
-    yield Finding(
+    yield Limit(
         'disturbance.gain: in each sample the disturbance estimate absorbs',
         2.0 * absorbed,
         f'{absorbed:.2g} of the velocity feedback. Above a half it oscillates against '
@@ -102,11 +98,9 @@ def _damping(settings: Settings, load: ReferenceLoad) -> Floats:
     return np.asarray(np.maximum(load.damping(settings), 1e-12))
 
 
-def _limits_of_surface(
-    config: ControllerConfig, settings: Settings
-) -> Iterator[Finding]:
+def _limits_of_surface(config: ControllerConfig, settings: Settings) -> Iterator[Limit]:
     T, filtering = config.sample_time, config.surface.time_constant
-    yield Finding(
+    yield Limit(
         'surface.time_constant:',
         T / filtering,
         f'{filtering:g} s is less than the sample time, {T:g} s: alpha2 follows the measurement '
@@ -114,7 +108,7 @@ def _limits_of_surface(
     )
     if settings.surface.known_rate == 0:
         rate = float(np.max(settings.surface.gain / 2.0 + settings.surface.mu))
-        yield Finding(
+        yield Limit(
             'surface.gain, surface.mu: K/2 + mu',
             filtering * rate,
             f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
@@ -124,11 +118,11 @@ def _limits_of_surface(
 
 def _limits_of_slope(
     config: ControllerConfig, settings: Settings, load: ReferenceLoad
-) -> Iterator[Finding]:
+) -> Iterator[Limit]:
     T, damping = config.sample_time, _damping(settings, load)
     ratios = settings.barrier.slope_limit * T / damping
     for joint, ratio in zip(config.joints, ratios, strict=True):
-        yield Finding(
+        yield Limit(
             f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
             ratio / 2.0,
             f'{ratio:.2g} times its error in a sample. Above 2 the error grows: give less than '

@@ -231,7 +231,7 @@ class InCommand:
         T = self.config.sample_time
         self.safe_torque.last.take_usable(stamp, measurement, limit, T)
         self._observe_speed()
-        # the states that are missing in a gap: a ramp that counted states would last
+        # a gap counts as the states that are missing in it, else the ramp would last longer
         return self.safe(T * max(1, round(self.readings.gap / T)))
 
     def safe_without_state(self, dt: float) -> Vector | None:

@@ -18,7 +18,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.law.sensor import FILTER as SLOW
+from blf_dsc_controller.law.sensor import FILTER
 from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.state_check import LONG_GAP
 
@@ -83,7 +83,7 @@ class LastState:
             differenced = np.clip(
                 (q - self.q) / elapsed, -velocity_limit, velocity_limit
             )
-            self.slow += min(1.0, elapsed / SLOW) * (differenced - self.slow)
+            self.slow += min(1.0, elapsed / FILTER) * (differenced - self.slow)
         usable = np.where(np.abs(dq) <= velocity_limit, dq, differenced)
         if is_late:
             self.slow[:] = usable
