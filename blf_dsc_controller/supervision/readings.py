@@ -115,4 +115,4 @@ class Readings:
 
         `limit` [rad/s] is the largest.
         """
-        return np.asarray(np.clip(self.velocity, -limit, limit))
+        return np.minimum(np.maximum(self.velocity, -limit), limit)  # faster than clip

@@ -9,7 +9,7 @@ counted until the next start all the same, since the safe torque needs its motio
 
 from __future__ import annotations
 
-from math import nan, pi, tau
+from math import hypot, nan, pi, tau
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ class Wraps:
         self._is_free = turns_freely(config)
         self._has_range = np.array([kind == 'revolute' for kind in kinds])
         self._offset = np.zeros(n)  # rad, whole turns
+        self._is_off = False  # whether any is not zero
         self._last = np.full(n, nan)  # rad, counted on
         self._counted = np.zeros(3 * n)
 
@@ -46,8 +47,23 @@ class Wraps:
         the state before, `fastest` [rad/s] the largest speed of a joint.
         """
         n = self._last.size
-        q = measurement[:n] + self._offset
+        q = measurement[:n] + self._offset if self._is_off else measurement[:n]
         step = q - self._last
+        fault = None
+        if hypot(*step.tolist()) <= pi:  # as a rule; not if a position is not finite
+            self._last[:] = q
+        else:
+            q, fault = self._counted_on(measurement, step, gap, fastest)
+        if not self._is_off:
+            return measurement, fault
+        self._counted[:] = measurement
+        self._counted[:n] = q
+        return self._counted, fault
+
+    def _counted_on(
+        self, measurement: Vector, step: Vector, gap: float, fastest: float
+    ) -> tuple[Vector, Fault | None]:
+        """Count turns in a large or not finite `step` (n,) [rad]; return q and the fault."""
         fault = None
         if (np.abs(step) > pi).any():
             turns = -np.rint(np.nan_to_num(step, posinf=0.0, neginf=0.0) / tau)
@@ -58,13 +74,10 @@ class Wraps:
             if at_fault.any():
                 fault = self._fault(int(np.argmax(at_fault)), measurement)
             self._offset += tau * turns * (self._is_free | at_fault)
-            q = measurement[:n] + self._offset
-        self._last = np.where(np.isfinite(q), q, self._last)
-        if not self._offset.any():
-            return measurement, fault
-        self._counted[:] = measurement
-        self._counted[:n] = q
-        return self._counted, fault
+            self._is_off = bool(self._offset.any())
+        q = measurement[: step.size] + self._offset
+        np.copyto(self._last, q, where=np.isfinite(q))
+        return q, fault
 
     def follow(self, measurement: Vector) -> None:
         """Take a measurement that has been counted on."""
@@ -74,6 +87,7 @@ class Wraps:
         """Take positions of joints that have a range as measured; return whether they change."""
         wrong = self._has_range & (self._offset != 0.0)
         self._offset[wrong] = 0.0
+        self._is_off = bool(self._offset.any())
         self._last[wrong] = nan
         return bool(wrong.any())
 
