@@ -229,11 +229,16 @@ def _check_runs(
             'there is no run of a motion in a posture: give the bags of these, too'
         )
     for run, _ in runs:
-        if run.joints != config.joints:
-            raise BlfDscError(
-                f'the run is of the joints {", ".join(run.joints)}, the configuration of '
-                f'{", ".join(config.joints)}'
-            )
+        check_joints('the run', run.joints, config)
+
+
+def check_joints(name: str, joints: Sequence[str], config: ControllerConfig) -> None:
+    """Raise BlfDscError if a run of this name is of other joints than the configuration."""
+    if tuple(joints) != config.joints:
+        raise BlfDscError(
+            f'{name} is of the joints {", ".join(joints)}, the configuration of '
+            f'{", ".join(config.joints)}: give runs and the configuration of the same arm'
+        )
 
 
 def _assumed_inertia(arm: Design, responses: Sequence[Response]) -> Floats:

@@ -23,7 +23,11 @@ from blf_dsc_controller.commissioning.better_known import (
     is_known_by_urdf_only,
 )
 from blf_dsc_controller.commissioning.choice import LAGS
-from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.commissioning import (
+    Commissioned,
+    check_joints,
+    commissioned,
+)
 from blf_dsc_controller.commissioning.motion import SLOW_TONES
 from blf_dsc_controller.commissioning.planned import (
     TORQUE,
@@ -263,7 +267,8 @@ class Commissioning:
                 before its time, or lacks joint states.
         """
         measured = [
-            each if isinstance(each, tuple) else measured_in(each) for each in runs
+            each if isinstance(each, tuple) else measured_in(each, self.config)
+            for each in runs
         ]
         slow = [each for each in measured if self.is_slow_motion(each)]
         shaken = [each for each in measured if not self.is_slow_motion(each)]
@@ -276,10 +281,14 @@ class Commissioning:
         return is_slow_motion(measured[1], self.config)
 
 
-def measured_in(bag: str | Path) -> Measured:
+def measured_in(bag: str | Path, config: ControllerConfig | None = None) -> Measured:
     """Return the run of a bag, with its parameters.
 
-    Raises BagError if it cannot be read, or has none.
+    Raises BagError if it cannot be read, or has none; BlfDscError if it is of other joints than
+    a configuration.
     """
     content = read_content(Path(bag))
-    return recorded_run(content, np.asarray), content.controller_config()
+    recorded = content.controller_config()
+    if config is not None:
+        check_joints(str(bag), recorded.joints, config)
+    return recorded_run(content, np.asarray), recorded
