@@ -295,6 +295,30 @@ def test_restart_on_a_drive_that_holds_a_torque():
     assert guard.update(10**9, held * np.repeat([1.0, 0.0], [14, 7])) is None
 
 
+@pytest.mark.parametrize('effort', ['unknown', 'commanded', 'whole', 'current'])
+def test_command_after_a_gap_is_what_efforts_show_if_they_are_torques(effort):
+    """Amperes are none; what drives add to a command is no part of it."""
+    given = HELD | {'robot.effort': effort}
+    guard = Guard(change(loop_of('panda_rigid').controller, given))
+    held, settings = guard.held, guard.controller.settings
+    q = np.array(loop_of('panda_rigid').plant.initial.position)
+    acting = np.arange(1.0, 8.0)
+    added = added_torque(settings.torque, q) if effort == 'whole' else np.zeros(7)
+    assert held.command() is None
+    held.after_gap = np.concatenate((q, np.zeros(7), acting + added))
+    if effort in ('unknown', 'current'):
+        assert held.command() is None
+        return
+    np.testing.assert_allclose(held.command(), acting, atol=1e-12)
+    held.after_gap[14:] = 1e3 * np.sign(acting - 4.5)
+    limit = settings.torque.limit
+    np.testing.assert_array_equal(held.command(), limit * np.sign(acting - 4.5))
+    for missing in (3, 17):  # of the positions, and of the efforts
+        held.after_gap = np.concatenate((q, np.zeros(7), acting))
+        held.after_gap[missing] = np.nan
+        assert held.command() is None
+
+
 @pytest.mark.parametrize('effort', ['whole', 'commanded', 'current'])
 @pytest.mark.parametrize('drive', ['none', 'gravity'])
 def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort):
