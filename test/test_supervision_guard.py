@@ -833,6 +833,16 @@ def test_arm_that_is_not_seen_is_not_known_to_rest():
     assert not ramp.is_settled
 
 
+def test_joint_that_passes_for_a_light_one_keeps_half_of_its_damping():
+    """As an elastic one does that oscillates; a heavier one gets more."""
+    ramp = SafeTorque(2)
+    ramp.scale[:] = 0.1, 2.0
+    ramp.last.take(1, np.zeros(6), np.array([1.0, -1.0]))
+    safety = Safety(torque='damping', damping=(2.0, 1.0))
+    torque = ramp.advance(safety, settings(), P, 0.0)
+    np.testing.assert_allclose(torque, [-0.5 * 2.0, 2.0 * 1.0])
+
+
 @pytest.mark.parametrize('torque', ['zero', 'damping', 'hold_gravity'])
 def test_only_a_torque_that_holds_carries_a_load(torque):
     rig = Rig({'safety.torque': torque})
