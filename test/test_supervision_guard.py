@@ -833,6 +833,19 @@ def test_arm_that_is_not_seen_is_not_known_to_rest():
     assert not ramp.is_settled
 
 
+def test_arm_is_not_settled_before_its_ramp_is_over_nor_while_it_moves():
+    ramp = SafeTorque(2)
+    ramp.last.take(1, np.zeros(6), np.zeros(2))
+    ramp.begin_ramp(0.5, np.zeros(2))
+    settled = []
+    for _ in range(5):
+        settled.append(ramp.is_settled)
+        ramp.advance(Safety(torque='damping'), settings(), P, 0.125)
+    assert settled == [False] * 4 + [True]
+    ramp.last.take(2, np.array([0.0, 0.0, 0.0, -0.1, 0.0, 0.0]), np.zeros(2))
+    assert not ramp.is_settled
+
+
 def test_joint_that_passes_for_a_light_one_keeps_half_of_its_damping():
     """As an elastic one does that oscillates; a heavier one gets more."""
     ramp = SafeTorque(2)
