@@ -965,3 +965,28 @@ def test_stop_that_winds_the_estimates_up_holds_with_those_from_before(reason, g
     winds_up = reason in AFTER_WINDING_UP and not gap
     expected = 'from before' if winds_up else 'of the torque that holds it'
     assert SafeStop._load_at_stop(stop, reason) == expected
+
+
+@pytest.mark.parametrize('reason', list(Reason))
+@pytest.mark.parametrize('oscillates', [False, True])
+def test_load_is_observed_in_a_stop_unless_its_cause_may_be_commands_that_do_not_arrive(
+    reason, oscillates
+):
+    """Of an arm that oscillates they do: else it would not."""
+    guard = Guard(ControllerConfig())
+    safety = guard.config.safety
+    guard.safe_stop.begin(safety, reason, 0.0, was_running=False, oscillates=oscillates)
+    unreached = {Reason.OUTSIDE_BOUND, Reason.SATURATED, Reason.NO_EFFECT}
+    assert guard.safe_torque.carries == (reason not in unreached or oscillates)
+
+
+@pytest.mark.parametrize('torque', ['zero', 'damping', 'hold_gravity'])
+def test_arm_that_nothing_holds_may_speed_up(torque):
+    """Else the load that was known before holds it again."""
+    guard = Guard(ControllerConfig())
+    safety = Safety(torque=torque)
+    stop = guard.safe_stop
+    stop.begin(safety, Reason.FAILED, 0.0, was_running=False, oscillates=False)
+    found = [stop.observe_speed(safety, 1.0, 0.1) for _ in range(4)]
+    assert any(found) == (torque != 'zero')
+    assert guard.safe_torque.carries == (torque == 'zero')
