@@ -267,6 +267,11 @@ def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(
         if guard.starting.error is not None:
             assert 'what holds the arm?' in str(guard.starting.error)
             assert guard.supervisor.reason == 'start rejected'
+            guard = Guard(config)
+            guard.journal.commands = 1  # its own torque holds the arm
+            guard.starting.activate()
+            guard.starting.check_support(measurement)
+            assert guard.starting.error is None
         for moving in (measurement + 0.1, measurement - 0.1):
             assert check_support(guard.controller, config, moving) is None
         asked = change(config, {'safety.first_torque': 'send'})

@@ -990,3 +990,15 @@ def test_arm_that_nothing_holds_may_speed_up(torque):
     found = [stop.observe_speed(safety, 1.0, 0.1) for _ in range(4)]
     assert any(found) == (torque != 'zero')
     assert guard.safe_torque.carries == (torque == 'zero')
+
+
+@pytest.mark.parametrize('is_withdrawn', [False, True])
+def test_reset_carries_nothing_on_once_another_program_has_taken_command(is_withdrawn):
+    rig = Rig({'safety.torque': 'hold_gravity'})
+    rig.step(200)
+    rig.guard.fail('why')
+    rig.step(2)
+    if is_withdrawn:
+        rig.guard.withdraw('the robot stopped by itself')
+    rig.guard.starting.reset()
+    assert (rig.guard.starting._takeover.carried is None) == is_withdrawn
