@@ -248,6 +248,7 @@ def test_torque_of_another_node_counts_and_not_the_last_own_one():
     arm.guard.starting.activate()
     arm.guard.starting.take_over_from(acting)
     (torque,), _ = arm.run(arm.config.sample_time)
+    assert arm.guard.starting._takeover.acting is None  # it holds the arm no more
     step = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
     assert (np.abs(torque - acting) <= step + 1e-9).all()
 
