@@ -584,6 +584,57 @@ def tree(*chains):
 
 
 @pytest.mark.parametrize(
+    ('joints', 'message'),
+    [
+        (  # a parallelogram
+            ('base one', 'one two', 'base three', 'three two'),
+            "a loop of 'j1' ('base' to 'one'), 'j2' ('one' to 'two'), 'j3' ('base' to 'three'), ",
+        ),
+        (
+            ('base one', 'base one', 'one two'),
+            "two joints, in a loop of 'j1' ('base' to 'one'), 'j2' ('base' to 'one'): only",
+        ),
+        (  # below the arm
+            ('base one', 'one two', 'two three', 'three two'),
+            "'two' is the child of two joints, in a loop of 'j3' ('two' to 'three'), 'j4' ",
+        ),
+        (
+            ('base one', 'one two', 'three one'),
+            "two joints, 'j1' ('base' to 'one'), 'j3' ('three' to 'one'): only trees",
+        ),
+        (  # without a root
+            ('base one', 'one two', 'two base'),
+            "joints form a loop, 'j2' ('one' to 'two'), 'j3' ('two' to 'base'), 'j1' ('base' to",
+        ),
+        (  # beside the arm
+            ('base one', 'two three', 'three two'),
+            "a loop, 'j3' ('three' to 'two'), 'j2' ('two' to 'three'): only trees are read",
+        ),
+        (
+            ('base one', 'two two'),
+            "joints form a loop, 'j2' ('two' to 'two'): only trees",
+        ),
+    ],
+)
+@pytest.mark.parametrize('base', ['', 'base'])
+def test_loop_of_joints_is_told_with_its_links(joints, message, base):
+    inertial = '<inertial><mass value="1" /></inertial>'
+    links = [
+        f'<link name="{name}">{inertial}</link>'
+        for name in ('base', 'one', 'two', 'three')
+    ]
+    ends = [each.split() for each in joints]
+    elements = [
+        f'<joint name="j{k}" type="revolute"><parent link="{a}" /><child link="{b}" /></joint>'
+        for k, (a, b) in enumerate(ends, 1)
+    ]
+    text = f'<robot name="loop">{"".join(links + elements)}</robot>'
+    with pytest.raises(BlfDscError) as caught:
+        read_chain(text, base, 'one', ())
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
     ('chains', 'message'),
     [
         (  # two arms with hands on a torso that also carries a head

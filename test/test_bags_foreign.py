@@ -425,7 +425,7 @@ def test_types_of_this_package_need_a_name_but_no_definition(
 
 
 def test_files_that_are_missing_or_hold_other_numbers_than_stated(
-    entries, copy, run, all_say
+    entries, copy, all_say
 ):
     all_say(copy.parent, f'did you mean {copy}?')
     others = without_states(entries)
@@ -435,8 +435,36 @@ def test_files_that_are_missing_or_hold_other_numbers_than_stated(
         all_say(copy, f'it holds {count} messages of /joint_states, but counts 301')
     (copy / 'bag_0.mcap').unlink()
     all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
-    code, _, error = run('recover', copy, '--out', 'clean')
-    assert (code, 'there is no MCAP file to recover' in error) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ('bag', 'told'),
+    [
+        (
+            'lost',
+            'no file in .mcap beside its metadata.yaml: the messages were in that',
+        ),
+        ('full', 'it is empty: nothing was recorded, as on a full disk: give another'),
+        ('full/full_0.mcap', 'it is empty: nothing was recorded, as on a full disk: g'),
+        ('sql', '`sqlite3 sql/sql_0.db3 .recover | sqlite3 recovered.db3`'),
+        ('sql/sql_0.db3', 'or its file in .mcap: only these are recovered'),
+        ('nothing', 'there is no file in .mcap: give the folder that has one, or the'),
+        ('ful', 'there is none, did you mean full?'),
+        ('elsewhere/bag', 'there is none: give the folder of a bag'),
+    ],
+)
+def test_what_holds_nothing_to_recover_says_what_is_missing(bag, told, tmp_path, run):
+    for name, file in (('lost', ''), ('full', 'full_0.mcap'), ('sql', 'sql_0.db3')):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / 'metadata.yaml').write_text('{}')
+        if file:
+            (tmp_path / name / file).touch()
+    (tmp_path / 'nothing').mkdir()
+    code, output, error = run('recover', bag, '--out', 'clean')
+    assert (code, output) == (1, '')
+    assert error.startswith(f'blf_dsc recover: {bag} cannot be read as a bag: ')
+    assert told in error
+    assert not (tmp_path / 'clean').exists()
 
 
 @pytest.mark.parametrize(

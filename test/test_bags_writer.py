@@ -306,7 +306,7 @@ def test_every_intact_chunk_is_recovered_at_any_truncation(plain, tmp_path):
     (closed,) = [
         at + len(raw) for at, raw in raw_records(data) if raw[0] == Opcode.DATA_END
     ]
-    for size in sorted({*ends, *range(0, len(data), 499), len(data)}):
+    for size in sorted({*ends, 1, *range(499, len(data), 499), len(data)}):
         messages, losses = recovered(tmp_path / str(size), data[:size])
         assert messages == written[: 2 * PER_CHUNK * sum(end <= size for end in ends)]
         assert (not losses) == (size >= closed)

@@ -211,6 +211,25 @@ def test_another_robot_is_refused(arm, capsys):
     assert 'joints: got 2, but the robot has 7' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('robot', [[], ['--robot', 'plant', '--yes']])
+def test_bag_of_another_arm_is_refused_before_anything_moves(robot, arm, capsys):
+    bag = arm.with_name('other')
+    with blf.ArmController('panda_rigid', record=bag) as controller:
+        for k in range(3):
+            controller.update(1e-3 * k, [0.0] * 7, [0.0] * 7)
+    theirs = ', '.join(controller.config.joints)
+    PlantDriver.last = None
+    out = arm.with_name('out.yaml')
+    words = ['commission', str(bag), '--config', str(arm), '--out', str(out), *robot]
+    assert main(words) == 1
+    found = capsys.readouterr()
+    told = f'{bag} is of the joints {theirs}, the configuration of joint1, joint2: '
+    assert told in found.err
+    assert 'choosing' not in found.err + found.out
+    assert PlantDriver.last is None
+    assert nothing_looks_whole(arm)
+
+
 def driven(arm, cls=PlantDriver):
     """Return a robot that is connected."""
     config = blf.load_loop(arm).controller

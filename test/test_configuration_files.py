@@ -236,6 +236,13 @@ REMEDIES = [
     ('a:\n\tb: 1\n', 'indent with spaces, not with tabs'),
     ('<robot name="a">\n<!-- it: is -->\n</robot>', 'names it as robot.urdf'),
     (section('n', 'a: 1') + '---\nm: {}\n', 'leave out the line ---'),
+    (section('n', 'a: [0,08, 0,09]'), 'if 0,035 is to be one number, write 0.035'),
+    (section('n', 'a: [0,035, 0.035]'), 'if 0,035 is to be one number, write 0.035'),
+    (section('n', 'a: [1,05, 1.0]'), 'if 0,035 is to be one number, write 0.035'),
+    (section('n', 'a: [0.5, -0,35]'), 'if 0,035 is to be one number, write 0.035'),
+    (section('n', 'a: [0, 0, 1.0]'), 'write all entries alike (1.0, not 1)'),
+    (section('n', 'a: [1, 10, 1.0]'), 'write all entries alike (1.0, not 1)'),
+    (section('n', 'a: 0,035'), ': 035 has no value: a comma separates entries'),
     (
         'm:\n    a: {}\n  b:\n    c: 1\n',
         'in the column of the other lines of its group',

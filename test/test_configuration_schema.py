@@ -119,6 +119,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         (PLANT, {'duration': '1'}, 'got "1", but a double is expected'),
         (
             PLANT,
+            {'duration': '0,5'},
+            'got "0,5", but a double is expected: write a decimal point, 0.5',
+        ),
+        (
+            PLANT,
             {'duration': '1.0'},
             'got "1.0", but a double is expected: write it without quotes',
         ),
@@ -324,6 +329,31 @@ def test_invalid_value_is_rejected_with_what_it_is_and_what_is_expected(
     for cls in classes:
         (problem,) = problems_of(cls, given)
         assert problem.startswith(f'{name}: {message}')
+
+
+@pytest.mark.parametrize(
+    ('given', 'remedy'),
+    [
+        ([0, 29, 0, 29], ', with a decimal point: a comma separates entries; if 0,035'),
+        ([0, 29, 0, 5], ', with a decimal point: a comma separates entries; if 0,035'),
+        ([1, 5, 1, 5], ', with a decimal point: a comma separates entries; if 0,035'),
+        (['0,5', '1,5'], ': write a decimal point, 0.5, 1.5'),
+        ([0, 5], ', with a decimal point'),
+        ([0, 1, 0], ', with a decimal point'),
+        ([0, 0, 0, 0], ', with a decimal point'),
+        ([2, 2, 2, 2], ', with a decimal point'),
+        ([1, 5, 2, 5], ', with a decimal point'),
+        (['0,5,1', '1'], ''),
+    ],
+)
+def test_decimal_comma_is_noticed(given, remedy):
+    with pytest.raises(ConfigurationError) as raised:
+        build(PlantConfig, {'load.torque': given})
+    (problem,) = raised.value.problems
+    end = problem.partition('a double array is expected')[2]
+    assert end.startswith(remedy)
+    assert ('0,035' in end) == ('0,035' in remedy)
+    assert bool(end) == bool(remedy)
 
 
 def test_problems_of_all_parameters_are_reported_at_once():

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from functools import cache
 
 import numpy as np
@@ -23,7 +24,7 @@ from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import write_bag
 from blf_dsc_controller.supervision.braking import braking_matrix
-from blf_dsc_controller.supervision.first_torque import is_like
+from blf_dsc_controller.supervision.first_torque import _check_gravity, is_like
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import friction_torque, gravity_torque
@@ -214,6 +215,35 @@ def test_what_the_start_and_a_driver_advise_ends_with_an_arm_that_moves():
     assert disagreements(facts, config) == []
 
 
+@pytest.mark.parametrize(
+    ('compensates', 'weight', 'dq', 'shown', 'refusal'),
+    [
+        ('none', 0.1, 0.0, 1.0, 'gravity twice'),
+        ('none', 0.1, -0.04, 1.0, 'gravity twice'),  # encoder steps of an arm at rest
+        ('none', 0.1, 0.06, 1.0, ''),
+        ('none', 0.1, -0.06, 1.0, ''),
+        ('none', 0.04, 0.0, 1.0, ''),
+        ('none', 0.1, 0.0, np.nan, ''),
+        ('gravity', 0.1, 0.0, 0.0, 'no gravity'),
+        ('gravity', 0.1, 0.0, 0.015, 'no gravity'),  # noise of a sensor
+        ('gravity', 0.1, -0.06, 0.0, ''),
+        ('gravity', 0.04, 0.0, 0.0, ''),
+        ('gravity', 0.1, 0.0, 0.03, ''),
+        ('gravity', 0.1, 0.0, np.nan, ''),
+    ],
+)
+def test_efforts_are_compared_with_gravity_at_rest_and_where_it_matters(
+    compensates, weight, dq, shown, refusal
+):
+    """`weight` is the share of the torque limit, `shown` the effort as a share of the weight."""
+    given = {'robot.effort': 'whole', 'robot.drive_compensates': compensates}
+    config = change(loop_of('panda_rigid').controller, given)
+    joint = np.eye(7)[1]
+    gravity = -weight * config.torque.limit[1] * joint
+    with pytest.raises(StartError, match=refusal) if refusal else nullcontext():
+        _check_gravity(config, dq * joint, shown * gravity, gravity, gravity)
+
+
 @pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
 @pytest.mark.parametrize('effort', ['unknown', 'commanded', 'whole', 'current'])
 @pytest.mark.parametrize('parameter', ['none', 'gravity'])
@@ -237,8 +267,15 @@ def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(
         if guard.starting.error is not None:
             assert 'what holds the arm?' in str(guard.starting.error)
             assert guard.supervisor.reason == 'start rejected'
-        moving = measurement + 0.1
-        assert check_support(guard.controller, config, moving) is None
+            guard = Guard(config)
+            guard.journal.commands = 1  # its own torque holds the arm
+            guard.starting.activate()
+            guard.starting.check_support(measurement)
+            assert guard.starting.error is None
+        for moving in (measurement + 0.1, measurement - 0.1):
+            assert check_support(guard.controller, config, moving) is None
+        asked = change(config, {'safety.first_torque': 'send'})
+        assert check_support(guard.controller, asked, measurement) is None
 
 
 def test_restart_on_a_drive_that_holds_a_torque():
@@ -261,6 +298,30 @@ def test_restart_on_a_drive_that_holds_a_torque():
     guard = Guard(change(config, steps))
     guard.starting.activate()
     assert guard.update(10**9, held * np.repeat([1.0, 0.0], [14, 7])) is None
+
+
+@pytest.mark.parametrize('effort', ['unknown', 'commanded', 'whole', 'current'])
+def test_command_after_a_gap_is_what_efforts_show_if_they_are_torques(effort):
+    """Amperes are none; what drives add to a command is no part of it."""
+    given = HELD | {'robot.effort': effort}
+    guard = Guard(change(loop_of('panda_rigid').controller, given))
+    held, settings = guard.held, guard.controller.settings
+    q = np.array(loop_of('panda_rigid').plant.initial.position)
+    acting = np.arange(1.0, 8.0)
+    added = added_torque(settings.torque, q) if effort == 'whole' else np.zeros(7)
+    assert held.command() is None
+    held.after_gap = np.concatenate((q, np.zeros(7), acting + added))
+    if effort in ('unknown', 'current'):
+        assert held.command() is None
+        return
+    np.testing.assert_allclose(held.command(), acting, atol=1e-12)
+    held.after_gap[14:] = 1e3 * np.sign(acting - 4.5)
+    limit = settings.torque.limit
+    np.testing.assert_array_equal(held.command(), limit * np.sign(acting - 4.5))
+    for missing in (3, 17):  # of the positions, and of the efforts
+        held.after_gap = np.concatenate((q, np.zeros(7), acting))
+        held.after_gap[missing] = np.nan
+        assert held.command() is None
 
 
 @pytest.mark.parametrize('effort', ['whole', 'commanded', 'current'])

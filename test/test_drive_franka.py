@@ -391,16 +391,20 @@ def test_motors_that_are_where_their_links_are_say_nothing(theta, has_motors):
     """Gears that do not give way would be stiffer than any."""
     driver = FrankaDriver('', blf.load_loop('fr3_direct').controller, DriveConfig())
     state = SimpleNamespace(
-        m_load=0.0,
+        m_load=1.5,
         time=SimpleNamespace(to_sec=lambda: 1.0),
         q=[0.5] * 7,
-        dq=[0.0] * 7,
-        tau_J=[0.0] * 7,
+        dq=[0.1] * 7,
+        tau_J=[2.0] * 7,
+        tau_J_d=[3.0] * 7,
         theta=theta,
         dtheta=[0.0] * 7,
     )
     driver._control = SimpleNamespace(readOnce=lambda: (state, None))
-    assert (driver.read().motors is not None) == has_motors
+    stamp, q, dq, effort, motors = driver.read()
+    assert (motors is not None) == has_motors
+    assert (stamp, q, dq, effort) == (1.0, [0.5] * 7, [0.1] * 7, [2.0] * 7)
+    assert driver.load_in_force() == 1.5
 
 
 @pytest.mark.parametrize('call', ['readOnce', 'writeOnce'])
@@ -431,6 +435,111 @@ def test_what_libfranka_raises_in_motion_is_an_error_of_a_driver(
         use()
     assert type(caught.value) is expected
     assert 'libfranka' not in str(caught.value)
+
+
+class WrittenTorques:
+    """Keeps the torques that it was sent, and whether each ended the motion."""
+
+    def __init__(self):
+        self.sent = []
+
+    def writeOnce(self, torques):
+        self.sent.append((list(torques.tau_J), torques.motion_finished))
+
+
+def test_torques_go_on_until_the_next_start_which_begins_at_zero():
+    """A reflex leaves a torque behind that the next motion must not begin with."""
+    driver = FrankaDriver('', blf.load_loop('fr3_direct').controller, DriveConfig())
+    controls = [WrittenTorques(), WrittenTorques()]
+    left = iter(controls)
+    driver._robot = SimpleNamespace(start_torque_control=lambda: next(left))
+    driver.start()
+    driver.write(None)
+    driver.write(np.full(7, 3.0))
+    driver.write(None)
+    driver.finish()
+    driver.start()
+    driver.write(None)
+    first, second = (each.sent for each in controls)
+    zero, three = [0.0] * 7, [3.0] * 7
+    assert first == [(zero, False), (three, False), (three, False), (three, True)]
+    assert second == [(zero, False)]
+
+
+class ConnectedRobot:
+    """A robot in a mode, with what it was told."""
+
+    def __init__(self, *modes):
+        self.modes = list(modes)
+        self.told = []
+
+    def read_once(self):
+        mode = self.modes.pop(0) if len(self.modes) > 1 else self.modes[0]
+        return SimpleNamespace(
+            robot_mode=mode, m_ee=0.0, m_total=0.0, tau_J=[1.0] * 7, q=[0.0] * 7
+        )
+
+    def automatic_error_recovery(self):
+        self.told.append('recovered')
+
+    def set_collision_behavior(self, *thresholds):
+        self.told.append(thresholds)
+
+    def set_load(self, *load):
+        self.told.append(load)
+
+
+def connected(monkeypatch, robot, given=None, priority=0):
+    """Return a driver that has connected to this robot, and how it did."""
+    calls = []
+
+    def reach(address, realtime):
+        calls.append((address, realtime))
+        return robot
+
+    monkeypatch.setattr(pylibfranka, 'Robot', reach)
+    values = {'blf_dsc_controller': {'realtime.priority': priority}}
+    controller = blf.load_loop('fr3_direct', values).controller
+    driver = FrankaDriver('here', controller, build(DriveConfig, given or {}))
+    driver.connect()
+    return calls
+
+
+def test_thresholds_are_those_of_torque_and_force(monkeypatch):
+    """The lower ones, of contacts, and the upper ones, of collisions, are the same."""
+    torque, force = [10.0 + k for k in range(7)], [20.0 + k for k in range(6)]
+    robot = ConnectedRobot(pylibfranka.RobotMode.Idle)
+    given = {'collision_torque': torque, 'collision_force': force}
+    connected(monkeypatch, robot, given)
+    assert robot.told[0] == (torque, torque, force, force)
+    given = {'collision_torque': torque[:6], 'collision_force': force}
+    with pytest.raises(DriverError, match='got 6 entries, but the robot has 7 joints'):
+        connected(monkeypatch, robot, given)
+
+
+def test_only_a_reflex_is_recovered_and_no_other_mode_is_started_from(monkeypatch):
+    modes = pylibfranka.RobotMode
+    robot = ConnectedRobot(modes.Reflex, modes.Idle)
+    connected(monkeypatch, robot)
+    assert robot.told[0] == 'recovered'
+    for mode in (modes.Reflex, modes.UserStopped, modes.Guiding, modes.Move):
+        robot = ConnectedRobot(mode)
+        with pytest.raises(DriverError, match=f'is not idle, but in mode {mode.name}'):
+            connected(monkeypatch, robot)
+        assert robot.told == ['recovered'] * (mode is modes.Reflex)
+
+
+@pytest.mark.parametrize(('priority', 'enforced'), [(0, False), (80, True)])
+def test_realtime_is_enforced_where_a_priority_is_asked_for(
+    priority, enforced, monkeypatch
+):
+    robot = ConnectedRobot(pylibfranka.RobotMode.Idle)
+    ((address, realtime),) = connected(monkeypatch, robot, priority=priority)
+    wanted = pylibfranka.RealtimeConfig
+    assert (address, realtime) == (
+        'here',
+        wanted.kEnforce if enforced else wanted.kIgnore,
+    )
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):

@@ -44,6 +44,7 @@ from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.topics import TARGETS
 from blf_dsc_controller.run import SLIDING, TURNING
+from blf_dsc_controller.supervision.guard import Guard
 
 # rad: the bound of the preset, to which any error of the arm adds up
 NEAR = 0.045
@@ -143,6 +144,20 @@ def test_only_what_may_be_degrees_is_no_target_of_a_stream(positions, named):
     found = _far_beyond(np.array(positions), config)
     assert bool(found) == bool(named)
     assert named in found
+
+
+def test_move_takes_as_long_in_either_direction_and_longer_at_a_part_of_the_speed():
+    guard = Guard(blf.load_loop('recommended').controller)
+    guard.controller.reference_at = lambda _: np.zeros((3, 2))
+    script = SimpleNamespace(_guard=guard)
+
+    def seconds(far, speed):
+        wanted = {'positions': [far, 0.0], 'speed': speed}
+        (point,) = Script._move(script, wanted).points
+        assert point.positions == (far, 0.0)
+        return point.time
+
+    assert seconds(0.5, 0.2) == seconds(-0.5, 0.2) > 1.5 * seconds(0.5, 0.8) > 0.1
 
 
 def test_next_loop_answers_no_stop_of_the_one_before():

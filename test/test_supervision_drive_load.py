@@ -10,6 +10,7 @@ from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.contact import QUIET, TOUCHED
+from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -111,6 +112,27 @@ def test_law_leaves_to_the_drives_what_they_were_told_since_it_began(law):
     assert added_mass(law, before) == 0.0
     loads.take(law, DriveLoad(3.5, CENTRE))
     assert added_mass(law, before) == pytest.approx(1.0)
+
+
+def test_reset_of_a_stopped_arm_carries_on_without_what_the_drives_hold():
+    """The whole torque stays: what the law forgets of the drives is in no command."""
+    given = {'safety.first_torque': 'send', 'safety.torque': 'hold_gravity'}
+    guard = Guard(change(CONFIG, given))
+    guard.starting.activate()
+    q = np.array(CONFIG.reference.offset)
+    rest = np.concatenate((q, np.zeros(14)))
+    assert guard.update(10**9, rest) is not None
+    guard.take_over(DriveLoad(2.5, CENTRE))
+    guard.fail('why')
+    guard.update(10**9 + 10**6, rest)
+    law = guard.controller
+    carried = guard.safe_stop.carried(guard.config.safety)
+    added = added_torque(law.settings.torque, q)
+    guard.starting.reset()
+    forgotten = added - added_torque(law.settings.torque, q)
+    assert np.abs(forgotten).max() > 1.0  # N m
+    now = guard.starting._takeover.carried
+    np.testing.assert_allclose(now, carried - forgotten, atol=1e-9)
 
 
 def test_load_that_is_put_down_after_a_reset_leaves_what_it_held(law):

@@ -331,7 +331,10 @@ def test_the_bound_that_a_warning_asks_for_is_wide_enough():
     [
         ({'robot.payload': 3.0}, 'Give less robot.payload'),
         ({'robot.payload': 1.7}, 'expected to be up to 0.34 rad'),  # and room
-        ({'robot.payload': 0.01}, 'is it in degrees? Give 0.0192'),
+        (
+            {'robot.payload': 0.01},
+            'is it in degrees? Give 0.0192; in mrad? Give 0.0011',
+        ),
     ],
 )
 def test_a_wide_bound_of_soft_gains_is_not_taken_for_degrees(changes, remedy):

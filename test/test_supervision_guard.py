@@ -833,6 +833,29 @@ def test_arm_that_is_not_seen_is_not_known_to_rest():
     assert not ramp.is_settled
 
 
+def test_arm_is_not_settled_before_its_ramp_is_over_nor_while_it_moves():
+    ramp = SafeTorque(2)
+    ramp.last.take(1, np.zeros(6), np.zeros(2))
+    ramp.begin_ramp(0.5, np.zeros(2))
+    settled = []
+    for _ in range(5):
+        settled.append(ramp.is_settled)
+        ramp.advance(Safety(torque='damping'), settings(), P, 0.125)
+    assert settled == [False] * 4 + [True]
+    ramp.last.take(2, np.array([0.0, 0.0, 0.0, -0.1, 0.0, 0.0]), np.zeros(2))
+    assert not ramp.is_settled
+
+
+def test_joint_that_passes_for_a_light_one_keeps_half_of_its_damping():
+    """As an elastic one does that oscillates; a heavier one gets more."""
+    ramp = SafeTorque(2)
+    ramp.scale[:] = 0.1, 2.0
+    ramp.last.take(1, np.zeros(6), np.array([1.0, -1.0]))
+    safety = Safety(torque='damping', damping=(2.0, 1.0))
+    torque = ramp.advance(safety, settings(), P, 0.0)
+    np.testing.assert_allclose(torque, [-0.5 * 2.0, 2.0 * 1.0])
+
+
 @pytest.mark.parametrize('torque', ['zero', 'damping', 'hold_gravity'])
 def test_only_a_torque_that_holds_carries_a_load(torque):
     rig = Rig({'safety.torque': torque})
@@ -942,3 +965,40 @@ def test_stop_that_winds_the_estimates_up_holds_with_those_from_before(reason, g
     winds_up = reason in AFTER_WINDING_UP and not gap
     expected = 'from before' if winds_up else 'of the torque that holds it'
     assert SafeStop._load_at_stop(stop, reason) == expected
+
+
+@pytest.mark.parametrize('reason', list(Reason))
+@pytest.mark.parametrize('oscillates', [False, True])
+def test_load_is_observed_in_a_stop_unless_its_cause_may_be_commands_that_do_not_arrive(
+    reason, oscillates
+):
+    """Of an arm that oscillates they do: else it would not."""
+    guard = Guard(ControllerConfig())
+    safety = guard.config.safety
+    guard.safe_stop.begin(safety, reason, 0.0, was_running=False, oscillates=oscillates)
+    unreached = {Reason.OUTSIDE_BOUND, Reason.SATURATED, Reason.NO_EFFECT}
+    assert guard.safe_torque.carries == (reason not in unreached or oscillates)
+
+
+@pytest.mark.parametrize('torque', ['zero', 'damping', 'hold_gravity'])
+def test_arm_that_nothing_holds_may_speed_up(torque):
+    """Else the load that was known before holds it again."""
+    guard = Guard(ControllerConfig())
+    safety = Safety(torque=torque)
+    stop = guard.safe_stop
+    stop.begin(safety, Reason.FAILED, 0.0, was_running=False, oscillates=False)
+    found = [stop.observe_speed(safety, 1.0, 0.1) for _ in range(4)]
+    assert any(found) == (torque != 'zero')
+    assert guard.safe_torque.carries == (torque == 'zero')
+
+
+@pytest.mark.parametrize('is_withdrawn', [False, True])
+def test_reset_carries_nothing_on_once_another_program_has_taken_command(is_withdrawn):
+    rig = Rig({'safety.torque': 'hold_gravity'})
+    rig.step(200)
+    rig.guard.fail('why')
+    rig.step(2)
+    if is_withdrawn:
+        rig.guard.withdraw('the robot stopped by itself')
+    rig.guard.starting.reset()
+    assert (rig.guard.starting._takeover.carried is None) == is_withdrawn

@@ -240,6 +240,30 @@ def test_the_largest_first_step_is_one_from_there():
     assert isinstance(arm.guard.starting.error, StartError)
 
 
+def test_torque_of_another_node_counts_and_not_the_last_own_one():
+    """The controller has commanded before, and has been activated again."""
+    arm = Arm('fr3')
+    arm.run(3.0)
+    acting = arm.holding() + 3.0  # N m
+    arm.guard.starting.activate()
+    arm.guard.starting.take_over_from(acting)
+    (torque,), _ = arm.run(arm.config.sample_time)
+    assert arm.guard.starting._takeover.acting is None  # it holds the arm no more
+    step = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
+    assert (np.abs(torque - acting) <= step + 1e-9).all()
+
+
+def test_load_is_left_out_where_no_integrator_could_ever_unlearn_it():
+    gain = [0.0, *[100.0] * 6]
+    arm = Arm('fr3')
+    arm.config = change(arm.config, {'disturbance.gain': gain})
+    arm.restart(np.full(7, 2.0))  # N m
+    arm.run(arm.config.sample_time)
+    assert (arm.guard.controller.state.disturbance != 0.0).tolist() == [
+        each > 0.0 for each in gain
+    ]
+
+
 def test_a_bag_of_it_replays_bit_for_bit(tmp_path):
     arm = Arm('fr3')
     arm.run(1.0)

@@ -178,6 +178,51 @@ def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded
     assert np.abs(restarted.taken[0]).min() > 1.0  # half of gravity
 
 
+def test_it_says_whether_it_watches_and_whether_anybody_commands():
+    """It watches once it has seen a torque and knows where the arm is."""
+    rig = Watched(HOLDING)
+    line = rig.line
+    assert not line.is_engaged(0.0)
+    rig.dead = True
+    rig.step(100)
+    assert not line.watches
+    assert not line.is_engaged(0.1)
+    rig.dead = False
+    rig.step(10)
+    now = rig.plant.sample * 1e-3
+    assert line.watches
+    assert line.is_engaged(now)
+    assert not line.is_engaged(now + 2.0 * TIMEOUT)
+    assert line.stand_down()
+    assert not line.watches
+    assert not line.is_engaged(now)
+    rig.step(1)  # a torque that was on its way
+    assert not line.watches
+    line.stand_by()
+    assert not line.watches
+    rig.step(10)
+    assert line.watches
+    now = rig.plant.sample * 1e-3
+    for k in range(1000):  # the states stop, too
+        assert line.poll(now + k * 1e-3) is None
+    assert not line.watches
+    rig.dead = True
+    rig.step(10)
+    line.take_torque(np.zeros(2), rig.plant.sample * 1e-3)
+    rig.step(100)
+    assert line.active
+    assert line.watches
+    assert line.is_engaged(rig.plant.sample * 1e-3)
+    armed = Watched(HOLDING)
+    armed.line = TorqueWatchdog(armed.config, TIMEOUT, armed=True)
+    armed.dead = True
+    armed.step(10)
+    assert not armed.line.watches
+    armed.step(100)
+    assert armed.line.active
+    assert armed.line.watches
+
+
 def test_it_does_not_stand_down_while_it_commands():
     rig = Watched(HOLDING)
     rig.step(100)

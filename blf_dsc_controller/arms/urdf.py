@@ -12,7 +12,7 @@ rules:
   velocity of 0 means no limit, and so does an acceleration.  Position limits are the
   narrower ones of `<limit>` and `<safety_controller>`.
 
-Not supported: `floating`, `planar` and `mimic` joints in the chain, and closed chains.
+Not supported: `floating`, `planar` and `mimic` joints in the chain, and loops of joints.
 """
 
 from __future__ import annotations
@@ -237,11 +237,15 @@ class Tree(NamedTuple):
 
     @classmethod
     def of(cls, text: str) -> Tree:
-        """Read a URDF, in which each joint has its links, and no link two joints above it."""
+        """Read a URDF, in which each joint has its links, and no link two joints above it.
+
+        Raises BlfDscError if it is none, or no tree.
+        """
         robot = _robot(text)
         links = _named(robot, 'link')
         joints = _named(robot, 'joint')
         above: dict[str, ET.Element] = {}
+        second: dict[str, ET.Element] = {}
         for name, joint in joints.items():
             for role in ('parent', 'child'):
                 if (link := _link(joint, role)) not in links:
@@ -250,10 +254,8 @@ class Tree(NamedTuple):
                         f'{_listed(links)}: correct its <{role}>'
                     )
             if above.setdefault(link, joint) is not joint:
-                raise BlfDscError(
-                    f'link {link!r} is the child of two joints: closed chains are not '
-                    'supported; open the chain by removing a joint'
-                )
+                second[link] = joint
+        _check_tree(above, second)
         return cls(links, joints, above)
 
     @property
@@ -386,6 +388,45 @@ class Tree(NamedTuple):
             held += moved(beyond.held if kind == 'fixed' else beyond.J, frame)
             fixed += (child, *beyond.fixed) if kind == 'fixed' else ()
         return _Body(J, held, fixed)
+
+
+def _check_tree(
+    above: Mapping[str, ET.Element], second: Mapping[str, ET.Element]
+) -> None:
+    """Raise BlfDscError if a link has a `second` joint above it, or is above itself."""
+    only = 'only trees are read, such as serial arms: remove a joint without a motor'
+    for link, joint in second.items():
+        ways = [_up(each, above) for each in (above[link], joint)]
+        shared = [each for each in ways[0] if each in ways[1]]
+        meet = shared or _link(ways[0][-1], 'parent') == _link(ways[1][-1], 'parent')
+        loop = [each for way in ways for each in way[::-1] if each not in shared]
+        problem = f'link {link!r} is the child of two joints'
+        if meet:
+            raise BlfDscError(f'{problem}, in a loop of {_edges(loop)}: {only}')
+        raise BlfDscError(f'{problem}, {_edges([above[link], joint])}: {only}')
+    for link, joint in above.items():
+        loop = _up(joint, above)
+        if _link(loop[-1], 'parent') == link:
+            raise BlfDscError(f'joints form a loop, {_edges(loop[::-1])}: {only}')
+
+
+def _up(joint: ET.Element, above: Mapping[str, ET.Element]) -> list[ET.Element]:
+    """Return a joint and those above it, up to the root, or once around a loop."""
+    way = [joint]
+    while (parent := above.get(_link(way[-1], 'parent'))) is not None:
+        if parent in way:
+            break
+        way.append(parent)
+    return way
+
+
+def _edges(joints: Sequence[ET.Element]) -> str:
+    """Return joints with their links in words."""
+    ends = [(_link(each, 'parent'), _link(each, 'child')) for each in joints]
+    names = [each.get('name', '') for each in joints]
+    return _shortened(
+        [f'{name!r} ({a!r} to {b!r})' for name, (a, b) in zip(names, ends, strict=True)]
+    )
 
 
 def _robot(text: str) -> ET.Element:

@@ -26,10 +26,12 @@ from zstandard import FRAME_HEADER, ZstdError
 
 from blf_dsc_controller.bags.sources import (
     CDR,
-    FILES,
     MAGIC_SIZE,
+    METADATA,
+    NOTHING_RECORDED,
     BagError,
     check_regular,
+    near,
     next_record,
     records_in,
 )
@@ -59,21 +61,10 @@ def recover(path: Path, out: Path) -> Recovery:
     """Write what a damaged folder or MCAP file still holds to a clean bag `out`.
 
     Raises:
-        BagError: there is no MCAP file, or `out` exists already.
+        BagError: there is no MCAP file, or nothing in any; or `out` exists already.
         BlfDscError: `out` cannot be written; nothing of it is left.
     """
-    check_regular(path)
-    if path.is_file() and path.suffix not in FILES:
-        raise BagError(
-            f'{path} cannot be read as a bag: give its folder, or its file in .mcap'
-        )
-    candidates = path.glob('*.mcap') if path.is_dir() else [path]
-    files = [file for file in candidates if file.is_file()]
-    if not files:
-        raise BagError(
-            f'{path} cannot be read as a bag: there is no MCAP file to recover'
-        )
-    files.sort(key=lambda file: (len(file.name), file.name))  # bag_10 after bag_9
+    files = _files_of(path)
     with (
         writing(out) as part,
         BagWriter(part, name=out.name, flush_interval=None) as bag,
@@ -82,6 +73,42 @@ def recover(path: Path, out: Path) -> Recovery:
             f'{file.name}: {loss}' for file in files for loss in _copied(file, bag)
         ]
     return Recovery(bag.message_counts, losses)
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return the MCAP files of a bag, in order.
+
+    Raises BagError if there is none, or nothing in any.
+    """
+    check_regular(path)
+    if not path.exists():
+        problem = f'there is none{near(path)}'
+    elif path.is_file() and path.suffix != '.mcap':
+        problem = 'give its folder, or its file in .mcap: only these are recovered'
+    else:
+        candidates = path.glob('*.mcap') if path.is_dir() else [path]
+        files = [file for file in candidates if file.is_file()]
+        if any(file.stat().st_size for file in files):
+            return sorted(
+                files, key=lambda file: (len(file.name), file.name)
+            )  # 10 after 9
+        problem = NOTHING_RECORDED if files else _no_file(path)
+    raise BagError(f'{path} cannot be read as a bag: {problem}')
+
+
+def _no_file(folder: Path) -> str:
+    """Return what a folder without MCAP files lacks, and what to do."""
+    if databases := sorted(folder.glob('*.db3')):
+        return (
+            'it has no file in .mcap, and only these are recovered. sqlite3 recovers its own: '
+            f'`sqlite3 {databases[0]} .recover | sqlite3 recovered.db3`'
+        )
+    if (folder / METADATA).exists():
+        return (
+            f'there is no file in .mcap beside its {METADATA}: the messages were in that file. '
+            'Copy it there from where the bag was recorded; without it, nothing can be recovered'
+        )
+    return 'there is no file in .mcap: give the folder that has one, or the file'
 
 
 class _Copy:

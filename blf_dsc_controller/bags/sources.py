@@ -35,6 +35,9 @@ _ROS1 = '.bag'
 FILES = {'.mcap', '.db3', '.bag'}
 """Suffixes of the files of a bag."""
 _TABLES = {'.csv', '.txt', '.npz', '.mat', '.parquet'}
+NOTHING_RECORDED = (
+    'it is empty: nothing was recorded, as on a full disk: give another bag'
+)
 CDR = 'cdr'
 _MAGIC = b'\x89MCAP0\r\n'
 MAGIC_SIZE = len(_MAGIC)
@@ -249,7 +252,7 @@ def _no_room(error: Exception) -> str:
 
 def _reason(path: Path, error: Exception) -> str:
     if not path.exists():
-        return f'there is none{_near(path)}'
+        return f'there is none{near(path)}'
     if path.suffix in _TABLES:
         return 'it is a table, which only blf_dsc identify reads: give a bag'
     files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
@@ -270,7 +273,7 @@ def _reason(path: Path, error: Exception) -> str:
         if encoding:
             return f'its messages are {encoding}, not CDR of ROS 2: {_remedy(encoding)}'
     if not any(file.stat().st_size for file in files):
-        text = 'it is empty: nothing was recorded, as on a full disk: give another bag'
+        text = NOTHING_RECORDED
     elif not any(map(_has_magic, files)):
         text = 'it is no MCAP file: give a bag'
     else:
@@ -286,7 +289,7 @@ def _has_magic(file: Path) -> bool:
         return _MAGIC in (begin, stream.read())
 
 
-def _near(path: Path) -> str:
+def near(path: Path) -> str:
     """Return what may be meant by a path at which there is nothing."""
     folder = path.parent
     names = [each.name for each in folder.iterdir()] if folder.is_dir() else []

@@ -114,7 +114,7 @@ def _by_runs(options: Namespace, path: Path, commissioning: Commissioning) -> in
     """Commission by bags, or else on the simulated arm."""
     file = _file(options, path)
     if options.bags:
-        runs = _given(options)
+        runs = _given(options, commissioning.config)
         found = _chosen(commissioning, runs)
         return _written(file, found, _names(commissioning, runs))
     runs, missing = _simulated(path, commissioning)
@@ -128,7 +128,7 @@ def _by_runs(options: Namespace, path: Path, commissioning: Commissioning) -> in
 
 def _on_robot(options: Namespace, path: Path, commissioning: Commissioning) -> int:
     """Commission a robot, with the bags that are given, too."""
-    runs = _given(options)
+    runs = _given(options, commissioning.config)
     after: list[str] = []
     if options.ripple:
         after = [*before_start(options, commissioning.config)]
@@ -283,10 +283,10 @@ def _check(options: Namespace) -> None:
         )
 
 
-def _given(options: Namespace) -> Runs:
-    """Return the runs of the bags that are given."""
+def _given(options: Namespace, config: ControllerConfig) -> Runs:
+    """Return the runs of the bags that are given, which must be of the same joints."""
     announce_reading(options.bags, 'read')
-    return [(str(bag), measured_in(bag)) for bag in options.bags]
+    return [(str(bag), measured_in(bag, config)) for bag in options.bags]
 
 
 def _names(commissioning: Commissioning, runs: Runs) -> list[str]:

@@ -29,7 +29,7 @@ from blf_dsc_controller.commissioning.chosen import (
 )
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.margin import BARELY, Loops, RigidArm
-from blf_dsc_controller.commissioning.measurement import Measured
+from blf_dsc_controller.commissioning.measurement import Measured, check_joints
 from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.observer_pole import ObserverPole, SensedLoops
 from blf_dsc_controller.commissioning.planned import measuring_gains
@@ -220,11 +220,7 @@ def _check_runs(config: ControllerConfig, runs: Sequence[Measured]) -> None:
             'there is no run of a motion in a posture: give the bags of these, too'
         )
     for run, _ in runs:
-        if run.joints != config.joints:
-            raise BlfDscError(
-                f'the run is of the joints {", ".join(run.joints)}, the configuration of '
-                f'{", ".join(config.joints)}'
-            )
+        check_joints('the run', run.joints, config)
 
 
 def _assumed_inertia(arm: Design, responses: Sequence[Response]) -> Floats:

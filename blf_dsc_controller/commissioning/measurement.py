@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run
 
 
@@ -21,10 +23,23 @@ class Measured(NamedTuple):
     config: ControllerConfig
 
 
-def measured_in(bag: str | Path) -> Measured:
+def measured_in(bag: str | Path, config: ControllerConfig | None = None) -> Measured:
     """Return what a bag has.
 
-    Raises BagError if it cannot be read, or has no configuration.
+    Raises BagError if it cannot be read, or has no configuration; BlfDscError if it is of other
+    joints than `config`.
     """
     content = read_content(Path(bag))
-    return Measured(recorded_run(content, np.asarray), content.controller_config())
+    recorded = content.controller_config()
+    if config is not None:
+        check_joints(str(bag), recorded.joints, config)
+    return Measured(recorded_run(content, np.asarray), recorded)
+
+
+def check_joints(name: str, joints: Sequence[str], config: ControllerConfig) -> None:
+    """Raise BlfDscError if a run of this name is of other joints than the configuration."""
+    if tuple(joints) != config.joints:
+        raise BlfDscError(
+            f'{name} is of the joints {", ".join(joints)}, the configuration of '
+            f'{", ".join(config.joints)}: give runs and the configuration of the same arm'
+        )

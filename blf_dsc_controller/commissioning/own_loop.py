@@ -263,7 +263,9 @@ class Commissioning:
                 before its time, or lacks joint states.
         """
         measured = [
-            Measured(*each) if isinstance(each, tuple) else measured_in(each)
+            Measured(*each)
+            if isinstance(each, tuple)
+            else measured_in(each, self.config)
             for each in runs
         ]
         slow = [each for each in measured if self.is_slow_motion(each)]

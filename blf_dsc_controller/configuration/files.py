@@ -18,12 +18,13 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib.util
+import itertools
 import math
 import re
 import stat
 import sys
 import sysconfig
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -40,6 +41,8 @@ _DECIMAL = re.compile(r'[+-]?(?P<digits>[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-
 _SPECIAL = re.compile(
     r'[+-]?(?i:inf|infinity|nan)|[+-]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)'
 )
+_COMMA = re.compile(r'[+-]?(?:0,[0-9]*[1-9]|[0-9]+,0[0-9])[0-9]*')  # 0,35 or 1,05
+DECIMAL_POINT = 'a comma separates entries; if 0,035 is to be one number, write 0.035'
 
 _MARK = 'ros__parameters'
 _PART = re.compile(r'\*|\*\*|[A-Za-z_][A-Za-z0-9_]*')
@@ -207,11 +210,18 @@ def _value(node: yaml.Node, name: str) -> object:
     if len({type(value) for value in values}) > 1:
         words = [value for value in values if isinstance(value, str)]
         alike = f'{words[0]!a} is text' if words else '1.0, not 1'
+        if _has_decimal_comma([entry.value for entry in node.value]):
+            alike += f'; {DECIMAL_POINT}'
         raise _error(
             node,
             f'{name} mixes types, which ROS rejects: write all entries alike ({alike})',
         )
     return values
+
+
+def _has_decimal_comma(words: Sequence[str]) -> bool:
+    """Whether two words may be a number that was written with a comma, such as 0 and 035."""
+    return any(_COMMA.fullmatch(f'{a},{b}') for a, b in itertools.pairwise(words))
 
 
 def _scalar(node: yaml.Node, name: str) -> object:
@@ -223,7 +233,8 @@ def _scalar(node: yaml.Node, name: str) -> object:
     if node.style in ('"', "'") or node.tag == 'tag:yaml.org,2002:str':
         return node.value
     if not node.value:
-        raise _error(node, f'{name} has no value')
+        hint = f': {DECIMAL_POINT}' if name.rpartition('.')[2].isdigit() else ''
+        raise _error(node, f'{name} has no value{hint}')
     return parse_scalar(node.value)
 
 

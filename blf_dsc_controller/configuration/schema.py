@@ -32,7 +32,7 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 import yaml
 
-from blf_dsc_controller.configuration.files import parse_scalar
+from blf_dsc_controller.configuration.files import DECIMAL_POINT, parse_scalar
 from blf_dsc_controller.errors import ArgumentTypeError, BlfDscError, ConfigurationError
 
 Config = TypeVar('Config')
@@ -120,7 +120,9 @@ class Parameter:
             lacks_point = self.type is float and all(
                 _is(entry, int | float) for entry in entries
             )
-            expected += ', with a decimal point' if lacks_point else ''
+            if lacks_point:
+                expected += ', with a decimal point'
+                expected += f': {DECIMAL_POINT}' if _alternate(entries) else ''
             if self.type is str and not any(isinstance(each, str) for each in entries):
                 expected += ': write it in quotes'
             if self.type is not str and any(isinstance(each, str) for each in entries):
@@ -154,13 +156,14 @@ class Parameter:
             yield f'{self.name}: got {format_value(entries[first])}{place}, but {expected}{more}'
 
     def _unquoted(self, entries: Sequence[Any]) -> str:
-        """Return the remedy if entries would be of this type but for their quotes, or empty."""
-        words = [parse_scalar(each) for each in entries if isinstance(each, str)]
-        return (
-            ': write it without quotes'
-            if all(_is(word, self.type) for word in words)
-            else ''
-        )
+        """Return the remedy if quotes or a comma keep entries from this type, or empty."""
+        given = [each for each in entries if isinstance(each, str)]
+        if all(_is(parse_scalar(each), self.type) for each in given):
+            return ': write it without quotes'
+        with_points = [each.replace(',', '.', 1) for each in given]
+        if all(_is(parse_scalar(each), self.type) for each in with_points):
+            return f': write a decimal point, {", ".join(with_points)}'
+        return ''
 
     def spelt(self, given: Any) -> Any:
         """Return a value as it was written.
@@ -439,6 +442,15 @@ def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[st
         )
         entries = 'entry is' if needed == 1 else 'entries are'
         yield f'{param.name}: got {length}, but {needed} {entries} needed ({factors})'
+
+
+def _alternate(entries: Sequence[float]) -> bool:
+    """Whether entries may be the parts of numbers with a decimal comma: 0, 35, 0, 35."""
+    whole, parts = entries[::2], entries[1::2]
+    if not len(whole) == len(parts) > 1:
+        return False
+    repeats = len({*whole}) == len({*parts}) == 1 and whole[0] != parts[0]
+    return repeats or (not any(whole) and all(parts))
 
 
 def _is(value: object, type_: Any) -> bool:

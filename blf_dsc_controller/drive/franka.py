@@ -156,6 +156,7 @@ class FrankaDriver(Driver):
     def start(self) -> None:
         """Begin torque control."""
         self._control = None  # one that a reflex has ended excludes another
+        self._torque = np.zeros(_JOINTS)  # not that of the motion before
         with self._explained('torque control was refused'):
             self._control = self._robot.start_torque_control()
 
@@ -179,7 +180,7 @@ class FrankaDriver(Driver):
     def write(self, torque: Vector | None) -> None:
         """Command torques (7,) [N m] beyond gravity.
 
-        None repeats those before, or zero.
+        None repeats those since the start, or zero.
         """
         if torque is not None:
             self._torque = torque

@@ -47,7 +47,10 @@ def width_warnings(
     remedy = f'is it in mm? Give {1e-3 * widest:.3g}'
     if units == TURNING:
         wide += f' is {math.degrees(widest):.3g} degrees and'
-        remedy = f'is it in degrees? Give {math.radians(widest):.3g}'
+        remedy = (
+            f'is it in degrees? Give {math.radians(widest):.3g}; in mrad? Give '
+            f'{1e-3 * widest:.3g}'
+        )
     if of_tool := _tool_parameter(config):
         name = of_tool
         remedy = 'the bound of a joint follows from this one: give less'

@@ -142,7 +142,7 @@ class TorqueWatchdog:
         self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
         if now - self._seen_at > LONG_SILENCE:
             self._forget_controller()
-        if stamp > self.stamp or self.stamp < 0:
+        if stamp > self.stamp:
             self._seen_at = now
         self.stamp = stamp
         if self._armed:
