@@ -399,15 +399,19 @@ def computed_torque_with(path, statement):
     return str(path), before.count('\n') + 1
 
 
-@pytest.mark.parametrize('supervised', [True, False])
-def test_error_of_a_law_is_told_with_its_line(supervised, tmp_path):
-    statement = 'assert t < 0.005, "too late"'
+@pytest.mark.parametrize(
+    ('right', 'supervised'),
+    [('t < 0.005', True), ('t < 0.005', False), ('t > 0.0', True)],
+)
+def test_error_of_a_law_is_told_with_its_line(right, supervised, tmp_path):
+    """In a run, and in the sample that a controller computes when it is made."""
+    statement = f'assert {right}, "wrong time"'
     law, line = computed_torque_with(tmp_path / 'law.py', statement)
     loop = blf.load_loop('recommended', {'blf_dsc_controller': {'law': law}})
     plant = change(loop.plant, {'duration': 0.01})
     with pytest.raises(BlfDscError) as raised:
         blf.simulate(loop.controller, plant, supervised=supervised)
-    assert str(raised.value) == f'{law}, line {line}: AssertionError: too late'
+    assert str(raised.value) == f'{law}, line {line}: AssertionError: wrong time'
 
 
 def test_law_without_a_first_torque_does_not_start(tmp_path):
