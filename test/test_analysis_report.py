@@ -526,3 +526,21 @@ def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
     assert plot['marks'] == [
         (pytest.approx(1.0), 'stop: velocity not plausible', ALARM, pytest.approx(1.8))
     ]
+
+
+@pytest.mark.parametrize(
+    ('ends', 'written'),
+    [
+        ((2.0, 120.0), ['2', '5', '10', '20', '50', '100']),
+        ((17.0, 24.0), ['18', '20', '22', '24']),
+    ],
+)
+def test_logarithmic_axis_has_plain_numbers_to_read_it_by(ends, written, tmp_path):
+    picture = figures.Picture(1, 1, 'response', (4.0, 3.0), share_time=False)
+    axes = picture.axes[0, 0]
+    axes.loglog(ends, ends)
+    picture.save(tmp_path / 'response.png')
+    low, high = axes.get_xlim()
+    ticks = zip(axes.get_xticks(), axes.get_xticklabels(), strict=True)
+    assert [label.get_text() for x, label in ticks if low <= x <= high] == written
+    assert not any(each.get_text() for each in axes.get_xticklabels(minor=True))

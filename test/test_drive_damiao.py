@@ -510,6 +510,13 @@ def test_driver_is_found_by_its_name():
     assert find_driver('damiao').__name__ == 'DamiaoDriver'
 
 
+def test_joints_that_cannot_be_shown_are_a_line_on_stderr(capsys):
+    arguments = ['--robot', 'can0', '--config', 'no_such_preset', '--period', '0']
+    assert show_joints.main(arguments) == 1
+    (line,) = capsys.readouterr().err.splitlines()[:1]
+    assert line.startswith('show_joints: ')
+
+
 def test_joints_are_shown_without_a_torque_and_a_turn_too_much_is_told(
     tmp_path, capsys
 ):

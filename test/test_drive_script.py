@@ -87,6 +87,24 @@ def test_simulated_drives_stop_by_themselves_and_are_released_where_they_are():
     np.testing.assert_allclose(driver.read().q, before, atol=1e-4)
 
 
+def test_simulated_drives_take_no_first_torque_for_a_jump():
+    """They hold the arm between two runs, also where it needs 5 N m."""
+    loop = blf.load_loop('fr3_direct')
+    driver = simulated(loop.plant)(SIMULATED, loop.controller, DriveConfig())
+    driver.connect()
+    driver.start()
+    for k in range(6):
+        driver.write(np.full(7, float(k)))  # N m: 1000 N m/s
+    driver.read()
+    driver.finish()
+    driver.start()
+    driver.write(np.zeros(7))
+    driver.read()
+    driver.write(np.full(7, 5.0))
+    with pytest.raises(ReflexError, match='faster than'):
+        driver.read()
+
+
 def test_simulated_robot_reports_motors_that_have_encoders():
     loop = blf.load_loop('panda', {PLANT: {'sensor.side': 'both'}})
     for plant, has in ((loop.plant, True), (blf.load_loop('panda').plant, False)):
@@ -476,6 +494,8 @@ def test_what_cannot_be_done_is_refused_with_the_reason_and_the_arm_holds(arm):
     for wrong in ([1.0, 2.0], [('now', [0.1] * 7)], 1.0):
         with pytest.raises(DriveError, match='must be a time and positions'):
             arm.follow(wrong)
+    with pytest.raises(DriveError, match='where a list of numbers belongs'):
+        arm.follow([[1.0, *before]])  # a row of a table
     with pytest.raises(DriveError, match='points: got none'):
         arm.follow([])
     with pytest.raises(DriveError, match='the last one is at 0 s'):

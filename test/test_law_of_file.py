@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import pickle
 import subprocess
@@ -13,13 +14,14 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import pytest
-from command import finished
+from command import closed_loop, finished
 from numba import config as numba_config
 from numba import typeof
 
 import blf_dsc_controller as blf
 from benchmark.studies import path_of
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -28,7 +30,7 @@ from blf_dsc_controller.configuration.law_traits import LAWS, OWN, traits_of
 from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import BlfDscError, ConfigurationError, StartError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
@@ -118,6 +120,11 @@ IMPORTS = (
             METHODS.replace('dt, saturated', 'dt'),
             'LAW.finish must have the arguments self, settings, state, signals, dt, saturated',
         ),
+        (
+            METHODS.replace('pass', 'state.memory[0] += dt', 1)
+            + '    has_barrier = True\n',
+            'state.memory is used, but there is no MEMORY',
+        ),
     ],
 )
 def test_file_that_defines_no_law_is_refused(text, problem, tmp_path):
@@ -174,6 +181,7 @@ compiling = pytest.mark.skipif(numba_config.DISABLE_JIT, reason='nothing is comp
 def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tmp_path):
     path = tmp_path / 'law.py'
     helper = 'import numpy as np\n\n\ndef doubled(x):\n    return x\n\n\n'
+    helper += "MEMORY = NamedTuple('MEMORY', [('sum', Annotated[np.ndarray, 'n'])])\n"
     mistaken = METHODS.replace('pass', f'signals.demand[0] += {line}', 1)
     law = law_of_text(path, helper + mistaken)(1.0)
     with pytest.raises(BlfDscError) as raised:
@@ -381,6 +389,45 @@ def test_law_tracks_and_keeps_its_memory_in_the_state(preset, bound):
     assert not controller.state.memory.any()
     controller.restore(saved)
     assert controller.state.memory.any()
+
+
+def computed_torque_with(path, statement):
+    """Return the file of a law that first executes a statement, and the line of this."""
+    first = '        memory = memory_of(state.memory, settings)\n'
+    before, _, after = Path(LAW).read_text(encoding='utf-8').partition(first)
+    path.write_text(f'{before}        {statement}\n{first}{after}', encoding='utf-8')
+    return str(path), before.count('\n') + 1
+
+
+@pytest.mark.parametrize(
+    ('right', 'supervised'),
+    [('t < 0.005', True), ('t < 0.005', False), ('t > 0.0', True)],
+)
+def test_error_of_a_law_is_told_with_its_line(right, supervised, tmp_path):
+    """In a run, and in the sample that a controller computes when it is made."""
+    statement = f'assert {right}, "wrong time"'
+    law, line = computed_torque_with(tmp_path / 'law.py', statement)
+    loop = blf.load_loop('recommended', {'blf_dsc_controller': {'law': law}})
+    plant = change(loop.plant, {'duration': 0.01})
+    with pytest.raises(BlfDscError) as raised:
+        blf.simulate(loop.controller, plant, supervised=supervised)
+    assert str(raised.value) == f'{law}, line {line}: AssertionError: wrong time'
+
+
+def test_law_without_a_first_torque_does_not_start(tmp_path):
+    """Simulated, and over ROS: the arm would wait for ever for its first torque."""
+    statement = 'signals.xi1[0] = float("nan")'
+    law, _ = computed_torque_with(tmp_path / 'law.py', statement)
+    given = {'law': law, 'barrier.bound': [0.1, 0.1]}
+    loop = blf.load_loop('recommended', {'blf_dsc_controller': given})
+    with pytest.raises(StartError, match='the demanded torque is not finite'):
+        blf.simulate(loop.controller, loop.plant)
+    pytest.importorskip('rclpy', reason='needs ROS 2')
+    file = tmp_path / 'loop.yaml'
+    file.write_text(f'blf_dsc_controller:\n  ros__parameters: {json.dumps(given)}\n')
+    run = closed_loop('--config', file, '--mode', 'lockstep', '--out', tmp_path / 'out')
+    assert run.returncode == STOPPED, run.stderr
+    assert 'torque not finite: the demanded torque is not finite' in run.stdout
 
 
 def test_gains_change_while_it_runs():

@@ -24,6 +24,7 @@ from blf_dsc_controller.configuration.nodes import known_names, load_loop, locat
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference import terms
@@ -31,7 +32,7 @@ from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.monte_carlo import torque_rows
-from blf_dsc_controller.studies.tuning import parameters_at, value_at
+from blf_dsc_controller.studies.tuning import Gain, parameters_at, value_at
 
 
 def test_every_law_is_tuned_with_the_same_effort():
@@ -462,6 +463,8 @@ def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monke
 
 def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
     taken = f"{IMPORT}LAWS = {{'slotine_li': StudiedLaw('mine')}}"
+    gain = "(type('Gain', (), {'name': 'gains.k', 'least': 9.0, 'most': 1.0}),)"
+    turned = f"{IMPORT}LAWS = {{'mine': StudiedLaw('mine', {gain})}}"
     for name, text, problem in (
         ('missing.py', None, 'expected a law of the study (proposed, '),
         ('json.py', '', 'there is another module of this name'),
@@ -469,6 +472,11 @@ def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
         ('unclosed.py', '\nLAWS = {', 'cannot be imported: line 2: '),
         ('empty.py', '', 'LAWS must be a dict of StudiedLaw by name. For the law of'),
         ('taken.py', taken, 'has a law slotine_li already'),
+        (
+            'turned.py',
+            turned,
+            "got Gain('gains.k', 9, 1), but its range must be above 0",
+        ),
     ):
         if text is not None:
             (tmp_path / name).write_text(text)
@@ -476,6 +484,13 @@ def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
         assert main(['arms', '--laws', str(tmp_path / name), '--out', str(out)]) == 1
         assert problem in capsys.readouterr().err
         assert not out.exists()
+
+
+def test_gain_that_a_law_does_not_have_is_named():
+    config = load_loop('ur5e_rigid').controller
+    mistaken = Gain('feedback.stifness', 0.1, 1.0)
+    with pytest.raises(BlfDscError, match=r'did you mean feedback\.stiffness'):
+        parameters_at(config, [mistaken], [0.5])
 
 
 def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch, capsys):

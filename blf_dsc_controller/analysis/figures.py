@@ -11,10 +11,11 @@ from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from blf_dsc_controller.analysis.event_times import change_times, true_change_times
 from blf_dsc_controller.analysis.metrics import Metrics, measure
@@ -48,6 +49,9 @@ _CLOSE_UP = (9.5, 2.6)
 _BEFORE, _AFTER = 1.0, 2.0  # s, shown of a change
 _FLAT = 2.0  # ratio of the largest to the least value of what hardly changes
 _DECADE = 10.0
+_LONG = (
+    100.0  # ratio of the ends of a logarithmic axis, for which powers of ten will do
+)
 _SHADED = 0.1  # opacity of a span
 _ABOVE = 1.15  # of the height of a panel, where the legend of its column is
 # points, widths of lines
@@ -117,9 +121,26 @@ class Picture:
                 lowest = [axes for axes in column if axes.get_visible()][-1]
                 lowest.set_xlabel('time [s]')
                 lowest.tick_params(labelbottom=True)
+            for axes in self.axes.flat:
+                _number(axes.xaxis)
+                _number(axes.yaxis)
             # Figure.savefig would draw twice, the first time for the layout only.
             with writing(path) as part:
                 self._canvas.print_png(part)  # type: ignore[no-untyped-call]
+
+
+def _number(axis: Axis) -> None:
+    """Write plain numbers at a logarithmic axis, and enough of them, unless it is long."""
+    low, high = axis.get_view_interval()
+    if axis.get_scale() != 'log' or high > _LONG * low:
+        return
+    axis.set_major_locator(
+        LogLocator(subs=(1.0, 2.0, 5.0))
+        if high > _DECADE * low
+        else MaxNLocator(5, steps=[1, 2, 5, 10])
+    )
+    axis.set_major_formatter('{x:g}')
+    axis.set_minor_formatter(NullFormatter())
 
 
 def head(axes: Axes, title: str, *, legend_at: float | None = None) -> None:

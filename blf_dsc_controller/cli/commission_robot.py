@@ -36,6 +36,8 @@ from blf_dsc_controller.commissioning.proof import (
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.nodes import PLANT
+from blf_dsc_controller.configuration.plant import pick_ups
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.drivers import driver_of
@@ -58,7 +60,8 @@ def robot(
     """
     folder = prepared_folder(options)
     config = commissioning.config
-    driver = driver_of(options.robot, path, config)
+    unloaded = {PLANT: pick_ups([], [])}  # a simulated arm, which nobody disturbs
+    driver = driver_of(options.robot, path, config, unloaded)
     with announced_compilation(print_notice):
         ArmController(config).close()
     with closing(driver):

@@ -14,6 +14,7 @@ from blf_dsc_controller import child
 from blf_dsc_controller.compiled.announcement import COMPILING
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, RECORDER, VIEW
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.controller_log import NOTHING_COMMANDED, WAITS_FOR_RESET
 
 LOOP = 'loop'
 """Name of the process of controller and plant, in lock-step."""
@@ -80,6 +81,14 @@ class NodeProcess:
     def serves(self) -> bool:
         """Whether the node has said where its page is."""
         return any(_PAGE in line for line in self._whole_lines())
+
+    @property
+    def waits_for_reset(self) -> bool:
+        """Whether the node has said that it stopped before its first torque, and goes on."""
+        return any(
+            f'{NOTHING_COMMANDED}: ' in line and line.endswith(WAITS_FOR_RESET)
+            for line in self._whole_lines()
+        )
 
     def take_notices(self) -> list[str]:
         """Return what the node has reported of its kernels or its page since the last call."""

@@ -98,8 +98,8 @@ def _run_nodes(
 ) -> bool:
     """Run the nodes until the plant has ended.
 
-    Return False if something else ended the run; raise KeyboardInterrupt if it had not
-    begun.
+    A controller that stops before its first torque ends it, too. Return False if something
+    else did; raise KeyboardInterrupt if the run had not begun.
     """
     # stops the nodes in reverse, then restores the handlers
     with ExitStack() as ending:
@@ -120,14 +120,22 @@ def _run_nodes(
         def is_running() -> bool:
             return all(node.is_running for node in nodes) and not interrupts
 
-        _wait_while(lambda: is_running() and monitor.start is None, monitor, nodes)
-        _wait_while(is_running, monitor, pages)
+        def has_stopped() -> bool:
+            return monitor.start is None and any(n.waits_for_reset for n in nodes[1:])
+
+        _wait_while(
+            lambda: is_running() and monitor.start is None and not has_stopped(),
+            monitor,
+            nodes,
+        )
+        stopped = has_stopped()  # and nobody will reset it: the arm would wait for ever
+        _wait_while(lambda: is_running() and not stopped, monitor, pages)
         if interrupts and monitor.start is None:
             _do_not_wait_for(nodes)  # they import, compile or wait for each other
             raise KeyboardInterrupt
         _hurry_without_recorder(*nodes)
-        completed = not (interrupts or nodes[-1].is_running)
-        if completed:
+        completed = not interrupts and (stopped or not nodes[-1].is_running)
+        if completed and not stopped:
             monitor.show(config.plant.duration)
             _keep(pages, nodes[1:], monitor, interrupts)
     for node in nodes:

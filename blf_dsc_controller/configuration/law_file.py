@@ -22,8 +22,12 @@ import importlib.util
 import inspect
 import re
 import sys
+import traceback
 import typing
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import CodeType, ModuleType
 from typing import Any, NamedTuple
 
 from blf_dsc_controller.configuration.schema import Parameter
@@ -116,6 +120,21 @@ def digest(law: str) -> str:
     return hashlib.sha256(_File.of(law).read()).hexdigest()
 
 
+@contextmanager
+def errors_told_with_line(law: str) -> Iterator[None]:
+    """Raise what a law of a file raises as a BlfDscError with its line; nothing else changes."""
+    try:
+        yield
+    except Exception as error:
+        raised = traceback.extract_tb(error.__traceback__)[-1]
+        path = _File.of(law).path if is_file(law) else None
+        # Kernels that are kept name a file of this content, perhaps elsewhere.
+        if path is None or Path(raised.filename).name != path.name:
+            raise
+        text = f'{path}, line {raised.lineno}: {type(error).__name__}: {error}'
+        raise BlfDscError(text) from error
+
+
 @functools.cache
 def _load(place: Path, content: bytes) -> type:
     # Kernels and pickles find the module by this name, another content has another one.
@@ -133,7 +152,7 @@ def _load(place: Path, content: bytes) -> type:
         del sys.modules[name]
         raise BlfDscError(f'{place} cannot be imported: {error!r}') from error
     law = getattr(module, 'LAW', None)
-    problem = _problem(law)
+    problem = _problem(law) or _problem_of_memory(module, code)
     if problem:
         raise BlfDscError(f'{place}: {problem}')
     return typing.cast('type', law)
@@ -164,6 +183,25 @@ def _problem_of_methods(law: type) -> str:
     if not hasattr(law, 'has_barrier'):
         return 'LAW does not say by has_barrier whether it keeps the error inside its bound'
     return ''
+
+
+def _problem_of_memory(module: ModuleType, code: CodeType) -> str:
+    """Return that a file uses `state.memory` without `MEMORY`, or nothing.
+
+    The memory would have no numbers, and what a law keeps would overwrite others.
+    """
+    if hasattr(module, 'MEMORY') or 'memory' not in _names_in(code):
+        return ''
+    return (
+        'state.memory is used, but there is no MEMORY, which says how many numbers it has: add '
+        'MEMORY = Memory at the end, with the name of your class'
+    )
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """Return the attributes and global names that code uses, with its functions and classes."""
+    inner = [each for each in code.co_consts if isinstance(each, CodeType)]
+    return {*code.co_names}.union(*(_names_in(each) for each in inner))
 
 
 def memory_of(law: type) -> type | None:

@@ -163,7 +163,7 @@ class Drive:
         """
         try:
             given = [
-                [float(time), *(np.asarray(each, float).tolist() for each in values)]
+                [float(time), *(_listed(each) for each in values)]
                 for time, *values in points
             ]
         except (TypeError, ValueError) as error:
@@ -417,3 +417,11 @@ class Drive:
         if problem is not None:
             of, hint = self._hint
             raise MotionFailedError(problem + hint if number == of else problem)
+
+
+def _listed(values: Any) -> list[float]:
+    """Return a field of a point as a list; TypeError or ValueError if it is none."""
+    field = np.asarray(values, float)
+    if field.ndim != 1:
+        raise ValueError(f'got {values} where a list of numbers belongs')
+    return [float(each) for each in field]

@@ -9,6 +9,7 @@ Turn a joint by hand: the number must grow as the URDF turns it, and be 0 at its
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
@@ -20,6 +21,7 @@ from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.drive.drivers import driver_of
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import joint_units
 
 _TURN = 2.0 * np.pi  # rad
@@ -41,26 +43,34 @@ def lines(chain: Chain, positions: ArrayLike) -> Iterator[str]:
         yield f'{text}: outside{hint}'
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the joints again and again, until Ctrl-C."""
-    parser = argparse.ArgumentParser(prog='show_joints', description=__doc__)
-    parser.add_argument('--robot', required=True, help='its address')
-    parser.add_argument('--config', required=True, help='parameter file or preset')
-    parser.add_argument('--period', type=float, default=0.5, help='s; 0: once')
-    options = parser.parse_args(arguments)
-    path = locate(options.config)
+def _show(robot: str, given: str, period: float) -> None:
+    path = locate(given)
     config = load(path, CONTROLLER, ControllerConfig)
     chain = config.robot.chain(config.joints)
     with (
-        closing(driver_of(options.robot, path, config)) as driver,
+        closing(driver_of(robot, path, config)) as driver,
         suppress(KeyboardInterrupt),
     ):
         driver.connect()
         while True:
             print('\n'.join(lines(chain, driver.positions())), flush=True)  # noqa: T201
-            if not options.period:
+            if not period:
                 break
-            time.sleep(options.period)
+            time.sleep(period)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the joints again and again, until Ctrl-C; return an exit code."""
+    parser = argparse.ArgumentParser(prog='show_joints', description=__doc__)
+    parser.add_argument('--robot', required=True, help='its address')
+    parser.add_argument('--config', required=True, help='parameter file or preset')
+    parser.add_argument('--period', type=float, default=0.5, help='s; 0: once')
+    options = parser.parse_args(arguments)
+    try:
+        _show(options.robot, options.config, options.period)
+    except BlfDscError as error:
+        print(f'show_joints: {error}', file=sys.stderr)  # noqa: T201
+        return 1
     return 0
 
 

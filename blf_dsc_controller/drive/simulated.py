@@ -25,6 +25,7 @@ from blf_dsc_controller.motors.damiao import ranges_of
 from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
 from blf_dsc_controller.run import FIRST_STAMP, NANOSECOND
 from blf_dsc_controller.supervision.drive_load import DriveLoad
+from sim_plant.kernels import plant_views
 from sim_plant.motors import IN_REAL_TIME, MotorPlant
 from sim_plant.plant import plant_of
 from sim_plant.sampled_plant import Plant
@@ -73,7 +74,12 @@ class SimulatedDriver(Driver):
         return np.asarray(self._measure()[0])
 
     def start(self) -> None:
-        """Begin to wait for torques."""
+        """Begin to wait for torques: those of an earlier run are forgotten, as no jump counts."""
+        plant = self.plant
+        now = plant_views(plant.arm, plant.settings, plant.state)[1]
+        now.drives.command[:] = (
+            0.0  # since then the drives have held the arm by themselves
+        )
         self._is_braked = True
         self._due = time.monotonic()
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_file import errors_told_with_line
 from blf_dsc_controller.errors import check_type
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
@@ -21,7 +22,10 @@ def controller_of(config: ControllerConfig) -> Controller:
     check_type(
         'config', config, ControllerConfig, 'load_loop returns it as .controller'
     )
-    return Controller(law_of(config), settings_of_config(config), reference_of(config))
+    with errors_told_with_line(config.law):
+        return Controller(
+            law_of(config), settings_of_config(config), reference_of(config)
+        )
 
 
 def begin(

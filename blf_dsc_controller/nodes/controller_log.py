@@ -14,6 +14,11 @@ from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.supervisor import STAMPS, Phase, Reason
 
+NOTHING_COMMANDED = 'nothing is commanded'
+"""Begins what is logged of a stop before the first torque."""
+WAITS_FOR_RESET = '/reset starts again'
+"""Ends what is logged of a stop that the node outlives."""
+
 
 class ControllerLog:
     """Logs what is new of a guard; it remembers what has been logged.
@@ -73,8 +78,8 @@ class ControllerLog:
             return
         torque = f'{guard.config.safety.torque} torque'
         if not guard.commanding:
-            torque = 'nothing is commanded'
-        after = f'{self._node.get_fully_qualified_name()}/reset starts again'
+            torque = NOTHING_COMMANDED
+        after = f'{self._node.get_fully_qualified_name()}{WAITS_FOR_RESET}'
         if ends:
             after = 'this node ends'
         texts = (

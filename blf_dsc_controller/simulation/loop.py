@@ -22,10 +22,11 @@ import numpy as np
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_file import errors_told_with_line
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
-from blf_dsc_controller.errors import BlfDscError, check_type
+from blf_dsc_controller.errors import BlfDscError, StartError, check_type
 from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.controller import Controller
@@ -66,9 +67,9 @@ def simulate(
     The plant's duration must not be 0.  If not `supervised`, the law runs alone, past
     its limits too.  A run whose law has been stopped for `after_stop` [s] may end early.
 
-    Raises StartError if the law cannot take over and approach.enabled is false,
-    MotionError if there is no approach within the limits, and ArgumentTypeError if the
-    configurations are others.
+    Raises StartError if the law cannot take over and approach.enabled is false, or stops
+    before its first torque, MotionError if there is no approach within the limits, and
+    ArgumentTypeError if the configurations are others.
     """
     remedy = 'simulate(loop.controller, loop.plant) runs what load_loop returns'
     check_type('controller_config', controller_config, ControllerConfig, remedy)
@@ -103,7 +104,7 @@ def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
 
     Raises StartError if the law cannot take over and approach.enabled is false, and
     MotionError if there is no approach within the limits; BlfDscError if the plant is
-    not compiled.
+    not compiled, or a law of a file fails.
     """
     if not plant.is_compiled:
         raise BlfDscError(
@@ -113,7 +114,8 @@ def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
     q, dq, _ = plant.measure().reshape(3, -1)
     begin(record.controller, record.config, q, dq)
     span = Span(0, record.stamps.size - 1, is_end=True, observed=observed)
-    CompiledLoop(record.controller, plant).run(span, record.rows_to_fill())
+    with errors_told_with_line(record.config.law):
+        CompiledLoop(record.controller, plant).run(span, record.rows_to_fill())
 
 
 def _run_supervised(
@@ -126,12 +128,16 @@ def _run_supervised(
         chunk = range(first, min(first + _CHUNK, size) if first else 1)
         record = rows_of(chunk)
         is_end = chunk.stop == size
-        if not (
-            first and _run_compiled(loop, guard, plant, record, chunk, is_end=is_end)
-        ):
-            _run_guarded(guard, plant, record, bound, is_end=is_end)
+        with errors_told_with_line(guard.config.law):
+            if not (
+                first
+                and _run_compiled(loop, guard, plant, record, chunk, is_end=is_end)
+            ):
+                _run_guarded(guard, plant, record, bound, is_end=is_end)
         if guard.starting.error is not None:
             raise guard.starting.error
+        if guard.supervisor.stops and not guard.commanding:  # nothing would ever move
+            raise StartError(guard.supervisor.text)
         if is_end:
             _release(guard, record)
         bound[:] = record.sample(-1).bound

@@ -255,6 +255,12 @@ def load_laws(path: Path) -> list[str]:
             "second one with LAWS = {'mine': StudiedLaw('my law', (), 'my_law.py')}, as in "
             'doc/tutorial_law.md'
         )
+    for gain in (gain for law in added.values() for gain in law.gains):
+        if not 0.0 < gain.least < gain.most:
+            raise BlfDscError(
+                f'{path}: got Gain({gain.name!r}, {gain.least:g}, {gain.most:g}), but its range '
+                'must be above 0, the smaller end first'
+            )
     for name, law in added.items():
         if LAWS.setdefault(name, law) is not law:
             raise BlfDscError(

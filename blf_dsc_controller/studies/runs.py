@@ -149,7 +149,7 @@ def _events(record: Record, samples: Sample, plant: PlantConfig) -> Row:
         'outcome': outcome,
         'first_violation_s': float(violation),
         'latch_time_s': float(t[latch[0]]) if latch.size else nan,
-        'saturated_fraction': float(is_cut.mean()),
+        'saturated_fraction': float(is_cut.mean()) if is_cut.size else nan,
     }
 
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import Value, flatten
+from blf_dsc_controller.configuration.schema import Value, flatten, suggestion
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats
 
 SEED = 1
@@ -43,12 +44,20 @@ def parameters_at(
     values: Iterable[float],
     inertia: Floats | float = 1.0,
 ) -> dict[str, Value]:
-    """Return the parameters for these gains; `inertia` (n,) is m of the arm."""
+    """Return the parameters for these gains; `inertia` (n,) is m of the arm.
+
+    Raises BlfDscError if the law has none of such a name.
+    """
     present = flatten(config)
     chosen = dict[str, Floats]()
     for gain, value in zip(gains, values, strict=True):
         if gain.inertial:
             chosen[gain.name] = np.asarray(value * inertia)
+        elif gain.name not in present:
+            raise BlfDscError(
+                f'Gain({gain.name!r}, ...): there is no such parameter'
+                f'{suggestion(gain.name, present)}'
+            )
         else:
             of = chosen.setdefault(gain.name, np.array(present[gain.name], dtype=float))
             of[gain.joint if gain.joint >= 0 else ...] = value
