@@ -49,9 +49,8 @@ _CLOSE_UP = (9.5, 2.6)
 _BEFORE, _AFTER = 1.0, 2.0  # s, shown of a change
 _FLAT = 2.0  # ratio of the largest to the least value of what hardly changes
 _DECADE = 10.0
-_LONG = (
-    100.0  # ratio of the ends of a logarithmic axis, for which powers of ten will do
-)
+# ratio of the ends of a logarithmic axis, above which powers of ten will do
+_LONG = 100.0
 _SHADED = 0.1  # opacity of a span
 _ABOVE = 1.15  # of the height of a panel, where the legend of its column is
 # points, widths of lines

@@ -89,9 +89,8 @@ def _files_of(path: Path) -> list[Path]:
         candidates = path.glob('*.mcap') if path.is_dir() else [path]
         files = [file for file in candidates if file.is_file()]
         if any(file.stat().st_size for file in files):
-            return sorted(
-                files, key=lambda file: (len(file.name), file.name)
-            )  # 10 after 9
+            # bag_10 after bag_9
+            return sorted(files, key=lambda file: (len(file.name), file.name))
         problem = NOTHING_RECORDED if files else _no_file(path)
     raise BagError(f'{path} cannot be read as a bag: {problem}')
 

@@ -77,9 +77,7 @@ class SimulatedDriver(Driver):
         """Begin to wait for torques: those of an earlier run are forgotten, as no jump counts."""
         plant = self.plant
         now = plant_views(plant.arm, plant.settings, plant.state)[1]
-        now.drives.command[:] = (
-            0.0  # since then the drives have held the arm by themselves
-        )
+        now.drives.command[:] = 0.0  # the drives have held the arm themselves
         self._is_braked = True
         self._due = time.monotonic()
 
