@@ -65,9 +65,7 @@ class ObserverPole(NamedTuple):
     pole: float  # L, rad/s; 0: none
     margin: Margin  # with it, or with the slowest that is tried, where gears resonate
     why_none: str = ''  # of efforts that are no torques of the links
-    noise_hides: bool = (
-        False  # whether it is noise alone that speaks against a faster one
-    )
+    noise_hides: bool = False  # whether noise alone speaks against a faster one
 
 
 class _Left(NamedTuple):
