@@ -83,6 +83,17 @@ def test_a_position_more_than_a_thousand_turns_away_is_no_wrap(turns, counted):
     assert got[0] == pytest.approx(0.0 if counted else turns * tau, abs=1e-9)
 
 
+@pytest.mark.parametrize('lost', [np.nan, np.inf])
+def test_a_turn_is_counted_across_a_state_whose_position_is_lost(lost):
+    wraps = Wraps(build(ControllerConfig, {**ARM, **SWING}))
+    for q in (np.pi - 1e-3, lost, -np.pi + 1e-3):
+        measurement = np.zeros(6)
+        measurement[0] = q
+        got, fault = wraps.count(measurement, 1e-3, 3.0)
+    assert fault is None
+    assert got[0] == pytest.approx(np.pi + 1e-3)
+
+
 @pytest.mark.parametrize('velocity', ['measured', 'estimated'])
 @pytest.mark.parametrize('wrap', [within_a_turn, from_zero])
 def test_wrapping_positions_of_continuous_joints_change_no_torque(wrap, velocity):
