@@ -44,13 +44,15 @@ presets have are left out.  With what is written each runs its motion for 16 s
     pick-up    likewise from the pick-up at 8 s on
     bears      as above
 
-`lags` chooses the gains of each arm by the same runs twice: for damping that does not lag, and
-with a lag where it pays
+`lags` chooses the gains of each arm by the same runs three times: for damping that does not lag,
+with lags of at most 5 ms where they pay, and with any of `choice.LAGS`
 
-    lag [ms]   of each joint's damping
-    stiffer    the gains, joint by joint
-    pick-up    as above, without and with these lags; - if it does not hold
-    bears      likewise
+    lag [ms]   of each joint's damping, the last time
+    stiffer    the gains, joint by joint, than without
+    motion     largest error [mrad] from 3 s to the pick-up, each time; - if it does not hold
+    pick-up    likewise, within 4 s of it
+    later      likewise, from then on
+    bears      as above, each time
 
 `above` says whether a motion that ends at 120 Hz misses anything: the modulus margin of the true
 linear arms up to there and above, in the postures of the measurement, with gains of the preset and
@@ -60,10 +62,10 @@ multiples of them.  Play and friction are left out.
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -109,6 +111,7 @@ LONG, SHORT = 60.0, 16.0  # s
 BEGIN = 3.0  # s, from which errors in motion are counted
 PICK_UP, LOADED = 8.0, 4.0  # s, and for how long after it errors are counted
 FACTORS = (1.5, 2.5, 4.0)
+SHORT_LAG = 0.005  # s
 TIMES = 4  # that an arm is commissioned
 RAISE = 1.03  # step by step, since a loop beyond its stability limit has a margin again
 LEAST = 0.1  # modulus margin, of a loop that is nearly unstable
@@ -135,12 +138,24 @@ def worked(
     controller: ControllerConfig, plant: PlantConfig, seconds: float
 ) -> tuple[bool, float]:
     """Return whether an arm holds, and its largest error [mrad] at the pick-up."""
+    _, pick_up, _ = largest_errors(controller, plant, seconds)
+    return not np.isnan(pick_up), pick_up
+
+
+def largest_errors(
+    controller: ControllerConfig, plant: PlantConfig, seconds: float
+) -> tuple[float, float, float]:
+    """Return the largest errors [mrad] in motion, at the pick-up and later; nan: it stops."""
     run = simulate(controller, change(plant, {'duration': seconds})).run()
     if run.error is None or run.stops or run.oscillations:
-        return False, np.nan
+        return np.nan, np.nan, np.nan
     errors = 1e3 * np.abs(run.error).max(axis=1)
-    loaded = (run.time >= PICK_UP) & (run.time < PICK_UP + LOADED)
-    return True, float(errors[loaded].max())
+    begins = (BEGIN, PICK_UP, PICK_UP + LOADED)
+    motion, pick_up, later = (
+        float(errors[(run.time >= begin) & (run.time < end)].max())
+        for begin, end in itertools.pairwise((*begins, seconds))
+    )
+    return motion, pick_up, later
 
 
 def without_bound(controller: ControllerConfig) -> ControllerConfig:
@@ -235,17 +250,21 @@ def runs_of(controller: ControllerConfig, plant: PlantConfig) -> list[Measured]:
 def lagging(name: str, number: int) -> list[str]:
     """Return the row of `lags` for an arm."""
     controller, measured, plant = measured_of(name, number)
-    without, found = (
-        commissioned(controller, measured, MARGIN, lags) for lags in ((), LAGS)
-    )
-    choice = found.choice
+    short = tuple(lag for lag in LAGS if lag <= SHORT_LAG)
+    found = [
+        commissioned(controller, measured, MARGIN, lags) for lags in ((), short, LAGS)
+    ]
+    choice = found[-1].choice
     row = [
         ', '.join(f'{1e3 * each:g}' for each in np.asarray(choice.gains.damping_lag)),
         ', '.join(f'{each:.2f}' for each in choice.factors / choice.without_lag),
     ]
-    free = [without_bound(each.config) for each in (without, found)]
-    errors = (worked(each, plant, LONG)[1] for each in free)
-    row.append(', '.join('-' if np.isnan(e) else f'{e:.1f}' for e in errors))
+    free = [without_bound(each.config) for each in found]
+    errors = [largest_errors(each, plant, LONG) for each in free]
+    row += [
+        ', '.join('-' if np.isnan(e) else f'{e:.1f}' for e in times)
+        for times in zip(*errors, strict=True)
+    ]
     row.append(', '.join(f'{borne(each, plant):g}' for each in free))
     return [name.rpartition('_')[2], f'{number}', *row]
 
@@ -434,7 +453,7 @@ def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
     """Compute the row of each study."""
     with ProcessPoolExecutor(cores()) as pool:
         for name in names:
-            found = list(pool.map(outcome, repeat(name), range(count)))
+            found = list(pool.map(outcome, itertools.repeat(name), range(count)))
             chosen = [each for each in found if not each.refusal]
             for text, times in Counter(e.refusal for e in found if e.refusal).items():
                 print(f'{name}: {times} times: {text}')
@@ -457,7 +476,16 @@ def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
 
 HEADS = {
     'repeat': ['arm', 'number', 'times', 'stiffness chosen', 'inertia measured'],
-    'lags': ['arm', 'number', 'lag [ms]', 'stiffer', 'pick-up [mrad]', 'bears'],
+    'lags': [
+        'arm',
+        'number',
+        'lag [ms]',
+        'stiffer',
+        'motion',
+        'pick-up',
+        'later',
+        'bears',
+    ],
     'careful': ['arm', 'number', 'noise', 'margin', 'here', 'holds'],
     'unknown': ['arm', 'number', 'hidden', 'bound', 'motion', 'pick-up', 'bears'],
     'above': [

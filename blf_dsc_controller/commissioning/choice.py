@@ -32,7 +32,7 @@ from blf_dsc_controller.commissioning.margin import Loops, Margin, RigidArm
 
 Floats = NDArray[np.float64]
 
-LAGS = (0.002, 0.003, 0.005)
+LAGS = (0.002, 0.003, 0.005, 0.008, 0.012)
 """Lags of the damping of a joint [s] that are tried, one after the other."""
 
 _STEP = 1.1  # from one factor on the gains that is tried to the next
