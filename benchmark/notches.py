@@ -1,29 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Would notch filters let gains grow?  By the measured responses of commissioned arms.
+"""Would notch filters let gains grow more than lags?  By measured responses of random arms.
 
     python -m benchmark notches [ARMS] [STUDY ...]
 
-The arms are those of `commissioning`, measured by simulated runs, with the gains and lags that
-follow.  Then the feedback of one joint after the other may pass a notch,
+The arms are those of `commissioning`, measured by simulated runs.  From the gains without a filter
+on, the damping of one joint after the other may pass a lag, one of `choice.LAGS`, or a notch,
 
     N(s) = (s^2 + 2 a d w s + w^2) / (s^2 + 2 d w s + w^2)
 
-at one of the `FREQUENCIES`, of one of the `SHAPES` (d, a): each time the one with which the gains
-grow most, until they grow by less than 20 % in all.  The modulus margin stays 0.5, of the
-measured arm and of a rigid one of the measured inertias and lags.
+at one of the `FREQUENCIES`: each time the filter with which the gains of all joints together grow
+most, until that is less than 20 %.  A joint has one of each kind at most.  The modulus margin stays
+0.5, of the measured arm and of a rigid one of the measured inertias and lags; what is above the
+fastest line of the motion limits nothing, unlike in `choice`.
 
-    no lag     the notches of each joint [Hz], and how many times the gains grow by them, where no
-               damping lags
-    lags       the gains of `choice.LAGS` over those without a lag
-    both       notches beside these lags, and how many times the gains grow by them
-    mean       of the gains over those without lag and notch, over the joints (geometric), by
-               notches, lags and both
+    lags       of each joint [ms], if there are no notches, and how many times the gains grow
+    notches    joint@frequency [Hz], if there are no lags, likewise
+    mean       of the gains, over the joints (geometric), by lags, by notches and by both
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -49,44 +46,53 @@ Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 FREQUENCIES = (15.0, 20.0, 25.0, 30.0, 36.0, 43.0, 52.0, 62.0, 75.0, 90.0)  # Hz
-SHAPES = ((0.7, 1.0 / 7.0), (0.4, 0.4))  # d, a
+DAMPING, SHARE = 0.7, 1.0 / 7.0
+"""d and a: wide, since the frequency of a joint changes with posture and load."""
+
 STEP = 1.1  # of the gains
 PAYS = 1.2  # times all gains together
 
 
-class Notch(NamedTuple):
-    """A notch in the feedback of one joint."""
+class Filters(NamedTuple):
+    """Lag [s] and frequency of the notch [Hz] (n,) in the damping of each joint; 0: none."""
 
-    joint: int
-    frequency: float  # Hz
-    damping: float  # d
-    share: float  # a, what passes at the frequency
+    lag: Floats
+    notch: Floats
 
-    def response(self, s: Complex) -> Complex:
-        """Return N (f,) at s = i omega."""
-        w = 2.0 * np.pi * self.frequency
-        wide = s**2 + 2.0 * self.damping * w * s + w**2
-        return np.asarray(1.0 - 2.0 * (1.0 - self.share) * self.damping * w * s / wide)
+    def passed(self, s: Complex) -> Complex:
+        """Return what passes the notches at s = i omega (f,): (f, n, 1)."""
+        w = 2.0 * np.pi * self.notch
+        wide = s[:, None] ** 2 + 2.0 * DAMPING * w * s[:, None] + w**2
+        missing = 2.0 * (1.0 - SHARE) * DAMPING * w * s[:, None] / wide
+        return np.asarray(1.0 - missing)[..., None]
+
+    def others(self, lags: Sequence[float], notches: Sequence[float]) -> Iterator[Filters]:
+        """Yield these with one filter more, or with a longer lag."""
+        for j in range(self.lag.size):
+            for lag in lags:
+                if lag > self.lag[j]:
+                    yield self._replace(lag=replaced(self.lag, j, lag))
+            if self.notch[j] == 0.0:
+                for frequency in notches:
+                    yield self._replace(notch=replaced(self.notch, j, frequency))
 
 
-def through(notches: Sequence[Notch], n: int, s: Complex) -> Complex:
-    """Return what passes the notches of each joint, (f, n, 1) at s (f,)."""
-    passed = np.ones((s.size, n, 1), complex)
-    for notch in notches:
-        passed[:, notch.joint, 0] *= notch.response(s)
-    return passed
+def replaced(values: Floats, j: int, value: float) -> Floats:
+    """Return values (n,) with another one of joint j."""
+    return np.where(np.arange(values.size) == j, value, values)
 
 
-class Notched(NamedTuple):
-    """A commissioned arm whose feedback passes notches."""
+class Filtered(NamedTuple):
+    """A commissioned arm whose damping passes filters."""
 
     loops: Loops
     inertia: Floats  # (n,) kg m^2, the least of each joint that was measured
     timing: Timing
-    notches: tuple[Notch, ...] = ()
+    filters: Filters
 
     def has_margin(self, gains: JointGains) -> bool:
         """Whether the measured arm and the rigid one have the modulus margin."""
+        gains = gains._replace(damping_lag=self.filters.lag)
         return self.measured(gains) >= MARGIN and self.rigid(gains) >= MARGIN
 
     def measured(self, gains: JointGains) -> float:
@@ -96,7 +102,7 @@ class Notched(NamedTuple):
     def _margins(self, gains: JointGains) -> Iterator[Margin]:
         for k, response in enumerate(self.loops.responses):
             s: Complex = np.asarray(2j * np.pi * response.frequency, complex)
-            passed = through(self.notches, len(self.inertia), s)
+            passed = self.filters.passed(s)
             C_y, C_v = (passed * C for C in self.loops.law(response, gains))
             L = C_y @ response.position + C_v @ response.velocity
             position, velocity = response.deviations()
@@ -114,20 +120,21 @@ class Notched(NamedTuple):
         joints = Joints(motors=np.zeros(n), viscous=np.zeros(n))
         G = arm_response(np.diag(self.inertia)[None], joints, self.timing, s)
         law = linear(gains, self.loops.inertia, 1)
-        C = through(self.notches, n, s) * law_response(law, self.timing, s)
+        C = self.filters.passed(s) * law_response(law, self.timing, s)
         own = np.diagonal(G @ C, axis1=2, axis2=3)
         return float(np.abs(1.0 + own).min())
 
 
-def arm_of(found: Commissioned, sample_time: float) -> Notched:
-    """Return a commissioned arm without a notch."""
+def arm_of(found: Commissioned, sample_time: float) -> Filtered:
+    """Return a commissioned arm without a filter."""
     least = np.where(np.isnan(found.findings.inertias), np.inf, found.findings.inertias)
     inertia = np.minimum(least.min(axis=0), found.loops.inertia)
     timing = found.findings.timing(sample_time, found.lag)
-    return Notched(found.loops, inertia, timing)
+    none = np.zeros(inertia.size)
+    return Filtered(found.loops, inertia, timing, Filters(none, none))
 
 
-def grown(arm: Notched, gains: JointGains) -> Floats:
+def grown(arm: Filtered, gains: JointGains) -> Floats:
     """Return by how much the gains of each joint (n,) may grow, all together and then each."""
     factors = np.ones(len(arm.inertia))
     while arm.has_margin(gains.scaled(STEP * factors)):
@@ -143,61 +150,47 @@ def grown(arm: Notched, gains: JointGains) -> Floats:
     return factors
 
 
-def with_notches(arm: Notched, gains: JointGains) -> tuple[Notched, Floats]:
-    """Return an arm with the notches that pay, and by how much its gains (n,) grow."""
-    factors = grown(arm, gains)
+def with_filters(
+    arm: Filtered, gains: JointGains, lags: Sequence[float], notches: Sequence[float]
+) -> tuple[Filters, Floats]:
+    """Return the filters that pay, and by how much the gains (n,) grow."""
+    factors = without = grown(arm, gains)
     while True:
-        notched = [
-            arm._replace(notches=(*arm.notches, Notch(j, frequency, *shape)))
-            for j, frequency, shape in itertools.product(
-                range(len(arm.inertia)), FREQUENCIES, SHAPES
-            )
-        ]
         tried = (
             (each, factors * grown(each, gains.scaled(factors)))
-            for each in notched
-            if each.has_margin(gains.scaled(factors))
+            for filters in arm.filters.others(lags, notches)
+            if (each := arm._replace(filters=filters)).has_margin(gains.scaled(factors))
         )
         best, more = max(
             tried, key=lambda each: float(np.prod(each[1])), default=(arm, factors)
         )
         if np.prod(more / factors) < PAYS:
-            return arm, factors
+            return arm.filters, factors / without
         arm, factors = best, more
 
 
 def row(name: str, number: int) -> list[str]:
     """Return the row of an arm."""
     config, measured, _ = measured_of(name, number)
-    plain, lagging = (
-        commissioned(config, measured, MARGIN, lags) for lags in ((), LAGS)
-    )
-    found = [
-        with_notches(arm_of(each, config.sample_time), each.choice.gains)
-        for each in (plain, lagging)
-    ]
-    (_, alone), (_, both) = found
-    lags = lagging.choice.factors / plain.choice.factors
-    means = (np.exp(np.log(each).mean()) for each in (alone, lags, lags * both))
+    found = commissioned(config, measured, MARGIN, lags=())
+    arm, gains = arm_of(found, config.sample_time), found.choice.gains
+    lags, by_lags = with_filters(arm, gains, LAGS, ())
+    notches, by_notches = with_filters(arm, gains, (), FREQUENCIES)
+    _, by_both = with_filters(arm, gains, LAGS, FREQUENCIES)
+    means = (np.exp(np.log(each).mean()) for each in (by_lags, by_notches, by_both))
+    at = (f'{j + 1}@{f:g}' for j, f in enumerate(notches.notch) if f > 0.0)
     return [
         name.rpartition('_')[2],
         f'{number}',
-        f'{told(found[0][0])}: {listed(alone)}',
-        listed(lags),
-        f'{told(found[1][0])}: {listed(both)}',
+        f'{listed(1e3 * lags.lag)}: {listed(by_lags)}',
+        f'{" ".join(at) or "-"}: {listed(by_notches)}',
         ', '.join(f'{each:.2f}' for each in means),
     ]
 
 
-def told(arm: Notched) -> str:
-    """Return the notches of an arm, as joint@frequency."""
-    notches = sorted(arm.notches)
-    return ' '.join(f'{each.joint + 1}@{each.frequency:g}' for each in notches) or '-'
-
-
-def listed(factors: Floats) -> str:
-    """Return factors (n,) in a line."""
-    return ', '.join(f'{each:.2g}' for each in factors)
+def listed(values: Floats) -> str:
+    """Return values (n,) in a line."""
+    return ', '.join(f'{each:.2g}' for each in values)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -209,4 +202,4 @@ def main(options: argparse.Namespace) -> None:
     """Print a table."""
     many, *given = options.words or ['2']
     rows = of_arms(row, tuple(given) or STUDIES, int(many))
-    print_table(['arm', 'number', 'no lag', 'lags', 'both', 'mean'], rows)
+    print_table(['arm', 'number', 'lags', 'notches', 'mean'], rows)

@@ -29,7 +29,7 @@ GROUPS = {
         'two-encoders': 'what encoders at motors and links are worth together',
         'known-load': 'what it would be worth to know a load at once',
         'damping-lag': 'UR5es whose damping lags, and the same ones without',
-        'notches': 'whether notch filters let gains grow, on commissioned arms',
+        'notches': 'whether notch filters let gains grow more than lags',
         'stop-damping': 'how much of the damping of a stop a joint bears',
         'commissioning': 'random arms, commissioned and put to work',
         'load-observer': 'what joint torque sensors are worth',
