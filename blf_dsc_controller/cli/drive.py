@@ -100,8 +100,8 @@ def drive(options: Namespace) -> int:
 
 def _say_before(config: ControllerConfig, driver: Driver) -> None:
     """Print the warnings, the errors to expect, and where waypoints end."""
-    unmeasured = not_commissioned(config)
     in_motors = driver.config.feedback == 'motor'
+    unmeasured = not_commissioned(config, in_motors=in_motors)
     judged = as_in_motors(config) if in_motors else config
     for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
         print_notice(f'warning: {warning}')
