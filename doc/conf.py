@@ -38,7 +38,7 @@ extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
 exclude_patterns = ['user_docs*', 'standard*', '__*', 'modules.rst', f'{project}*']
 myst_enable_extensions = ['dollarmath', 'tasklist']
 myst_fence_as_directive = ['math']  # as GitHub writes equations
-myst_heading_anchors = 3
+myst_heading_anchors = 4
 
 highlight_language = 'none'  # of indented blocks
 default_role = 'code'  # docstrings write `name`

@@ -41,7 +41,7 @@ if len(sys.argv) > 1:
 else:
     needed = {'franky_sim': 'franky-sim', 'pylibfranka': 'pylibfranka'}
     if missing := [each for each in needed if not importlib.util.find_spec(each)]:
-        sys.exit(f'pip install {" ".join(needed[each] for each in missing)}')
+        sys.exit(f'first pip install {" ".join(needed[each] for each in missing)}')
     simulator = subprocess.Popen(
         [sys.executable, '-c', SIMULATOR], stdout=subprocess.PIPE, text=True
     )

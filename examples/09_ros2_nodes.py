@@ -22,9 +22,9 @@ import blf_dsc_controller as blf
 PRESET = str(blf.share_folder() / 'config' / 'panda.yaml')
 # A node ends as by Ctrl-C with its input, which is this program's as long as it lives.
 STARTED = """
-import os, signal, sys, threading
+import os, signal, threading
 def end_with_parent():
-    sys.stdin.buffer.read()
+    os.read(0, 1)  # not by sys.stdin, whose lock Python takes at its end
     os.kill(os.getpid(), signal.SIGINT)
 threading.Thread(target=end_with_parent, daemon=True).start()
 from blf_dsc_controller.cli.main import {0}

@@ -38,6 +38,7 @@ from blf_dsc_controller.cli.result_folder import (
     keep,
     make_folder,
 )
+from blf_dsc_controller.errors import BlfDscError
 
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 1  # s
@@ -288,6 +289,24 @@ def test_folder_that_a_recorder_makes_goes_until_its_run_begins(tmp_path):
     keep(begun)
     assert discard_unbegun() == [unbegun]
     assert [before, begun] == sorted(tmp_path.iterdir())
+
+
+def test_folder_that_another_command_makes_meanwhile_is_left_alone(
+    tmp_path, monkeypatch
+):
+    out = tmp_path / 'out'
+    mkdir = Path.mkdir
+
+    def after_another(path, **given):
+        mkdir(path)
+        mkdir(path, **given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, 'mkdir', after_another)
+        with pytest.raises(BlfDscError, match='out exists already and is not'):
+            make_folder(out)
+    assert discard_unbegun() == []
+    assert out.exists()
 
 
 @pytest.mark.parametrize(

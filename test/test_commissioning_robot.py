@@ -301,6 +301,8 @@ def test_gains_that_nobody_measured_are_told_where_a_robot_is_meant():
     assert 'nobody has measured' in not_commissioned(preset)
     measured = {'commissioning.date': '2026-11-25 12:00'}
     assert not_commissioned(change(preset, measured)) == ''
+    in_motors = not_commissioned(preset, in_motors=True)
+    assert 'begin with those of its maker' in in_motors
     stiffer = change(preset, measured | {'feedback.stiffness': 2.0})
     assert '2 times the gains for which' in not_commissioned(stiffer)
     # of the paper's arm; of an arm that is known to be unknown (another warning)

@@ -19,6 +19,7 @@ from recorded_run import limited_files
 import blf_dsc_controller as blf
 from blf_dsc_controller.analysis.metrics import tool_errors
 from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.cli import drive as cli_drive
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
@@ -542,6 +543,23 @@ def test_the_command_says_that_the_recording_is_not_whole(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'the duration is over' in printed
     assert f'only a part: {disk / "bag"} cannot be written any further' in printed
+
+
+def test_recording_that_another_command_has_begun_meanwhile_stays(
+    tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / 'bag'
+
+    def made(config, record, stamps):
+        out.mkdir()
+        (out / 'bag_0.mcap').touch()
+        return blf.ArmController(config, record=record, stamps=stamps)
+
+    monkeypatch.setattr(cli_drive, 'ArmController', made)
+    words = ['drive', '--robot', 'simulated', '--config', 'panda', '--out', str(out)]
+    assert main(words) == 1
+    assert 'bag exists already and is not overwritten' in capsys.readouterr().err
+    assert (out / 'bag_0.mcap').exists()
 
 
 def test_the_command_says_how_far_the_tool_was_off(tmp_path, capsys):

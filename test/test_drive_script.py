@@ -36,6 +36,7 @@ from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
     DriveError,
     LoopEndedError,
+    MissingExtraError,
     MotionFailedError,
     NotInTimeError,
 )
@@ -548,6 +549,12 @@ def test_degrees_are_refused_with_the_hint_that_they_may_be_some(arm):
     with pytest.raises(MotionFailedError, match='past its limit') as raised:
         arm.move_to([9.0] * 7)
     assert 'deg2rad' not in str(raised.value)
+
+
+def test_stream_without_ruckig_says_what_to_install(arm, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'ruckig', None)
+    with pytest.raises(MissingExtraError, match=r'needs ruckig.*pip install .*streams'):
+        arm.stream(arm.state.reference)
 
 
 def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import pty
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from command import COMPILED, NO_PICTURES
+from command import COMPILED, NO_PICTURES, finished
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
@@ -48,7 +49,40 @@ def test_example_runs_without_hardware(path, tmp_path):
         check=False,
     )
     assert ended.returncode == 0, ended.stderr
+    assert not re.search('Traceback|Fatal', ended.stderr), ended.stderr
     assert re.search(line, ended.stdout), ended.stdout + ended.stderr
+
+
+def test_keys_that_are_pressed_at_once_all_count():
+    """Joint 1 is chosen and turned by one press: 0.1 s at 0.3 rad/s."""
+    pytest.importorskip('ruckig', reason='needs ruckig')
+    terminal, end = pty.openpty()
+    command = [sys.executable, ROOT / 'examples' / '05_keyboard.py']
+    with subprocess.Popen(command, stdin=end, stdout=subprocess.PIPE) as keyboard:
+        turned = [shown_position(keyboard.stdout)]
+        os.write(terminal, b'1+')
+        while abs(turned[-1] - turned[0]) < 0.02:
+            turned.append(shown_position(keyboard.stdout))
+        os.write(terminal, b'q')
+        assert b'ended at' in keyboard.stdout.read()
+    os.close(terminal)
+    os.close(end)
+    assert keyboard.returncode == 0
+
+
+def shown_position(output):
+    """Return the next position of a joint that is printed [rad]."""
+    text = b''
+    while not (found := re.search(rb'([+-][.0-9]+) rad', text)):
+        text += output.read(1)
+        assert text, 'it has ended'
+    return float(found[1])
+
+
+def test_keyboard_without_a_terminal_says_what_to_give():
+    path = ROOT / 'examples' / '05_keyboard.py'
+    ended = finished(sys.executable, path, stdin=subprocess.DEVNULL)
+    assert ended.stderr == 'keys come from a terminal, and this is none: give KEYS\n'
 
 
 def test_page_names_every_example():

@@ -135,6 +135,21 @@ def test_nanoseconds_of_two_clocks_are_no_part_of_one_time(tmp_path):
     assert 'which column is the time is not clear' in refused(path)
 
 
+def test_columns_of_which_more_than_one_may_be_a_position_are_named_alone(tmp_path):
+    """As those of a table by `blf_dsc export` of a simulated arm."""
+    names = [
+        'time',
+        *numbered('position'),
+        *numbered('truth position'),
+        *numbered('x'),
+    ]
+    path = tmp_path / 'a.csv'
+    written(path, names, (TIME, Q, Q, TAU))
+    assert re.search(
+        'These may be: position_1, .* truth position_6: choose them', refused(path)
+    )
+
+
 # Separators, headers, orders.
 
 

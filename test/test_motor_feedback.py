@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from motor_arm import ELASTIC, LEROBOT, RANGES, TORQUE, MotorDriver, loop_of
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.motor_options import limits_of
 from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load, load_loop, locate
@@ -111,6 +113,49 @@ def test_local_gains_are_what_a_lasting_deviation_changes(inside):
     if inside == 0.0:
         wanted = np.array(LEROBOT['feedback.joint_damping'])
         np.testing.assert_allclose(gains[1], wanted, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    'words',
+    ['', '--write motion.yaml', '--robot simulated --yes', '--prove --robot simulated'],
+)
+def test_gains_for_motors_alone_are_not_commissioned_over_the_bus(
+    tmp_path, monkeypatch, capsys, words
+):
+    """Simulated over the bus, those of the preset oscillate at some 45 Hz and stop."""
+    monkeypatch.chdir(tmp_path)
+    assert main(['commission', '--config', 'yam', *words.split()]) == 1
+    printed = capsys.readouterr()
+    assert 'keep the gains that the maker runs in them' in printed.err
+    assert not printed.out
+    assert not [*tmp_path.iterdir()]
+
+
+def test_motion_by_hand_sends_motors_the_torque_that_a_bag_records(
+    tmp_path, monkeypatch, capsys
+):
+    """The gains are soft enough for a host."""
+    preset = (blf.share_folder() / 'config' / 'yam.yaml').read_text()
+    soft = preset.replace('    feedback:\n', '    feedback:\n      stiffness: 0.12\n')
+    monkeypatch.chdir(tmp_path)
+    Path('my.yaml').write_text(
+        soft.replace('yam.urdf', str(locate('yam').with_suffix('.urdf')))
+    )
+    words = [
+        '--posture',
+        '0',
+        '1.047',
+        '1.047',
+        '0',
+        '0',
+        '0',
+        '--write',
+        'motion.yaml',
+    ]
+    assert main(['commission', '--config', 'my.yaml', *words]) == 0
+    assert 'measures with torques over the bus' in capsys.readouterr().err
+    assert load(Path('my.yaml'), DRIVE, DriveConfig).feedback == 'motor'
+    assert load(Path('motion_1.yaml'), DRIVE, DriveConfig).feedback == 'host'
 
 
 def test_damping_that_lags_is_none_that_motors_can_do():

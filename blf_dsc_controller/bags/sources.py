@@ -56,6 +56,10 @@ class BagError(BlfDscError):
     """A bag that cannot be read or written."""
 
 
+class BagExistsError(BagError):
+    """The folder of a new bag exists already."""
+
+
 class BagMessage(NamedTuple):
     """A message in CDR, as recorded."""
 

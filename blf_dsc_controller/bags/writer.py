@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.background_file import BackgroundFile
-from blf_dsc_controller.bags.sources import METADATA, BagError
+from blf_dsc_controller.bags.sources import METADATA, BagError, BagExistsError
 from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
 from blf_dsc_controller.messages.topics import FOREVER, Quality
 from blf_dsc_controller.writing import whole
@@ -72,7 +72,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     full disk, `abandon` the bag. Its files have the `name` of the folder, or the given one.
 
     Raises:
-        BagError: `path` exists already.
+        BagExistsError: `path` exists already.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
-            raise BagError(
+            raise BagExistsError(
                 f'{path} exists already and is not overwritten: choose another folder or remove it'
             ) from None
         self._flushed = monotonic()

@@ -56,8 +56,11 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.progress import announce_reading, print_notice, steps
 from blf_dsc_controller.supervision.digits import largest_error
+from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.supervision.gear_warnings import softer_by
 
 Runs = list[tuple[str, Measured]]
 """Runs with their names."""
@@ -95,6 +98,8 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         margin=options.margin,
         lags=_lags(path),
     )
+    if _in_motors(path) and (options.robot or options.ros or not options.bags):
+        _say_of_motors(config)
     if options.write:
         _write_motions(options, path, commissioning)
         return 0
@@ -236,10 +241,34 @@ def _picture(out: Path) -> Path:
     return out.with_suffix('.png')
 
 
+def _in_motors(path: Path) -> bool:
+    """Whether motors close the feedback of a file."""
+    return load(path, DRIVE, DriveConfig).feedback == 'motor'
+
+
 def _lags(path: Path) -> Sequence[float]:
     """Return the lags of the damping to try [s]: motors that close the feedback have none."""
-    in_motors = load(path, DRIVE, DriveConfig).feedback == 'motor'
-    return () if in_motors else LAGS
+    return () if _in_motors(path) else LAGS
+
+
+def _say_of_motors(config: ControllerConfig) -> None:
+    """Say that a feedback which motors close is measured over the bus.
+
+    Raises BlfDscError if no arm would bear its gains there.
+    """
+    over_bus = 'but a commissioning measures with torques over the bus'
+    if expected_errors(config, settings_of_config(config)).is_endless:
+        softer = softer_by(config)
+        raise BlfDscError(
+            f'drive.feedback: got motor, {over_bus}, where these gains make errors grow from '
+            'sample to sample, and would shake the arm. Motors bear more: keep the gains that the '
+            f'maker runs in them, without a commissioning; or lower {softer}, to measure what the '
+            'arm bears over the bus'
+        )
+    print_notice(
+        f'warning: drive.feedback is motor, {over_bus}, and chooses gains that the arm bears '
+        'there: motors bear more'
+    )
 
 
 def _is_simulated(options: Namespace) -> bool:

@@ -21,12 +21,15 @@ from blf_dsc_controller.cli.finding import Finding, Level, note, ok, problem
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.compiled.kernel_cache import SHIPPED, is_quick, place
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
+    DRIVE,
     ignored_in,
     load,
     locate,
 )
+from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
 from blf_dsc_controller.supervision.config_warnings import config_warnings
@@ -151,8 +154,11 @@ def _configuration(path: str) -> Iterator[Finding]:
     try:
         file = locate(path)
         config = load(file, CONTROLLER, ControllerConfig)
-        found = not_commissioned(config), ignored_in(file, (CONTROLLER,))
-        warnings = [*config_warnings(config), *filter(None, found)]
+        in_motors = load(file, DRIVE, DriveConfig).feedback == 'motor'
+        judged = as_in_motors(config) if in_motors else config
+        unmeasured = not_commissioned(config, in_motors=in_motors)
+        found = unmeasured, ignored_in(file, (CONTROLLER, DRIVE))
+        warnings = [*config_warnings(judged), *filter(None, found)]
     except BlfDscError as error:
         yield problem('config', str(error))
         return

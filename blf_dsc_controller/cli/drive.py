@@ -9,6 +9,7 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
+from blf_dsc_controller.bags.sources import BagExistsError
 from blf_dsc_controller.cli.result_folder import (
     discard_unbegun,
     expect_folder,
@@ -63,7 +64,11 @@ def drive(options: Namespace) -> int:
         expect_folder(options.out)
         ending.callback(discard_unbegun)
         with announced_compilation(print_notice):
-            controller = ArmController(config, record=options.out, stamps='wall')
+            try:
+                controller = ArmController(config, record=options.out, stamps='wall')
+            except BagExistsError:
+                keep(options.out)
+                raise
         ros = None
         if options.ros:
             ros = RosTopics(controller, options.namespace)
@@ -100,8 +105,8 @@ def drive(options: Namespace) -> int:
 
 def _say_before(config: ControllerConfig, driver: Driver) -> None:
     """Print the warnings, the errors to expect, and where waypoints end."""
-    unmeasured = not_commissioned(config)
     in_motors = driver.config.feedback == 'motor'
+    unmeasured = not_commissioned(config, in_motors=in_motors)
     judged = as_in_motors(config) if in_motors else config
     for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
         print_notice(f'warning: {warning}')

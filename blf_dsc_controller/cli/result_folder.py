@@ -26,8 +26,13 @@ def make_folder(path: Path, result: str = _ANY) -> Path:
     Raises BlfDscError if it exists already.
     """
     refuse_existing(path)
-    _unbegun[path] = result
-    path.mkdir(parents=True)
+    _unbegun[path] = result  # first: an interrupt may follow
+    try:
+        path.mkdir(parents=True)
+    except FileExistsError:
+        del _unbegun[path]  # another command has just made it
+        refuse_existing(path)
+        raise  # a link to nothing
     return path
 
 
@@ -41,7 +46,7 @@ def expect_folder(path: Path | None) -> None:
 
 
 def keep(path: Path | None) -> None:
-    """Never remove this folder: its run has begun."""
+    """Never remove this folder: its run has begun, or it is another command's."""
     if path is not None:
         _unbegun.pop(path, None)
 

@@ -9,7 +9,7 @@ from blf_dsc_controller.commissioning.chosen import FOLLOWED
 from blf_dsc_controller.commissioning.commissioning import Commissioned
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.configuration.files import Section
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, STUDY
+from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, PLANT, STUDY
 
 _Values = Mapping[str, object]
 
@@ -17,14 +17,14 @@ _Values = Mapping[str, object]
 def of_motion(sections: Sequence[Section], planned: Planned) -> dict[str, _Values]:
     """Return the sections of a file with a motion in the place of its reference.
 
-    A simulated arm begins in its posture and picks nothing up.
+    A simulated arm begins in its posture and picks nothing up.  Motors get the torque alone, since
+    it is what a bag records.
     """
     arm = {'initial.position': planned.posture.tolist(), 'duration': planned.duration}
-    return _with(
-        sections,
-        {f'/**/{CONTROLLER}': planned.values, f'/**/{PLANT}': arm},
-        removed=('reference.', 'events.'),
-    )
+    given = {f'/**/{CONTROLLER}': planned.values, f'/**/{PLANT}': arm}
+    if any('feedback' in section.entries for section in sections):  # drive.feedback
+        given[f'/**/{DRIVE}'] = {'feedback': 'host'}
+    return _with(sections, given, removed=('reference.', 'events.'))
 
 
 def of_commissioned(

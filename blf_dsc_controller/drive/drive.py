@@ -36,6 +36,7 @@ from blf_dsc_controller.errors import (
     MotionFailedError,
     NotInTimeError,
 )
+from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.script_link import ArmState
 
@@ -222,8 +223,10 @@ class Drive:
 
         Raises:
             LoopEndedError: the loop has ended.
+            MissingExtraError: ruckig is not installed.
         """
         values = checked_positions(positions, self.joints)
+        import_extra('ruckig', 'streams', 'a stream')
         self._loop.put(script_link.POSITIONS, values.tobytes())
 
     def wait(self, timeout: float | None = None) -> None:

@@ -71,8 +71,10 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
     path = locate(wanted['config'])
     config = load(path, CONTROLLER, ControllerConfig, _HOLD | given)
     driver = driver_of(wanted['robot'], path, config, overrides)
-    judged = as_in_motors(config) if driver.config.feedback == 'motor' else config
-    of_file = ignored_in(path, (CONTROLLER, DRIVE)), not_commissioned(config)
+    in_motors = driver.config.feedback == 'motor'
+    judged = as_in_motors(config) if in_motors else config
+    unmeasured = not_commissioned(config, in_motors=in_motors)
+    of_file = ignored_in(path, (CONTROLLER, DRIVE)), unmeasured
     for warning in [*config_warnings(judged), *filter(None, of_file)]:
         log.info(warning)
     record = Path(wanted['record']) if wanted['record'] else None

@@ -145,10 +145,13 @@ def _of_joints(
     if found and len(found) <= len(joints):
         are_numbers = _RANGE.fullmatch(split_unit(given, kind).stem)
         return found if are_numbers else _by_number(found, kind)
+    which = f'Its columns are {_listed(names)}'
+    if len(found) > len(joints):
+        which = f'These may be: {_listed(found)}'
     raise BlfDscError(
-        f'{path}: which columns are {kind} of {", ".join(joints)} is not clear. Its columns are '
-        f'{_listed(names)}: choose them, as in --map {kind}={kind}_* or --map {kind}=1:7 '
-        f'(columns 1 to 6, the first is 0){_elsewhere(path, names, joints, given or found)}'
+        f'{path}: which columns are {kind} of {", ".join(joints)} is not clear. {which}: choose '
+        f'them, as in --map {kind}={kind}_* or --map {kind}=1:7 (columns 1 to 6, the first is 0)'
+        f'{_elsewhere(path, names, joints, given or found)}'
     )
 
 
