@@ -39,7 +39,7 @@ from benchmark.commissioning import (
 from benchmark.harness import print_table
 from benchmark.kept import Results
 from benchmark.options import positive
-from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.messages.journal import EventType

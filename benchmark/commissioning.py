@@ -87,10 +87,10 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.choice import LAGS
-from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned, commissioned
+from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.margin import Loops
 from blf_dsc_controller.commissioning.measurement import Measured
-from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.commissioning.planned import measuring_gains, postures_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.nodes import LoopConfig

@@ -34,7 +34,7 @@ from benchmark.commissioning import runs_of
 from benchmark.harness import print_table
 from benchmark.kept import Results
 from benchmark.studies import load_study
-from blf_dsc_controller.commissioning.commissioning import commissioned
+from blf_dsc_controller.commissioning.commissioned import commissioned
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.monte_carlo import Study, draw, plant_with

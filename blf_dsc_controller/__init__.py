@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from blf_dsc_controller.analysis.metrics import measure as measure
     from blf_dsc_controller.bags.reader import read_run as read_run
     from blf_dsc_controller.bags.sources import BagError as BagError
-    from blf_dsc_controller.commissioning.own_loop import Commissioning as Commissioning
+    from blf_dsc_controller.commissioning.commissioning import (
+        Commissioning as Commissioning,
+    )
     from blf_dsc_controller.configuration.controller import (
         ControllerConfig as ControllerConfig,
     )
@@ -59,7 +61,7 @@ _PUBLIC = {
     'BagError': 'bags.sources',
     'BlfDscError': 'errors',
     'change': 'configuration.schema',
-    'Commissioning': 'commissioning.own_loop',
+    'Commissioning': 'commissioning.commissioning',
     'ConfigurationError': 'errors',
     'controller_of': 'factory.controller',
     'ControllerConfig': 'configuration.controller',

@@ -39,7 +39,8 @@ from blf_dsc_controller.commissioning.choice import (
     choose,
 )
 from blf_dsc_controller.commissioning.chosen import capped_stop_damping, with_gains
-from blf_dsc_controller.commissioning.commissioning import commissioned
+from blf_dsc_controller.commissioning.commissioned import commissioned
+from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.findings import findings_of
 from blf_dsc_controller.commissioning.margin import Loops, RigidArm, SingularValues
 from blf_dsc_controller.commissioning.motion import (
@@ -48,7 +49,6 @@ from blf_dsc_controller.commissioning.motion import (
     excitation,
     lines_in,
 )
-from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.page import errors_table, sentences, table
 from blf_dsc_controller.commissioning.planned import measuring_gains, plan
 from blf_dsc_controller.commissioning.postures import PostureByPosture

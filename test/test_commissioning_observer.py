@@ -22,7 +22,7 @@ from blf_dsc_controller.arms.linear_loop import (
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
-from blf_dsc_controller.commissioning.commissioning import commissioned
+from blf_dsc_controller.commissioning.commissioned import commissioned
 from blf_dsc_controller.commissioning.margin import BARELY, SingularValues
 from blf_dsc_controller.commissioning.observer_pole import (
     ENOUGH,

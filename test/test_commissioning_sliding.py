@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.commissioning.own_loop import Commissioning
+from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.configuration.robot import Robot

@@ -17,7 +17,7 @@ from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.bags.table import table
 from blf_dsc_controller.cli.commission_robot import _limits
 from blf_dsc_controller.commissioning import page
-from blf_dsc_controller.commissioning.own_loop import Commissioning
+from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.planned import _check_posture
 from blf_dsc_controller.commissioning.proof import Errors
 from blf_dsc_controller.configuration.controller import ControllerConfig

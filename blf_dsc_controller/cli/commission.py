@@ -36,9 +36,9 @@ from blf_dsc_controller.commissioning import (
     simulated,
 )
 from blf_dsc_controller.commissioning.choice import LAGS
-from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned
+from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.measurement import Measured, measured_in
-from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.commissioning.picture import draw
 from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
 from blf_dsc_controller.commissioning.slow_motion import slow_motion

@@ -21,7 +21,7 @@ from blf_dsc_controller.cli.commission_robot import (
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile, wrapped
 from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.commissioning import files, ripple_page, simulated
-from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.commissioning.postures import (
     EndedError,
     PostureByPosture,

@@ -18,12 +18,12 @@ import numpy as np
 from blf_dsc_controller.cli.drive import signals_to
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.commissioning import page
-from blf_dsc_controller.commissioning.driven import Driven
-from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
-from blf_dsc_controller.commissioning.own_loop import (
+from blf_dsc_controller.commissioning.commissioning import (
     REPEATS,
     Commissioning,
 )
+from blf_dsc_controller.commissioning.driven import Driven
+from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
 from blf_dsc_controller.commissioning.proof import (

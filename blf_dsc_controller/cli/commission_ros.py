@@ -20,8 +20,8 @@ from rclpy.parameter import Parameter
 
 from blf_dsc_controller.cli.commission_robot import prepared_folder
 from blf_dsc_controller.cli.drive import signals_to
+from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.over_ros import OverRos
-from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.commissioning.postures import PostureByPosture, move
 from blf_dsc_controller.commissioning.run_parameters import undisturbed_parameters
 from blf_dsc_controller.configuration.controller import ControllerConfig

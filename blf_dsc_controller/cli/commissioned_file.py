@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.commissioning import files, page, ripple_page
-from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.configuration.nodes import dump, read
 
 _WIDTH = 98

@@ -18,8 +18,8 @@ joints, and these the stiffest gains with a margin.
     strength        whether a run shows enough, and the torque of the next one
     chosen          the configuration with the chosen gains, and bounds that they keep
     findings        inertias, lags and resonances of the arm, beside those assumed
-    commissioning   the three steps in a row
-    own_loop        all of it for a loop of your own: `blf.Commissioning`
+    commissioned    the three steps in a row
+    commissioning   all of it for a loop of your own: `blf.Commissioning`
     simulated       the runs of a simulated arm
     postures        the runs of a robot, from posture to posture
     driven          likewise, over its driver

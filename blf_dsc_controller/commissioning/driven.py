@@ -11,7 +11,7 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from blf_dsc_controller.commissioning.own_loop import Commissioning
+from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.postures import PostureByPosture
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from blf_dsc_controller.commissioning.chosen import FOLLOWED
-from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.configuration.files import Section
 from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, PLANT, STUDY

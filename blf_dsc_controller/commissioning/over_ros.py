@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.motion import is_motion
-from blf_dsc_controller.commissioning.own_loop import Commissioning
 from blf_dsc_controller.commissioning.postures import (
     Answer,
     Given,

@@ -9,7 +9,7 @@ import numpy as np
 
 from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.commissioning.better_known import FAR_ABOVE, known_friction
-from blf_dsc_controller.commissioning.commissioning import CREEPING, Commissioned
+from blf_dsc_controller.commissioning.commissioned import CREEPING, Commissioned
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.observer_pole import ENOUGH, POLES

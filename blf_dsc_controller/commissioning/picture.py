@@ -13,7 +13,7 @@ from blf_dsc_controller.analysis.figures import Picture
 from blf_dsc_controller.analysis.panels import ALARM, BLUE, MUTED, ORANGE, SHADE
 from blf_dsc_controller.arms.joint_gains import JointGains
 from blf_dsc_controller.arms.linear_loop import SLOWEST
-from blf_dsc_controller.commissioning.commissioning import Commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned
 
 _COLOURS = (BLUE, ORANGE, MUTED, ALARM)
 _SIZE = (5.6, 3.4)  # inches, of a panel

@@ -21,10 +21,10 @@ from typing import NamedTuple, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.measurement import Measured, measured_in
 from blf_dsc_controller.commissioning.motion import lines_in
-from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import (
     Errors,

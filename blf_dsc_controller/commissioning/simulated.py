@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.measurement import Measured
-from blf_dsc_controller.commissioning.own_loop import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import cycles_of
 from blf_dsc_controller.commissioning.slow_motion import SlowMotion
