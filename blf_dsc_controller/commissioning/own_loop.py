@@ -8,6 +8,7 @@ from copy import copy
 from functools import cached_property
 from math import inf
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,7 +38,10 @@ from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.run import Run
+
+Kind = TypeVar('Kind')
 
 REPEATS = 2
 """How often a posture is measured again at most: softer, with swings, or with more torque."""
@@ -249,13 +253,16 @@ class Commissioning:
         return motion
 
     def result(
-        self, runs: Sequence[str | Path | tuple[Run, ControllerConfig]]
+        self,
+        runs: Sequence[str | Path | tuple[Run, ControllerConfig]],
+        names: Sequence[str] = (),
     ) -> Commissioned:
         """Return what runs of motions show, and the gains that follow.
 
         Args:
             runs: folders of bags, or runs with the configurations that they had.  Those of
                 the slow motion show the torque ripple, all others the gains.
+            names: what errors call the runs; without them, bags are named by their folders.
 
         Raises:
             BagError: a bag cannot be read.
@@ -268,10 +275,24 @@ class Commissioning:
             else measured_in(each, self.config)
             for each in runs
         ]
-        slow = [each for each in measured if self.is_slow_motion(each)]
-        shaken = [each for each in measured if not self.is_slow_motion(each)]
-        ripples = ripples_in(slow) if slow else ()
-        found = commissioned(self.config, shaken, self.margin, self._lags)
+        if not names:
+            names = ['' if isinstance(each, tuple) else str(each) for each in runs]
+        is_slow = [self.is_slow_motion(each) for each in measured]
+
+        def those(values: Sequence[Kind], *, slow: bool) -> list[Kind]:
+            pairs = zip(values, is_slow, strict=True)
+            return [each for each, it_is in pairs if it_is == slow]
+
+        ripples: tuple[Ripples, ...] = ()
+        if any(is_slow):
+            ripples = ripples_in(those(measured, slow=True), those(names, slow=True))
+        found = commissioned(
+            self.config,
+            those(measured, slow=False),
+            self.margin,
+            self._lags,
+            those(names, slow=False),
+        )
         return found._replace(ripples=ripples)
 
     def is_slow_motion(self, measured: tuple[Run, ControllerConfig]) -> bool:
