@@ -39,7 +39,7 @@ from blf_dsc_controller.arms.linear_loop import (
     law_response,
 )
 from blf_dsc_controller.commissioning.choice import LAGS
-from blf_dsc_controller.commissioning.commissioning import Commissioned, commissioned
+from blf_dsc_controller.commissioning.commissioned import Commissioned, commissioned
 from blf_dsc_controller.commissioning.margin import Loops, Margin, singular_values
 
 Floats = NDArray[np.float64]
@@ -66,7 +66,9 @@ class Filters(NamedTuple):
         missing = 2.0 * (1.0 - SHARE) * DAMPING * w * s[:, None] / wide
         return np.asarray(1.0 - missing)[..., None]
 
-    def others(self, lags: Sequence[float], notches: Sequence[float]) -> Iterator[Filters]:
+    def others(
+        self, lags: Sequence[float], notches: Sequence[float]
+    ) -> Iterator[Filters]:
         """Yield these with one filter more, or with a longer lag."""
         for j in range(self.lag.size):
             for lag in lags:

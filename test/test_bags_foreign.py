@@ -434,7 +434,13 @@ def test_files_that_are_missing_or_hold_other_numbers_than_stated(
         shutil.copy(written / f'{count}_0.mcap', copy / 'bag_0.mcap')
         all_say(copy, f'it holds {count} messages of /joint_states, but counts 301')
     (copy / 'bag_0.mcap').unlink()
-    all_say(copy, f'{copy} cannot be read as a bag', 'bag_0.mcap')
+    all_say(
+        copy,
+        f'{copy} cannot be read as a bag: its metadata.yaml names bag_0.mcap, which the folder '
+        'lacks: copy it there\n',
+    )
+    (copy / 'bag_1.mcap').touch()
+    all_say(copy, f'to save what its other files hold: blf_dsc recover {copy}')
 
 
 @pytest.mark.parametrize(

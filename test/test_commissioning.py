@@ -678,8 +678,10 @@ def test_what_is_no_commissioning_is_refused():
         velocity=run.velocity[every],
         torque=run.torque[every],
     )
-    with pytest.raises(BlfDscError, match='joint states are missing'):
-        commissioned(CONFIG, [(lossy, config)])
+    with pytest.raises(BlfDscError, match=r'^second: .* joint states are missing'):
+        blf.Commissioning(CONFIG).result(
+            [(run, config), (lossy, config)], ['first', 'second']
+        )
     with pytest.raises(BlfDscError, match=r'feedback\.inertia: got whole'):
         plan(
             build(ControllerConfig, {**ROBOT, 'feedback.inertia': 'whole'}),

@@ -196,8 +196,8 @@ def test_run_that_goes_on_after_a_stop_shows_no_ripple(whole, monkeypatch):
     shorten(monkeypatch)
     run, config = measured_in(whole.arm.with_name('out_bags') / 'slow_motion')
     stopped = replace(run, stops=(Stop(int(run.stamp[7000]), 'fault', 'a push'),))
-    with pytest.raises(BlfDscError, match=r'the arm stopped 7 s after .* a push'):
-        ripples_in([Measured(stopped, config)])
+    with pytest.raises(BlfDscError, match=r'^second: the arm stopped 7 s .* a push'):
+        ripples_in([Measured(run, config), Measured(stopped, config)], ['', 'second'])
 
 
 def test_slow_motion_alone_gives_no_gains(whole, monkeypatch, capsys):

@@ -21,6 +21,7 @@ from tempfile import gettempdir
 from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
+import yaml
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
@@ -222,7 +223,8 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
         raise BagError(
-            f'{path} cannot be read as a bag: {_no_room(error) or _reason(path, error)}'
+            f'{path} cannot be read as a bag: '
+            f'{_no_room(error) or _missing(path) or _reason(path, error)}'
         ) from error
 
 
@@ -282,6 +284,24 @@ def _reason(path: Path, error: Exception) -> str:
         text = 'it is no MCAP file: give a bag'
     else:
         text += f'; to save the undamaged part: blf_dsc recover {path}'
+    return text
+
+
+def _missing(folder: Path) -> str:
+    """Return which files a folder lacks that its metadata names, and what to do."""
+    names: list[str] = []
+    with suppress(Exception):  # anything, if the metadata is of another kind or damaged
+        stated = yaml.safe_load((folder / METADATA).read_text())
+        files = stated['rosbag2_bagfile_information']['relative_file_paths']
+        names = [Path(each).name for each in files]
+    lost = [name for name in names if not (folder / name).exists()]
+    if not lost:
+        return ''
+    text = (
+        f'its {METADATA} names {", ".join(lost)}, which the folder lacks: copy it there'
+    )
+    if any(folder.glob('*.mcap')):
+        text += f'; to save what its other files hold: blf_dsc recover {folder}'
     return text
 
 

@@ -191,7 +191,8 @@ def _still_held(work: Callable[[], int]) -> int:
 def _chosen(commissioning: Commissioning, runs: Runs) -> Commissioned:
     """Return what runs show, and the gains that follow."""
     print_notice(_CHOOSING)
-    return commissioning.result([run for _, run in runs])
+    names = [name for name, _ in runs]
+    return commissioning.result([run for _, run in runs], names)
 
 
 def _at_once(compute: Callable[..., Any], *given: object) -> Any:

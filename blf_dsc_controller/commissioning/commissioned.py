@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from datetime import datetime
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ from blf_dsc_controller.commissioning.chosen import (
 )
 from blf_dsc_controller.commissioning.findings import Findings, findings_of
 from blf_dsc_controller.commissioning.margin import BARELY, Loops, RigidArm
-from blf_dsc_controller.commissioning.measurement import Measured, check_joints
+from blf_dsc_controller.commissioning.measurement import Measured, check_joints, named
 from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.observer_pole import ObserverPole, SensedLoops
 from blf_dsc_controller.commissioning.planned import measuring_gains
@@ -165,11 +166,12 @@ def commissioned(
     runs: Sequence[Measured],
     margin: float = MARGIN,
     lags: Sequence[float] = LAGS,
+    names: Sequence[str] = (),
 ) -> Commissioned:
     """Return what runs of `plan` show, each with the configuration that it had.
 
     `margin` is the modulus margin that the gains are chosen for, `lags` [s] are those of the
-    damping that are tried.
+    damping that are tried, `names` those of the runs in errors.
 
     Raises BlfDscError if a run is not one of its motions, or has a stop.
     """
@@ -177,7 +179,8 @@ def commissioned(
     T = config.sample_time
     measured_with = as_measured(config, [made for _, made in runs])
     arm, _ = design_of(measured_with)
-    responses = tuple(response_of(run, lines_in(made), T) for run, made in runs)
+    each_name = names or [''] * len(runs)
+    responses = tuple(map(partial(_response_of, T), runs, each_name))
     found = findings_of([run for run, _ in runs], responses)
     assumed = _assumed_inertia(arm, responses)
     inertia = _largest_inertia(arm, found, assumed)
@@ -211,6 +214,12 @@ def commissioned(
         sensed=sensed,
         observer=None if sensed is None else sensed.fastest_pole(choice.gains),
     )
+
+
+def _response_of(sample_time: float, measured: Measured, name: str) -> Response:
+    """Return the response that a run of this name shows."""
+    with named(name):
+        return response_of(measured[0], lines_in(measured[1]), sample_time)
 
 
 def _check_runs(config: ControllerConfig, runs: Sequence[Measured]) -> None:

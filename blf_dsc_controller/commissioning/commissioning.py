@@ -37,6 +37,7 @@ from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.run import Run
 
 REPEATS = 2
@@ -249,13 +250,16 @@ class Commissioning:
         return motion
 
     def result(
-        self, runs: Sequence[str | Path | tuple[Run, ControllerConfig]]
+        self,
+        runs: Sequence[str | Path | tuple[Run, ControllerConfig]],
+        names: Sequence[str] = (),
     ) -> Commissioned:
         """Return what runs of motions show, and the gains that follow.
 
         Args:
             runs: folders of bags, or runs with the configurations that they had.  Those of
                 the slow motion show the torque ripple, all others the gains.
+            names: what errors call the runs; without them, bags are named by their folders.
 
         Raises:
             BagError: a bag cannot be read.
@@ -268,10 +272,21 @@ class Commissioning:
             else measured_in(each, self.config)
             for each in runs
         ]
-        slow = [each for each in measured if self.is_slow_motion(each)]
-        shaken = [each for each in measured if not self.is_slow_motion(each)]
-        ripples = ripples_in(slow) if slow else ()
-        found = commissioned(self.config, shaken, self.margin, self._lags)
+        if not names:
+            names = ['' if isinstance(each, tuple) else str(each) for each in runs]
+        pairs = list(zip(measured, names, strict=True))
+        slow = [pair for pair in pairs if self.is_slow_motion(pair[0])]
+        shaken = [pair for pair in pairs if not self.is_slow_motion(pair[0])]
+        ripples: tuple[Ripples, ...] = ()
+        if slow:
+            ripples = ripples_in([run for run, _ in slow], [name for _, name in slow])
+        found = commissioned(
+            self.config,
+            [run for run, _ in shaken],
+            self.margin,
+            self._lags,
+            [name for _, name in shaken],
+        )
         return found._replace(ripples=ripples)
 
     def is_slow_motion(self, measured: tuple[Run, ControllerConfig]) -> bool:

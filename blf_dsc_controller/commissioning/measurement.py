@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,6 +35,17 @@ def measured_in(bag: str | Path, config: ControllerConfig | None = None) -> Meas
     if config is not None:
         check_joints(str(bag), recorded.joints, config)
     return Measured(recorded_run(content, np.asarray), recorded)
+
+
+@contextmanager
+def named(name: str) -> Iterator[None]:
+    """Let an error begin with the name of a run, if it has one."""
+    try:
+        yield
+    except BlfDscError as error:
+        if not name:
+            raise
+        raise BlfDscError(f'{name}: {error}') from error
 
 
 def check_joints(name: str, joints: Sequence[str], config: ControllerConfig) -> None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple, ParamSpec, TypeVar
 
@@ -23,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
-from blf_dsc_controller.commissioning.measurement import Measured, measured_in
+from blf_dsc_controller.commissioning.measurement import Measured, measured_in, named
 from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import (
@@ -137,15 +136,6 @@ def _check(measured: Measured) -> None:
     response_of(measured.run, lines_in(config), config.sample_time)
 
 
-@contextmanager
-def _named(name: str) -> Iterator[None]:
-    """Let an error say in which posture it is."""
-    try:
-        yield
-    except BlfDscError as error:
-        raise BlfDscError(f'{name}: {error}') from error
-
-
 def _set_aside(bag: Path, why: str) -> None:
     """Rename a bag that is not in the result, so that its name is free for the next one."""
     there = bag.with_name(f'{why}_{bag.name}')
@@ -241,7 +231,7 @@ class PostureByPosture(ABC):
             self._run(way.config, way.duration, f'move {k}')
             planned, bag = self._measure(name)
             while k == 1:
-                with _named(name):
+                with named(name):
                     better = self.aside(
                         better_known_by_bag, self._commissioning, planned, bag
                     )
@@ -258,7 +248,7 @@ class PostureByPosture(ABC):
         planned = self.aside(self._commissioning.motion, self.position())
         bag = self._run(planned.config, planned.duration, name)
         for _ in range(REPEATS):
-            with _named(name):
+            with named(name):
                 again = self.aside(
                     plan_repeat_by_bag,
                     self._commissioning,
@@ -273,7 +263,7 @@ class PostureByPosture(ABC):
             # `plan_repeat` has set it, but of a copy if another process has computed it
             self._commissioning.go_on_with(again)
             bag = self._run(planned.config, planned.duration, name)
-        with _named(name):
+        with named(name):
             self.aside(check, bag)
         return planned, bag
 

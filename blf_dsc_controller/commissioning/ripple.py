@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from blf_dsc_controller.commissioning.measurement import Measured
+from blf_dsc_controller.commissioning.measurement import Measured, named
 from blf_dsc_controller.commissioning.slow_motion import SECONDS
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.identify import find_ripples
@@ -22,12 +22,20 @@ from blf_dsc_controller.identification.ripple import (
 from blf_dsc_controller.run import NANOSECOND, TURNING, Run
 
 
-def ripples_in(runs: Sequence[Measured]) -> tuple[Ripples, ...]:
+def ripples_in(
+    runs: Sequence[Measured], names: Sequence[str] = ()
+) -> tuple[Ripples, ...]:
     """Return what runs of a slow motion together show of each joint.
+
+    `names` are those of the runs in errors.
 
     Raises BlfDscError if the arm stopped in one, or if one ended before its time.
     """
-    recording, _ = joined(*(_recording(run) for run, _ in runs))
+    recordings = []
+    for measured, name in zip(runs, names or [''] * len(runs), strict=True):
+        with named(name):
+            recordings.append(_recording(measured.run))
+    recording, _ = joined(*recordings)
     robot = runs[0].config.robot
     effort: Effort = 'command'
     if robot.drive_compensates != 'none':  # commands lack gravity
