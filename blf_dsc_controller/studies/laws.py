@@ -406,10 +406,11 @@ def format_results(results: dict[str, Result]) -> str:
     for name, result in results.items():
         label = LAWS[name].label
         worst = result.columns().max(axis=1)
-        rough = 100.0 * max(figures.roughness for figures in result.runs)
+        rough = 100.0 * np.max([figures.roughness for figures in result.runs])
         kept = sum(figures.ratio < 1.0 for figures in result.runs)
-        cells = ('-' if np.isnan(value) else f'{value:.2f}' for value in worst)
-        rows.append([label, *cells, f'{rough:.1f} %', f'{kept} of {len(result.runs)}'])
+        cells = ['-' if np.isnan(value) else f'{value:.2f}' for value in worst]
+        cells.append('-' if np.isnan(rough) else f'{rough:.1f} %')
+        rows.append([label, *cells, f'{kept} of {len(result.runs)}'])
         if result.gains:
             each = ', '.join(
                 f'{gain} {value:g}' for gain, value in result.gains.items()
