@@ -109,7 +109,8 @@ def _kernels() -> Finding:
     version = importlib.metadata.version('numba')
     return note(
         'kernels',
-        f'numba {version} compiles them several times slower, and each update takes longer',
+        f'numba {version} compiles them in more than twice the time, and each update takes a '
+        'little longer',
         "pip install 'numba<0.69'",
     )
 

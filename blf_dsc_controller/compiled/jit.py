@@ -28,8 +28,8 @@ except ImportError:  # it uses parts of numba that other releases may lack: see 
     _KERNEL_COMPILER: dict[str, Any] = {}
     SLOW = (
         f'numba {numba.__version__} lacks what this package uses to compile kernels as a whole: '
-        'compilation takes three to four times as long, and each sample of a Panda twice to '
-        'three times: numba before 0.69 has it'
+        'compilation takes more than twice as long, and each sample a little longer: numba before '
+        '0.69 has it'
     )
 else:
     _INNER_COMPILER = {'pipeline_class': LinkedCompiler}

@@ -35,7 +35,7 @@ from typing import Any
 import numba
 from llvmlite import ir
 from llvmlite.binding import parse_assembly, parse_bitcode
-from numba.core import cgutils, types
+from numba.core import cgutils
 from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
@@ -45,8 +45,6 @@ from numba.core.environment import lookup_environment
 from numba.core.errors import UnsupportedError
 from numba.core.runtime import rtsys
 from numba.core.typed_passes import NativeLowering
-from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 
 from blf_dsc_controller.compiled.file_lock import FileLock
 from blf_dsc_controller.compiled.own_folder import is_own, make_own
@@ -280,49 +278,6 @@ class KernelCache(_Stored):
                 super().save_overload(signature, data)
         finally:
             self._lock.release()
-
-
-@intrinsic
-def uncounted(_typing: Any, vector: Any) -> Any:
-    """Return the vector as an array whose references are not counted."""
-
-    def generate(
-        context: Any, builder: ir.IRBuilder, signature: Any, args: Any
-    ) -> ir.Value:
-        array = context.make_array(signature.return_type)(context, builder, args[0])
-        array.meminfo = cgutils.get_null_value(array.meminfo.type)
-        array.parent = cgutils.get_null_value(array.parent.type)
-        return array._getvalue()  # noqa: SLF001 - numba's own way to read a structure
-
-    return vector(vector), generate
-
-
-@intrinsic
-def part_of(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:
-    """Return the contiguous part of this shape at an entry of a vector, unchecked."""
-    view = types.Array(vector.dtype, len(shape), 'C')
-
-    def generate(
-        context: Any, builder: ir.IRBuilder, signature: Any, args: Any
-    ) -> ir.Value:
-        source = context.make_array(signature.args[0])(context, builder, args[0])
-        result = context.make_array(signature.return_type)(context, builder)
-        lengths = cgutils.unpack_tuple(builder, args[2])
-        itemsize = context.get_constant(types.intp, 8)
-        strides = [itemsize]
-        for length in lengths[:0:-1]:
-            strides.insert(0, builder.mul(strides[0], length))
-        populate_array(
-            result,
-            data=builder.gep(source.data, [args[1]]),
-            shape=lengths,
-            strides=strides,
-            itemsize=itemsize,
-            meminfo=None,
-        )
-        return result._getvalue()  # noqa: SLF001
-
-    return view(vector, at, shape), generate
 
 
 def address_of(compiled: Any) -> int:

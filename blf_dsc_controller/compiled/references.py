@@ -26,6 +26,7 @@ from numba.extending import (
     register_model,
 )
 
+from blf_dsc_controller.compiled.array_value import array_value
 from blf_dsc_controller.compiled.jit import INLINED
 
 T = TypeVar('T')
@@ -128,29 +129,11 @@ def _load(manager: Any, builder: Any, field: Any, at: Any) -> Any:
 
 def _array(manager: Any, builder: Any, field: Any, at: Any) -> Any:
     """Return the array whose address and lengths are at the address `at`."""
-    model = manager.lookup(field)
-    item = _WORD(8)
     data, *lengths = (
         builder.load(cgutils.gep_inbounds(builder, at, 0, i))
         for i in range(field.ndim + 1)
     )
-    strides = [item]
-    for length in lengths[:0:-1]:
-        strides.insert(0, builder.mul(strides[0], length))
-    count = lengths[0]
-    for length in lengths[1:]:
-        count = builder.mul(count, length)
-    parts = {
-        'nitems': count,
-        'itemsize': item,
-        'data': data,
-        'shape': cgutils.pack_array(builder, lengths),
-        'strides': cgutils.pack_array(builder, strides),
-    }
-    result = model.get_value_type()(None)
-    for name, part in parts.items():
-        result = model.set(builder, result, part, name)
-    return result
+    return array_value(manager, builder, field, data, lengths)
 
 
 def _copied(manager: Any, builder: Any, type_: Any, value: Any) -> Any:

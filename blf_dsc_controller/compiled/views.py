@@ -13,9 +13,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba.extending import overload
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, overload
 
-from blf_dsc_controller.compiled.jit import INLINED, SLOW, inner
+from blf_dsc_controller.compiled.array_value import array_value
+from blf_dsc_controller.compiled.jit import INLINED
 
 Array = np.ndarray
 
@@ -36,19 +39,46 @@ def part(vector: Array, at: int, shape: tuple[int, ...]) -> Array:
     return vector[at : at + size].reshape(shape)
 
 
-if SLOW:
-    inner(view)
-    inner(part)
-    compiled_part = part
-else:
-    from blf_dsc_controller.compiled.linked import part_of, uncounted
+@intrinsic
+def _uncounted(_typing: Any, vector: Any) -> Any:
+    """Return the vector as an array whose references are not counted."""
 
-    @overload(view, strict=False, jit_options=INLINED)
-    def _compiled_view(vector: Any) -> Any:  # noqa: ARG001 - numba looks at the names
-        return lambda vector: uncounted(vector)  # noqa: PLW0108
+    def generate(
+        context: Any, builder: ir.IRBuilder, signature: Any, args: Any
+    ) -> ir.Value:
+        model = context.data_model_manager.lookup(signature.return_type)
+        (array,) = args
+        for name in ('meminfo', 'parent'):
+            none = cgutils.get_null_value(model.get(builder, array, name).type)
+            array = model.set(builder, array, none, name)
+        return array
 
-    @overload(part, strict=False, jit_options=INLINED)
-    def _compiled_part(vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
-        return lambda vector, at, shape: part_of(vector, at, shape)  # noqa: PLW0108
+    return vector(vector), generate
 
-    compiled_part = part_of
+
+@intrinsic
+def compiled_part(_typing: Any, vector: Any, at: Any, shape: Any) -> Any:
+    """Return the contiguous part of this shape at an entry of a vector, unchecked."""
+    view = types.Array(vector.dtype, len(shape), 'C')
+
+    def generate(
+        context: Any, builder: ir.IRBuilder, signature: Any, args: Any
+    ) -> ir.Value:
+        manager = context.data_model_manager
+        whole, at, shape = args
+        data = manager.lookup(signature.args[0]).get(builder, whole, 'data')
+        begin = builder.gep(data, [at])
+        lengths = cgutils.unpack_tuple(builder, shape)
+        return array_value(manager, builder, signature.return_type, begin, lengths)
+
+    return view(vector, at, shape), generate
+
+
+@overload(view, strict=False, jit_options=INLINED)
+def _compiled_view(vector: Any) -> Any:  # noqa: ARG001 - numba looks at the names
+    return lambda vector: _uncounted(vector)  # noqa: PLW0108
+
+
+@overload(part, strict=False, jit_options=INLINED)
+def _compiled_part(vector: Any, at: Any, shape: Any) -> Any:  # noqa: ARG001
+    return lambda vector, at, shape: compiled_part(vector, at, shape)  # noqa: PLW0108
