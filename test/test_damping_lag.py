@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark import damping_lag, random_arms
+from benchmark import damping_lag, notches, random_arms
 from blf_dsc_controller.arms.linear_loop import law_responses
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.schema import change
@@ -165,3 +165,19 @@ def test_an_arm_that_oscillates_with_the_published_gains_is_calm(given, reports)
     plant = replace(random_arms.arm_of(study, 442), duration=7.8)
     record = simulate(change(study.controller, given), plant)
     assert bool(record.run().oscillations) == reports
+
+
+def test_notch_that_is_compared_with_lags_passes_its_share_at_its_frequency():
+    filters = notches.Filters(lag=np.zeros(2), notch=np.array([20.0, 0.0]))
+    s = 2j * np.pi * np.array([1e-3, 20.0, 1e4])
+    passed = np.abs(filters.passed(s)[..., 0])
+    np.testing.assert_allclose(passed[:, 0], [1.0, notches.SHARE, 1.0], atol=1e-4)
+    np.testing.assert_array_equal(passed[:, 1], 1.0)
+    others = list(filters.others((0.002, 0.005), (30.0,)))
+    assert [(*each.lag, *each.notch) for each in others] == [
+        (0.002, 0.0, 20.0, 0.0),
+        (0.005, 0.0, 20.0, 0.0),
+        (0.0, 0.002, 20.0, 0.0),
+        (0.0, 0.005, 20.0, 0.0),
+        (0.0, 0.0, 20.0, 30.0),
+    ]
