@@ -32,6 +32,7 @@ GROUPS = {
         'notches': 'whether notch filters let gains grow more than lags',
         'stop-damping': 'how much of the damping of a stop a joint bears',
         'commissioning': 'random arms, commissioned and put to work',
+        'gain-rules': 'gains that are measured, and gains by rules',
         'load-observer': 'what joint torque sensors are worth',
         'observer-poles': 'how fast the load observer may be',
         'chosen-poles': 'how fast commissioning makes it, and what that is worth',
