@@ -13,7 +13,7 @@ leave.  Each runs for 60 s with the gains of
 
 A bandwidth w gives a joint the stiffness J w^2 and the damping 0.8 J w.  The two rules know the
 true gears K and motors; M and J are the largest inertias of the model over all postures with the
-rated payload, without and with the motors.
+rated payload, without the motors, and with what a torque loop leaves of them.
 
     held             arms that neither stop nor oscillate
     motion, pick-up  median of the largest errors [mrad] of these
@@ -58,7 +58,8 @@ def by_rule(
     links = arm.over_postures().inertia - arm.rotors
     antiresonance = np.sqrt(np.asarray(joints.stiffness) / links)
     w = HALF * antiresonance if rule == RULES[1] else LEAST * antiresonance.min()
-    J = links + joints.motors
+    loop = joints.torque_loop
+    J = links + joints.motors / (1.0 + (loop.gain if loop else 0.0))
     gains = damped_arm(0.8 * J * w, J)
     return with_gains(config, as_parameters(gains.stiffness, gains.damping))
 
