@@ -6,12 +6,12 @@
 The arms and runs are those of `commissioning`, with a bound that only an arm that shakes would
 leave.  Each runs for 60 s with the gains of
 
-    commissioned     the measured arm, with a modulus margin of 0.5
-    antiresonance    a bandwidth w of each joint of half of its first antiresonance sqrt(K / M)
-    least            0.4 times the least antiresonance of all joints, for all of them
-    preset           the configuration that it was measured with
+    commissioned       the measured arm, with a modulus margin of 0.5
+    half, a quarter    a bandwidth w of each joint of so much of its first antiresonance sqrt(K / M)
+    0.4, 0.2 of least  so much of the least antiresonance of all joints, for all of them
+    preset             the configuration that it was measured with
 
-A bandwidth w gives a joint the stiffness J w^2 and the damping 0.8 J w.  The two rules know the
+A bandwidth w gives a joint the stiffness J w^2 and the damping 0.8 J w.  The rules know the
 true gears K and motors; M and J are the largest inertias of the model over all postures with the
 rated payload, without the motors, and with what a torque loop leaves of them.
 
@@ -45,8 +45,13 @@ from blf_dsc_controller.commissioning.commissioned import commissioned
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.studies.runs import cores
 
-RULES = ('commissioned', 'antiresonance', 'least', 'preset')
-HALF, LEAST = 0.5, 0.4  # of an antiresonance
+RULES = {  # share of the antiresonance, and whether of the least one
+    'half': (0.5, False),
+    'a quarter': (0.25, False),
+    '0.4 of least': (0.4, True),
+    '0.2 of least': (0.2, True),
+}
+ALL = ('commissioned', *RULES, 'preset')
 
 
 def by_rule(
@@ -57,7 +62,8 @@ def by_rule(
     arm, _ = design_of(config)
     links = arm.over_postures().inertia - arm.rotors
     antiresonance = np.sqrt(np.asarray(joints.stiffness) / links)
-    w = HALF * antiresonance if rule == RULES[1] else LEAST * antiresonance.min()
+    share, of_least = RULES[rule]
+    w = share * (antiresonance.min() if of_least else antiresonance)
     loop = joints.torque_loop
     J = links + joints.motors / (1.0 + (loop.gain if loop else 0.0))
     gains = damped_arm(0.8 * J * w, J)
@@ -70,7 +76,7 @@ def errors_of(name: str, number: int) -> list[tuple[float, float, float]]:
     found = commissioned(config, measured, MARGIN)
     configs = (
         found.config,
-        *(by_rule(config, name, number, rule) for rule in RULES[1:3]),
+        *(by_rule(config, name, number, rule) for rule in RULES),
         config,
     )
     return [largest_errors(without_bound(each), plant, LONG) for each in configs]
@@ -83,7 +89,7 @@ def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
             found = np.array(
                 list(pool.map(errors_of, itertools.repeat(name), range(count)))
             )
-            for rule, errors in zip(RULES, np.moveaxis(found, 1, 0), strict=True):
+            for rule, errors in zip(ALL, np.moveaxis(found, 1, 0), strict=True):
                 held = errors[~np.isnan(errors[:, 0])]
                 motion, pick_up, _ = (
                     np.median(held, axis=0) if len(held) else [np.nan] * 3
