@@ -91,16 +91,10 @@ def rows(names: tuple[str, ...], count: int) -> Iterator[list[str]]:
             )
             for rule, errors in zip(ALL, np.moveaxis(found, 1, 0), strict=True):
                 held = errors[~np.isnan(errors[:, 0])]
-                motion, pick_up, _ = (
-                    np.median(held, axis=0) if len(held) else [np.nan] * 3
-                )
-                yield [
-                    name.rpartition('_')[2],
-                    rule,
-                    f'{len(held)} of {count}',
-                    f'{motion:.2g}',
-                    f'{pick_up:.2g}',
-                ]
+                medians = np.median(held, axis=0)[:2] if len(held) else ()
+                motion, pick_up = [f'{each:.2g}' for each in medians] or '--'
+                first = name.rpartition('_')[2], rule, f'{len(held)} of {count}'
+                yield [*first, motion, pick_up]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -290,7 +290,8 @@ def _reason(path: Path, error: Exception) -> str:
 def _missing(folder: Path) -> str:
     """Return which files a folder lacks that its metadata names, and what to do."""
     names: list[str] = []
-    with suppress(Exception):  # anything, if the metadata is of another kind or damaged
+    # where the metadata is of another kind or damaged, the library says so
+    with suppress(OSError, ValueError, LookupError, TypeError, yaml.YAMLError):
         stated = yaml.safe_load((folder / METADATA).read_text())
         files = stated['rosbag2_bagfile_information']['relative_file_paths']
         names = [Path(each).name for each in files]

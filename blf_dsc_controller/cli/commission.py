@@ -99,7 +99,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         lags=_lags(path),
     )
     if _in_motors(path) and (options.robot or options.ros or not options.bags):
-        _say_of_motors(config)
+        _check_in_motors(config)
     if options.write:
         _write_motions(options, path, commissioning)
         return 0
@@ -252,8 +252,8 @@ def _lags(path: Path) -> Sequence[float]:
     return () if _in_motors(path) else LAGS
 
 
-def _say_of_motors(config: ControllerConfig) -> None:
-    """Say that a feedback which motors close is measured over the bus.
+def _check_in_motors(config: ControllerConfig) -> None:
+    """Warn that a feedback which motors close is measured over the bus.
 
     Raises BlfDscError if no arm would bear its gains there.
     """
