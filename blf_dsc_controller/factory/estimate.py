@@ -22,6 +22,7 @@ from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.run import LearnedArm
 
 _MOST_FRICTION = 3.0  # times its initial estimate
+_RIPPLE = 0.01  # standard deviation of a torque ripple, of the rated torque
 
 
 def model_of(config: ControllerConfig) -> ArmModel:
@@ -49,7 +50,8 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     """Return the disturbance columns, in the order of `columns` and `ripple`.
 
     The standard deviation is half the initial estimate, or 5 % of the rated torque
-    where that is zero, for `viscous` at the largest velocity of the reference.
+    where that is zero, for `viscous` at the largest velocity of the reference.  Ripple
+    has 1 %: what is learned faster than it is known costs more than a weak ripple does.
     Friction is between a third of its initial estimate and three times that, or between
     0 and those 5 %: a push that is learned as friction, negative or none, turns over
     where the joint does.
@@ -85,7 +87,8 @@ def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Col
     is_viscous = block == 'viscous'
     is_friction = block in {'viscous', 'coulomb'}
     velocity = config.limits.velocity[i] if is_viscous else 1.0
-    usual = UNKNOWN_FRICTION * config.torque.limit[i] / velocity
+    share = _RIPPLE if block.endswith(' q') else UNKNOWN_FRICTION
+    usual = share * config.torque.limit[i] / velocity
     return Column(
         name=f'{block} {config.joints[i]}',
         unit=config.units[i].of('N m s/rad' if is_viscous else 'N m'),
