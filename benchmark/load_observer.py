@@ -234,9 +234,14 @@ def loop_of(
     loop = load_loop(preset, {PLANT: plant, CONTROLLER: controller})
     if law.is_learning:
         return loop
-    count = len(loop.controller.learning.initial_estimate)
+    return loop._replace(controller=without_learning(loop.controller))
+
+
+def without_learning(controller: ControllerConfig) -> ControllerConfig:
+    """Return a controller that keeps its estimate at first: a PID over the model of the URDF."""
+    count = len(controller.learning.initial_estimate)
     still = {'learning.weight': 0.0, 'learning.adaptation_gain': [0.0] * count}
-    return loop._replace(controller=change(loop.controller, still))
+    return change(controller, still)
 
 
 def known_after(record: Record) -> float:

@@ -73,6 +73,7 @@ from blf_dsc_controller.arms.linear_loop import Feedback
 from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.simulation.loop import simulate
@@ -363,7 +364,14 @@ def figures(
     controller = loop.controller
     if law in RIVALS:
         controller = law_of(controller, name, law, pair)
-    record = simulate(controller, loop.plant)
+    return outcome(controller, loop.plant, weighs=law in (THIS, NO_SENSORS))
+
+
+def outcome(
+    controller: ControllerConfig, plant: PlantConfig, *, weighs: bool
+) -> Figures:
+    """Run a controller on an arm; `weighs` is whether it is to weigh the load."""
+    record = simulate(controller, plant)
     run = record.run()
     if run.stops:
         stop = run.stops[0]
@@ -379,7 +387,7 @@ def figures(
         load_observer.largest(run.time, error),
         load_observer.largest(run.time, record.true_errors()),
         1e3 * float(np.sqrt((late**2).sum(axis=1).mean())),
-        load_observer.known_after(record) if law in (THIS, NO_SENSORS) else np.nan,
+        load_observer.known_after(record) if weighs else np.nan,
         random_arms.shaking_of(record),
         bool(run.oscillations),
     )
@@ -413,6 +421,23 @@ def row(name: str, law: str, found: list[Figures], others: list[Figures]) -> lis
         spread(ratios, worst=min, digits='.2g') if ratios else '-',
         f'{shaking:.1f} %' + (f', {fate}' if fate else ''),
     ]
+
+
+def rows_of(
+    name: str, law: str, found: list[Figures], others: list[Figures]
+) -> Iterator[list[str]]:
+    """Compute that row, and where encoders are at the motors a second one for the links."""
+    yield row(name, law, found, others)
+    if 'sensor.side' in ALL[name].plant:
+        at_links = [of._replace(errors=of.links, known=np.nan) for of in found]
+        cells = row(name, f'{law}, links', at_links, others)
+        yield [*cells[:5], *['-'] * 4]
+
+
+def goal_row(name: str) -> list[str]:
+    """Return what is aimed at on an arm."""
+    arm = ALL[name]
+    return [arm.label, 'goal', *arm.goal, f'{arm.known} s', '-', '8', '-']
 
 
 def fate_of(found: Sequence[Figures]) -> str:
@@ -466,18 +491,13 @@ def rows(
     name: str, truths: int, laws: Sequence[str], kept: Kept
 ) -> Iterator[list[str]]:
     """Compute the rows of an arm with some laws, that without learning first."""
-    arm = ALL[name]
-    yield [arm.label, 'goal', *arm.goal, f'{arm.known} s', '-', '8', '-']
+    yield goal_row(name)
     asked = [each for each in laws_of(name) if each in laws]
     others: list[Figures] = []
     for law in sorted(asked, key=lambda each: each != NO_LEARNING):
         found = [kept.of(name, law, k) for k in range(1, truths + 1)]
         others = found if law == NO_LEARNING else others
-        yield row(name, law, found, others)
-        if 'sensor.side' in arm.plant:
-            at_links = [of._replace(errors=of.links, known=np.nan) for of in found]
-            cells = row(name, f'{law}, links', at_links, others)
-            yield [*cells[:5], *['-'] * 4]
+        yield from rows_of(name, law, found, others)
 
 
 INTEGRALS = (1.0, 2.0, 4.0, 8.0)  # on `disturbance.gain`
@@ -540,12 +560,12 @@ def gains_row(name: str) -> list[str]:
     ]
 
 
-_HEADS = (
+HEADS = (
     *('arm', 'law', 'in motion', 'pick-up', 'later', 'weight known after'),
     *('rms with 2 kg', 'without learning, over it', 'shakes'),
 )
-_INTEGRATOR = (*_HEADS[:1], 'factor', *_HEADS[2:5], _HEADS[8], 'damped')
-_OBSERVERS = (*_HEADS[:1], 'factor and pole', *_HEADS[2:5], _HEADS[8])
+_INTEGRATOR = (*HEADS[:1], 'factor', *HEADS[2:5], HEADS[8], 'damped')
+_OBSERVERS = (*HEADS[:1], 'factor and pole', *HEADS[2:5], HEADS[8])
 _GAINS = ('arm', 'margin', 'this law, factor', *RIVALS)
 
 
@@ -576,4 +596,4 @@ def main(given: argparse.Namespace) -> None:
     print()
     kept = Kept(given.keep, links=given.links)
     of_arms = (rows(name, given.truths, given.laws, kept) for name in given.arms)
-    print_table(_HEADS, itertools.chain.from_iterable(of_arms))
+    print_table(HEADS, itertools.chain.from_iterable(of_arms))

@@ -26,6 +26,7 @@ GROUPS = {
         'margins': 'margins of the default gains, and errors at a pick-up',
         'elastic': 'where the gains of the presets hold, by the stiffness of gears',
         'soft-arms': 'errors at gains that gears bear, against goals and rivals',
+        'measured-arms': 'the same arms, each commissioned by itself first',
         'two-encoders': 'what encoders at motors and links are worth together',
         'known-load': 'what it would be worth to know a load at once',
         'damping-lag': 'UR5es whose damping lags, and the same ones without',
