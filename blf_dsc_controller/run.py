@@ -41,10 +41,7 @@ class Series:
         return self.values[:, self.names.index(name)]
 
     def held(self, stamp: Stamps, names: Sequence[str]) -> Floats:
-        """Return the last values of these names at or before each stamp.
-
-        The first values for earlier stamps.
-        """
+        """Return the last values of these names at or before each stamp, the first before any."""
         before = np.searchsorted(self.stamp, stamp, side='right') - 1
         rows = np.maximum(before, 0)
         found = np.empty((len(rows), len(names)))
@@ -138,10 +135,7 @@ def unit_of_all(units: Iterable[JointUnits], unit: str) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """N samples of n joints, simulated, recorded or replayed.
-
-    None or NaN where unknown.
-    """
+    """N samples of n joints, simulated, recorded or replayed; None or NaN where unknown."""
 
     joints: tuple[str, ...]
     stamp: Stamps  #: (N,) ns, of the joint states
@@ -175,10 +169,7 @@ class Run:
         return SLIDING if joint in self.sliding else TURNING
 
     def column(self, name: str, i: int) -> Floats | None:
-        """Return the values of one joint (N,) in an array by name.
-
-        None if it is unknown.
-        """
+        """Return the values of one joint (N,) in an array by name; None if it is unknown."""
         values = getattr(self, name)
         return None if values is None else values[:, i]
 

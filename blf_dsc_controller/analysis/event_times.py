@@ -58,10 +58,7 @@ def true_change_times(run: Run) -> list[float]:
 
 
 def outside(run: Run, i: int) -> NDArray[np.bool_] | None:
-    """Return where |xi1| >= k_c for a joint, (N,).
-
-    None if error or bound is unknown.
-    """
+    """Return where |xi1| >= k_c for a joint, (N,); None if error or bound is unknown."""
     error = run.column('error', i)
     bound = run.column('bound', i)
     return (
@@ -70,9 +67,7 @@ def outside(run: Run, i: int) -> NDArray[np.bool_] | None:
 
 
 def first_violation(run: Run) -> tuple[float, str]:
-    """Return when [s] a joint first left its bound, and which.
-
-    NaN and empty if none did.
+    """Return when [s] a joint first left its bound, and which; NaN and empty if none did.
 
     The error of the sample that causes a stop is not published, so the stop itself
     counts.

@@ -288,10 +288,7 @@ def _least(values: Floats) -> float:
 
 
 def _at_moments(time: Floats, error: Floats) -> dict[int, float]:
-    """Return the error at the sample nearest to each moment.
-
-    NaN where the run did not reach it.
-    """
+    """Return the error at the sample nearest to each moment; NaN where the run did not reach it."""
     end = time[-1] + 1.5 * (float(np.median(np.diff(time))) if time.size > 1 else 0.0)
     return {
         moment: float(error[np.abs(time - moment).argmin()])

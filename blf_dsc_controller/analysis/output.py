@@ -28,10 +28,7 @@ def write_json(numbers: Any, path: Path) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Convert to lists and dictionaries for JSON.
-
-    NaN and infinity become None.
-    """
+    """Convert to lists and dictionaries for JSON; NaN and infinity become None."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, dict):

@@ -307,10 +307,7 @@ def _error(run: Run, t: Floats, i: int, error: Floats) -> Panel:
 
 
 def _span(bound: Floats | None, error: Floats) -> float:
-    """Return the axis limit for a funnel, whose wide start would hide the error.
-
-    0 otherwise.
-    """
+    """Return the axis limit for a funnel, whose wide start would hide the error; else 0."""
     if bound is None or bound[0] <= bound[-1]:
         return 0.0
     known = np.abs(error[np.abs(error) < _LARGEST])

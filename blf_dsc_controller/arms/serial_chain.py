@@ -129,10 +129,7 @@ def begin(bodies: Bodies) -> None:
 
 @inner
 def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> None:
-    """Transform all motions from the frame of body i - 1 to that of i.
-
-    Add those of joint i.
-    """
+    """Transform all motions from the frame of body i - 1 to that of i, and add those of joint i."""
     motions = bodies.motions
     rotation = bodies.rotation[i]
     c, s = cos(q), sin(q)
@@ -229,10 +226,7 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> Non
 
 @inner
 def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
-    """Copy the products that are columns of body i to row j of Y.
-
-    Zero the rows below i.
-    """
+    """Copy the products that are columns of body i to row j of Y; zero the rows below i."""
     for k in range(int(bodies.first[i]), int(bodies.first[i + 1])):
         Y[j, k] = products[int(bodies.entry[k])]
         if j == i:

@@ -83,10 +83,7 @@ def shell_domain() -> int:
 
 
 def claimed(domain: int) -> socket.socket | None:
-    """Return the claim of a domain, held until it is closed.
-
-    None if another process has it.
-    """
+    """Return the claim of a domain, held until it is closed; None if another process has it."""
     claim = socket.socket(socket.AF_UNIX)
     claim.set_inheritable(True)
     try:

@@ -142,10 +142,7 @@ def end_at_signals(program: str) -> None:
 
 
 def _interrupt(program: str, _number: int, _frame: object) -> None:
-    """Raise KeyboardInterrupt, or exit at once during compilation.
-
-    Compilation would swallow the exception.
-    """
+    """Raise KeyboardInterrupt, or exit at once during compilation, which would swallow it."""
     numba = sys.modules.get('numba.core.compiler_lock')
     if numba is not None and numba.global_compiler_lock.is_locked():
         discard_unbegun()

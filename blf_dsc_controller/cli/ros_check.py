@@ -39,10 +39,7 @@ def require_ros() -> None:
 
 
 def _require_middleware(name: str) -> None:
-    """Raise BlfDscError if a chosen middleware cannot be loaded.
-
-    ROS would end the process.
-    """
+    """Raise BlfDscError if a chosen middleware cannot be loaded: ROS would end the process."""
     if name == _DEFAULT or importlib.util.find_spec('rclpy') is None:
         return
     load = child.running(_LOAD)

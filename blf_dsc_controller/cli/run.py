@@ -212,10 +212,7 @@ def notes_on_ideal_arm(config: LoopConfig) -> Iterator[str]:
 
 
 def _report(out: Path) -> bool:
-    """Draw and summarise the bag of a run.
-
-    Return whether the controller stopped in it.
-    """
+    """Draw and summarise the bag of a run; return whether the controller stopped in it."""
     # slow: the libraries of the pictures
     from blf_dsc_controller.analysis.figures import draw
     from blf_dsc_controller.analysis.metrics import measure

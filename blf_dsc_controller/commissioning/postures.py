@@ -186,10 +186,7 @@ class PostureByPosture(ABC):
         return compute(*given, **named)
 
     def request_end(self) -> None:
-        """Bring the arm to rest and end; a second request ends at once.
-
-        For signal handlers.
-        """
+        """Bring the arm to rest and end, as for a signal; a second request ends at once."""
         self._requests += 1
 
     def position(self) -> Floats:

@@ -64,10 +64,7 @@ _FILTERED = '; of the law paper, gains.prediction filtered'
 
 @dataclass(frozen=True)
 class ControllerConfig(ArmConfig):
-    """Parameters of the node `blf_dsc_controller`.
-
-    The defaults are the recommended set.
-    """
+    """Parameters of the node `blf_dsc_controller`; the defaults are the recommended set."""
 
     law: str = sizing(
         'blf_dsc',
@@ -119,10 +116,7 @@ class ControllerConfig(ArmConfig):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> Mapping[str, Value]:
-        """Return gains and limits for the arm of a URDF.
-
-        The defaults suit the two-link arm.
-        """
+        """Return gains and limits for the arm of a URDF; the defaults suit the two-link arm."""
         return followed_by(given)
 
     @property

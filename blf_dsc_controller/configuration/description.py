@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a URDF of this package can say beyond the format.
-
-Other readers ignore it.
+"""What a URDF of this package can say beyond the format; other readers ignore it.
 
 `<dynamics armature="">` is the inertia of the drive at its joint, `<link gravity="">`
 is gravity in the frame of a link that no joint moves, and `<joint><unsupported

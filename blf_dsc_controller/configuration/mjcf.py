@@ -87,10 +87,7 @@ def _model(source: str | Path, name: str) -> Any:
 
 
 def _remove_shapes(spec: Any) -> None:
-    """Remove shapes that inertias do not depend on.
-
-    Their files need not exist.
-    """
+    """Remove shapes that inertias do not depend on: their files need not exist."""
     import mujoco
 
     from_shapes = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE

@@ -80,10 +80,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Approach:
-    """Motion to the reference from a start outside the bound.
-
-    The bound applies along it.
-    """
+    """Motion to the reference from a start outside the bound, which applies along it."""
 
     enabled: bool = parameter(
         True,

@@ -362,9 +362,7 @@ def _located(
 
 
 def dump(path: Path, nodes: Mapping[str, object], comment: str = '') -> None:
-    """Write all parameters of the nodes to a parameter file.
-
-    Loading it restores them exactly.
+    """Write all parameters of the nodes to a parameter file; loading it restores them exactly.
 
     `nodes` are configurations, or values by dotted name, by node name with or without a
     namespace.

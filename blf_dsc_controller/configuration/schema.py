@@ -84,10 +84,7 @@ class Parameter:
 
     @property
     def allowed(self) -> str:
-        """The valid range or choices, such as `above 0 and at most 1`.
-
-        Empty: any value.
-        """
+        """The valid range or choices, such as `above 0 and at most 1`; empty: any value."""
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
         return ' and '.join(
@@ -239,9 +236,7 @@ def differences(before: object, after: object) -> dict[str, Value]:
 
 
 def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Config:
-    """Make a configuration from values by dotted name.
-
-    Missing ones keep their defaults.
+    """Make a configuration from values by dotted name; missing ones keep their defaults.
 
     Raises ConfigurationError with all problems: unknown names, types and ranges, and,
     if each value is valid by itself, lengths and conflicts between parameters.

@@ -40,10 +40,7 @@ class StateError(BlfDscError):
 
 
 class Load(NamedTuple):
-    """What the tip holds, with half the width of its 95 % interval.
-
-    NaN while it is unknown.
-    """
+    """What the tip holds, with half the width of its 95 % interval; NaN while it is unknown."""
 
     mass: float  # kg
     interval: float  # kg
@@ -424,10 +421,7 @@ class ArmController:
 
     @property
     def estimates(self) -> dict[str, float]:
-        """Learned parameters and friction by their names.
-
-        NaN where a column was rejected.
-        """
+        """Learned parameters and friction by their names; NaN where a column was rejected."""
         values = self._loop.guard.controller.sample.estimate
         return dict(zip(self._loop.estimates, values.tolist(), strict=True))
 

@@ -13,10 +13,7 @@ _BINS = 20_000
 
 
 class Latency:
-    """A histogram of durations, in microseconds up to 20 ms.
-
-    Longer ones are in its last bin.
-    """
+    """A histogram of durations, in microseconds up to 20 ms; longer ones are in its last bin."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, dtype=np.int64)
@@ -28,10 +25,7 @@ class Latency:
         self.largest = max(self.largest, duration)
 
     def quantile(self, share: float) -> float:
-        """Return the duration [s] that a `share` of all does not exceed.
-
-        0 without any.
-        """
+        """Return the duration [s] that a `share` of all does not exceed; 0 without any."""
         total = int(self._counts.sum())
         if not total:
             return 0.0

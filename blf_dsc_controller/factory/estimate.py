@@ -53,8 +53,8 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     where that is zero, for `viscous` at the largest velocity of the reference.  Ripple
     has 1 %: what is learned faster than it is known costs more than a weak ripple does.
     Friction is between a third of its initial estimate and three times that, or between
-    0 and those 5 %: a push that is learned as friction, negative or none, turns over
-    where the joint does.
+    0 and those 5 %: a push that is learned as friction, negative or none, changes
+    sign where the joint reverses.
     """
     known: dict[str, Any] = {}
     if config.model == 'urdf':

@@ -212,7 +212,7 @@ def _observer(config: ControllerConfig, p: int, lag: float) -> load_observer.Set
         config.disturbance,
         enabled=int(is_on),
         sensor_lag=0.5 * lag,  # the other half is that of the drives
-        unmodelled=_unmodelled(config),
+        unmodelled=np.array(config.learning.residual_floor),
         most=load_observer.most_load(np.array(config.torque.limit)),
         rotors=rotors,
     )
@@ -321,7 +321,7 @@ def _adaptation(
 
 
 def _contact(config: ControllerConfig) -> contact.Settings:
-    """Return whether contacts are found, what they do, and what is no contact."""
+    """Return whether contacts are found, what they do, and what is not a contact."""
     given = config.contact
     return filled(
         contact.Settings,
@@ -343,14 +343,8 @@ def _external(
         row_interval=sliding.row_interval,
         coulomb_velocity=config.learning.coulomb_velocity,
         row_variance=_PRIOR * least * least,
-        unmodelled=_unmodelled(config),
+        unmodelled=np.array(config.learning.residual_floor),
     )
-
-
-def _unmodelled(config: ControllerConfig) -> np.ndarray:
-    """Return the rms torque (n,) [N m] that no column describes."""
-    least = np.sqrt(_excitation(config).residual_floor / len(config.joints))
-    return np.asarray(least / _row(config).row_weight)
 
 
 def friction_settings(settings: Settings) -> friction.Settings:

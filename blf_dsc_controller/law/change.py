@@ -53,6 +53,7 @@ class Work(NamedTuple):
     predicted: Annotated[Array, 'n', 'm']
     innovation: Annotated[Array, 'n']
     covariance: Annotated[Array, 'n', 'n']
+    before: Annotated[Array, 'm']  # theta^ before it is taken back
 
 
 @inner

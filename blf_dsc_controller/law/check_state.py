@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
+from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, size_of, view_of
 from blf_dsc_controller.law import effect, kept_estimates, oscillation, repeats, sensor
 
@@ -42,6 +43,12 @@ class Checks(NamedTuple):
     sensor: sensor.State
     effect: effect.State
     oscillation: oscillation.State
+
+
+@inner
+def are_on(checks: Checks) -> bool:
+    """Whether anything is checked: neither by default nor in a `Controller.trial`."""
+    return bool(checks.velocity_limit[0] > 0.0)
 
 
 checks_of = view_of(Checks)

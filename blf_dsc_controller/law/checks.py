@@ -11,13 +11,19 @@ from math import isfinite
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import effect, kept_estimates, oscillation
-from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT, Checks
+from blf_dsc_controller.law.check_state import (
+    NO_EFFECT,
+    OUTSIDE,
+    SUSPECT,
+    Checks,
+    are_on,
+)
 from blf_dsc_controller.law.state import Sample, Settings, Signals, State
 
 
 @inner
 def is_valid_state(checks: Checks, measurement: Array) -> bool:
-    """Check that the used values of [q, dq, applied torque] (3 n,) are finite and not too fast."""
+    """Whether the used values of [q, dq, applied torque] (3 n,) are finite and not too fast."""
     n = measurement.size // 3
     for i in range(n):
         if not (
@@ -33,7 +39,7 @@ def watch_oscillation(
     settings: Settings, checks: Checks, signals: Signals, begins: bool, dt: float
 ) -> bool:
     """Follow the half waves of the joints, if checked; return whether to report an oscillation."""
-    if checks.velocity_limit[0] <= 0.0 or checks.sample_time[0] <= 0.0:
+    if not are_on(checks) or checks.sample_time[0] <= 0.0:
         return False
     now = checks.oscillation
     limit = settings.torque.limit

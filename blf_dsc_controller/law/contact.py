@@ -32,7 +32,7 @@ class Settings(NamedTuple):
 
     enabled: int  # 1: r is found, and whether it is a contact
     threshold: float  # h
-    loads: int  # 1: what a load in the tip explains is no contact
+    loads: int  # 1: what a load in the tip explains is not a contact
     freezes: int  # 1: nothing is learned while something touches the arm
 
 

@@ -44,9 +44,8 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 _FIRST = 0.5  # s since the first window, in which theta^ settles and s^2 is measured
 _REVERSING = 1.5  # `learning.coulomb_velocity`, below which a joint is about to reverse
 _RESTING = 0.005  # `learning.coulomb_velocity`, below which it rests
-_AFTER = (
-    3.0  # 1/L, for which it still counts as reversing, and does not count as resting
-)
+# 1/L, for which it still counts as reversing, and does not count as resting
+_AFTER = 3.0
 _SETTLED = 6.0  # 1/L, of rest before a tare
 _LEAST_NOISE = 0.01  # of the mean square of the unmodelled torque
 _ASSUMED = (0.01, 0.1, 0.1)  # of a window, for which the unmodelled torque counts
@@ -75,7 +74,7 @@ class State(NamedTuple):
     latch_time: Cell  # s, when the window of `factor` was latched; 0: it is the prior's
     factor: Annotated[Array, 'm * contact.enabled', 'm']  # of Phi_e + rho R, or of R
     variance: Cell  # a: that times its inverse is the covariance of theta
-    # of r by theta, less what a tare knows of r, (N m)^2
+    # of r by theta, less what a tare says of r, (N m)^2
     covariance: Annotated[Array, 'n * contact.enabled', 'n']
     spread: Annotated[Array, 'n * contact.enabled', 'n']  # factor of S
     # s^2, in motion, in slow motion and at rest, (N m)^2

@@ -260,7 +260,7 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
     friction of the sensors, if there are any.
     """
     senses = joint_sensors.shows_friction(settings, state)
-    before = signals.scratch.adaptation.tracked  # scratch here
+    before = signals.scratch.change.before
     for j in range(settings.m):
         before[j] = state.estimate[j]
         is_sensed = senses and settings.p <= j < settings.motors.size

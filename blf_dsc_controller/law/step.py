@@ -27,6 +27,7 @@ from blf_dsc_controller.law.check_state import (
     NOT_SENSORS,
     OSCILLATES,
     Checks,
+    are_on,
     checks_of,
 )
 from blf_dsc_controller.law.checks import (
@@ -87,8 +88,8 @@ def fill_sample(
 @inner
 def check_measurement(checks: Checks, measurement: Array, dt: float) -> int:
     """Return the flags of a measurement that the law must not use, or 0; update the sensor's."""
-    if checks.velocity_limit[0] <= 0.0:
-        return 0  # nothing is checked
+    if not are_on(checks):
+        return 0
     if not is_valid_state(checks, measurement):
         return INVALID
     T = checks.sample_time[0]
@@ -105,7 +106,7 @@ def take_measurement(
 ) -> None:
     """Write q, dq and effort into the signals, without repeats if there are checks."""
     used = measurement
-    if checks.velocity_limit[0] > 0.0:
+    if are_on(checks):
         T = checks.sample_time[0]
         repeats.bridge(checks.repeats, measurement, begins, T, dt)
         used = checks.repeats.used
@@ -160,6 +161,25 @@ def advance(
 
 
 @inner
+def blame_oscillation(settings: Settings, checks: Checks, state: State) -> int:
+    """Return the flag of an oscillation, or 0 while the load observer gives way to one.
+
+    The observer, which may be the cause, becomes slower before the arm is said to oscillate.
+    """
+    r = state.observer
+    if torque_sensors.is_fading(r.faded, r.slowed, r.calmed):
+        return 0
+    gives_way = torque_sensors.take_blame(
+        state.sensors,
+        checks.oscillation,
+        settings.torque.limit,
+        settings.observer.most,
+        r.slowed,
+    )
+    return NOT_SENSORS if gives_way else OSCILLATES
+
+
+@inner
 def step(
     law: Law,
     settings: Settings,
@@ -188,23 +208,15 @@ def step(
     noted = state.sensors.noted[0]
     advance(law, settings, state, signals, t, dt)
     fill_sample(settings, state, signals, sample)
-    if checks.velocity_limit[0] <= 0.0:
-        return 0  # nothing is checked
+    if not are_on(checks):
+        return 0
     flags = check_sample(settings, checks, state, signals, sample)
     if state.sensors.noted[0] != noted:
         oscillation.forget_all(checks.oscillation)  # r may have been the cause
         return flags | NOT_SENSORS
-    r = state.observer
-    if not oscillates or torque_sensors.is_fading(r.faded, r.slowed, r.calmed):
-        return flags
-    gives_way = torque_sensors.take_blame(
-        state.sensors,
-        checks.oscillation,
-        settings.torque.limit,
-        settings.observer.most,
-        r.slowed,
-    )
-    return flags | (NOT_SENSORS if gives_way else OSCILLATES)
+    if oscillates:
+        flags |= blame_oscillation(settings, checks, state)
+    return flags
 
 
 @kernel

@@ -145,10 +145,7 @@ class TargetStream:
         return velocity
 
     def _slope(self, intervals: int) -> tuple[float, np.ndarray]:
-        """Return time and mean rise since a target at least so long ago.
-
-        Both in intervals.
-        """
+        """Return time and mean rise, both in intervals, since a target at least so long ago."""
         before = self._numbers[-1] - self._numbers
         i = max(int(np.count_nonzero(before >= intervals)) - 1, 0)
         passed = float(before[i])

@@ -242,10 +242,7 @@ def _before(states: JointStates, until: int) -> JointStates:
 
 
 def _commands_before(content: Content, until: int) -> int:
-    """Return the number of torques received before a time [ns].
-
-    0 if it is not known.
-    """
+    """Return the number of torques received before a time [ns]; 0 if it is not known."""
     messages = content.topics.get(topics.COMMANDS)
     if messages is None:
         return 0

@@ -19,6 +19,7 @@ from blf_dsc_controller.law.check_state import (
     NOT_SENSORS,
     OSCILLATES,
     SUSPECT,
+    are_on,
 )
 from blf_dsc_controller.law.laws import for_law
 from sim_plant.kernels import OBSERVE, STEP, TRUTH
@@ -198,5 +199,5 @@ class CompiledLoop:
             controller.reference_vector,
             controller.torque_at,
             perceives=span.observed or settings.contact.freezes == 1,
-            ends_at_contact=bool(controller.checks.velocity_limit[0] > 0.0),
+            ends_at_contact=are_on(controller.checks),
         )

@@ -69,10 +69,7 @@ def draw_pairs(studies: Studies, path: Path) -> None:
 
 
 def _draw_boxes(axes: Axes, name: str, unit: float, studies: Studies) -> None:
-    """Draw quantiles of a figure with and without learning.
-
-    Of the runs that keep the bound without.
-    """
+    """Draw quantiles of a figure with and without learning, where the bound is kept without."""
     labels: list[str] = []
     for title, (study, results) in studies.items():
         for (law, label), colour in zip(LAWS.items(), (BLUE, ORANGE), strict=True):

@@ -397,10 +397,7 @@ class Page:
 
 
 def _shortened(joints: Sequence[str]) -> tuple[str, Sequence[str]]:
-    """Return what all names begin with, and what is left of each.
-
-    A legend has little room.
-    """
+    """Return what all names begin with, and what is left of each: a legend has little room."""
     prefix = os.path.commonprefix(joints).rstrip('0123456789')  # noqa: RUF071 - of characters
     rest = [name.removeprefix(prefix) for name in joints]
     return (prefix, rest) if all(rest) and prefix else ('joints', joints)
