@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from elastic_two_link import ARM, BEGIN, FAR, NEAR, shorten_motions, shorten_moves
 from plant_driver import PlantDriver
+from recorded_run import small_disk
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.arms.urdf import frames
@@ -161,6 +162,19 @@ def test_lost_states_are_told_after_the_first_posture(arm, capsys):
     assert 'posture 1: ' in (told := capsys.readouterr().err)
     assert 'joint states are missing' in told
     assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 2]
+    assert nothing_looks_whole(arm)
+
+
+def test_full_disk_is_told_once(tmp_path, arm, capsys, caplog):
+    """The move alone writes several megabytes."""
+    with small_disk(tmp_path / 'disk', 1) as disk:
+        assert commission(arm, 'plant', '--yes', '--record', str(disk / 'bags')) == 1
+    (logged,) = caplog.messages
+    assert 'move_1 cannot be written any further: No space left' in logged
+    told = capsys.readouterr().err
+    assert 'cannot be written' not in told.replace(logged, '')
+    assert 'move 1: its bag is not whole' in told
+    assert 'No gains were chosen or written; whole bags of 0 postures' in told
     assert nothing_looks_whole(arm)
 
 
