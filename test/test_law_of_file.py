@@ -456,7 +456,7 @@ def test_index_past_the_end_is_told_before_anything_moves(tmp_path):
     statement = 'signals.demand[settings.n] = 0.0'
     law, _ = computed_torque_with(tmp_path / 'law.py', statement)
     loop = blf.load_loop('recommended', {'blf_dsc_controller': {'law': law}})
-    with pytest.raises(BlfDscError, match='law.py: an index is past the end of an'):
+    with pytest.raises(BlfDscError, match=r'law\.py: an index is past the end of'):
         controller_of(loop.controller)
 
 
