@@ -335,7 +335,9 @@ def change(config: Config, given: Mapping[str, object], source: str = '') -> Con
             f'config: got {type(config).__name__}, expected ControllerConfig or PlantConfig: give '
             'the .controller or .plant of load_loop'
         )
-    check_type('given', given, Mapping, "give parameters by name, such as {'law': 'paper'}")
+    check_type(
+        'given', given, Mapping, "give parameters by name, such as {'law': 'paper'}"
+    )
     return build(type(config), {**flatten(config), **given}, source)
 
 
