@@ -219,6 +219,17 @@ def test_what_cannot_be_measured_is_refused_before_anything_moves(
     assert nothing_looks_whole(arm)
 
 
+def test_arm_that_comes_to_rest_too_near_its_limits_is_told_with_its_posture(
+    arm, capsys
+):
+    """Softly held, it ends 12 mrad beyond a posture that is as near to them as it may be."""
+    assert commission(arm, 'plant', '--yes', postures=((0.3, 2.9499),)) == 1
+    told = capsys.readouterr().err
+    assert 'posture 1: posture: joint2 would be at 2.96' in told
+    assert 'less than 0.05 rad from its limits' in told
+    assert PlantDriver.last.calls[-1] == 'finish'
+
+
 def test_another_robot_is_refused(arm, capsys):
     written(arm.parent, joints=7)
     assert commission(arm, 'plant', '--yes') == 1

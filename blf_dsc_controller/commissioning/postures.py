@@ -245,7 +245,8 @@ class PostureByPosture(ABC):
 
     def _measure(self, name: str) -> tuple[Planned, Path]:
         """Measure the arm where it rests, repeatedly if need be; return the last motion and bag."""
-        planned = self.aside(self._commissioning.motion, self.position())
+        with named(name):
+            planned = self.aside(self._commissioning.motion, self.position())
         bag = self._run(planned.config, planned.duration, name)
         for _ in range(REPEATS):
             with named(name):
