@@ -42,6 +42,28 @@ LOOP = blf.load_loop('paper')
             lambda: blf.ArmController(LOOP.plant),
             ('config: got PlantConfig', 'ControllerConfig or str or Path'),
         ),
+        (
+            lambda: blf.load_loop(5),
+            ('config: got int', 'str or Path', 'name of a preset'),
+        ),
+        (
+            lambda: blf.load_study(None),
+            ('config: got NoneType', 'str or Path', 'name of a preset'),
+        ),
+        (
+            lambda: blf.Commissioning(LOOP),
+            ('config: got LoopConfig', 'str or Path', 'name of a preset'),
+        ),
+        (
+            lambda: blf.load_loop('paper', 10.0),
+            ('overrides: got float', 'Mapping', "{'sim_plant': {'duration'"),
+        ),
+        (
+            lambda: blf.change(LOOP.controller, None),
+            ('given: got NoneType', 'Mapping', 'by name'),
+        ),
+        (lambda: blf.read_run(None), ('path: got NoneType', 'folder of a bag')),
+        (lambda: blf.verify(5), ('path: got int', 'folder of a bag')),
     ],
 )
 def test_wrong_argument_is_a_type_error_that_names_it_and_the_remedy(
@@ -54,6 +76,14 @@ def test_wrong_argument_is_a_type_error_that_names_it_and_the_remedy(
     for each in named:
         assert each in str(caught.value)
     assert not any(tmp_path.iterdir())
+
+
+def test_trajectory_that_is_no_sequence_is_a_type_error_that_names_it():
+    with (
+        blf.ArmController(LOOP.controller) as controller,
+        pytest.raises(blf.ArgumentTypeError, match=r'points: got NoneType.*a list of'),
+    ):
+        controller.follow(None)
 
 
 def test_argument_of_one_of_several_types_is_accepted():

@@ -121,6 +121,7 @@ def test_reference_is_that_of_the_last_sample_and_its_own_copy():
         ((0.0, 'high', [0.0] * 2), r'q: got what is no array of numbers, but \(2,\)'),
         ((0.0, [0.0, [0.0]], [0.0] * 2), 'q: got what is no array of numbers'),
         ((math.nan, [0.0] * 2, [0.0] * 2), 'stamp: got nan, but a finite time'),
+        ((None, [0.0] * 2, [0.0] * 2), 'stamp: got None, but a finite time'),
     ],
 )
 def test_states_of_another_shape_are_errors_and_change_nothing(given, problem):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import recorded_run
 from command import finished
-from recorded_run import Synthetic, small_disk
+from recorded_run import Synthetic, limited_files, small_disk
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.main import main
@@ -462,6 +462,15 @@ def test_full_disk_is_reported(tmp_path, capsys):
         run = here(capsys, '--offline', '--duration', 20, '--out', disk / 'out')
     assert run.returncode == 1
     assert 'cannot be written any further' in run.stderr
+
+
+def test_folder_goes_in_which_nothing_could_be_written(tmp_path, capsys):
+    """So that the same command can be given again."""
+    with limited_files(tmp_path / 'disk', 0) as disk:
+        run = here(capsys, '--offline', '--duration', 0.1, '--out', disk / 'out')
+        assert not (disk / 'out').exists()
+    assert run.returncode == 1
+    assert 'config.yaml cannot be written: File too large' in run.stderr
 
 
 @pytest.mark.parametrize(

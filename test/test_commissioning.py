@@ -658,6 +658,8 @@ def test_what_is_no_commissioning_is_refused():
     reversed_ = replace(run, joints=run.joints[::-1])
     with pytest.raises(BlfDscError, match='run is of the joints joint2, joint1, the'):
         commissioned(CONFIG, [(reversed_, config)])
+    with pytest.raises(BlfDscError, match='bag_1 is of the joints joint2, joint1, the'):
+        commissioned(CONFIG, [(reversed_, config)], names=['bag_1'])
     short = replace(
         run,
         stamp=run.stamp[:9000],

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from elastic_two_link import ARM, BEGIN, FAR, NEAR, shorten_motions, shorten_moves
 from plant_driver import PlantDriver
+from recorded_run import small_disk
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.arms.urdf import frames
@@ -164,6 +165,19 @@ def test_lost_states_are_told_after_the_first_posture(arm, capsys):
     assert nothing_looks_whole(arm)
 
 
+def test_full_disk_is_told_once(tmp_path, arm, capsys, caplog):
+    """The move alone writes several megabytes."""
+    with small_disk(tmp_path / 'disk', 1) as disk:
+        assert commission(arm, 'plant', '--yes', '--record', str(disk / 'bags')) == 1
+    (logged,) = caplog.messages
+    assert 'move_1 cannot be written any further: No space left' in logged
+    told = capsys.readouterr().err
+    assert 'cannot be written' not in told.replace(logged, '')
+    assert 'move 1: its bag is not whole' in told
+    assert 'No gains were chosen or written; whole bags of 0 postures' in told
+    assert nothing_looks_whole(arm)
+
+
 class Terminal(io.StringIO):
     def isatty(self):
         return True
@@ -203,6 +217,17 @@ def test_what_cannot_be_measured_is_refused_before_anything_moves(
     assert printed in capsys.readouterr().err
     assert PlantDriver.last is None or PlantDriver.last.calls == ['connect']
     assert nothing_looks_whole(arm)
+
+
+def test_arm_that_comes_to_rest_too_near_its_limits_is_told_with_its_posture(
+    arm, capsys
+):
+    """Softly held, it ends 12 mrad beyond a posture that is as near to them as it may be."""
+    assert commission(arm, 'plant', '--yes', postures=((0.3, 2.9499),)) == 1
+    told = capsys.readouterr().err
+    assert 'posture 1: posture: joint2 would be at 2.96' in told
+    assert 'less than 0.05 rad from its limits' in told
+    assert PlantDriver.last.calls[-1] == 'finish'
 
 
 def test_another_robot_is_refused(arm, capsys):

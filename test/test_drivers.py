@@ -24,13 +24,16 @@ from test_nodes_process import NODES, arguments_of, launched, start  # noqa: F40
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load, load_loop
+from blf_dsc_controller.configuration.drive import DriveConfig
+from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.simulation.loop import simulate
+from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
 
@@ -160,6 +163,17 @@ def test_parameter_file_of_the_page_runs_on_the_simulated_driver(
     run = simulate(law, change(load_loop(preset).plant, given)).run()
     assert run.stops == ()
     assert np.abs(run.error).max() < 0.05
+
+
+def test_parameter_files_of_the_pages_on_robots_get_no_warning(tmp_path):
+    """`blf_dsc doctor` shows these: what a reader copies is fit for what the page says."""
+    for text in (block.content for block in fences() if 'urdf:' in block.content):
+        file = tmp_path / 'my.yaml'
+        file.write_text(text.replace('topic://robot_description', 'ur5e.urdf'))
+        config = load(file, CONTROLLER, ControllerConfig)
+        if load(file, DRIVE, DriveConfig).feedback == 'motor':
+            config = as_in_motors(config)
+        assert config_warnings(config) == []
 
 
 def test_repeated_reading_does_not_make_the_torque_of_the_ur5e_jump():

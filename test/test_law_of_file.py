@@ -22,7 +22,7 @@ import blf_dsc_controller as blf
 from benchmark.studies import path_of
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.run import STOPPED
-from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.compiled.jit import SLOW, kernel
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
@@ -156,6 +156,9 @@ def used(law, x):
 
 
 compiling = pytest.mark.skipif(numba_config.DISABLE_JIT, reason='nothing is compiled')
+checking = pytest.mark.skipif(
+    numba_config.DISABLE_JIT or bool(SLOW), reason='unchecked'
+)
 
 
 @pytest.mark.parametrize(
@@ -229,6 +232,27 @@ class LAW(NamedTuple):
 """
 
 
+CHANGING = """\
+from blf_dsc_controller.compiled.jit import inner
+
+
+@inner
+def change(values, at):
+    values[at] += 1.0
+
+
+class LAW(NamedTuple):
+    at: Annotated[int, parameter(2, 'entry')]
+
+    def compute_demand(self, settings, state, signals, t, dt):
+        change(signals.values, self.at)
+
+    def finish(self, settings, state, signals, dt, saturated):
+        pass
+
+"""
+
+
 class Few(NamedTuple):
     count: int
     values: Annotated[Array, 'count']
@@ -246,6 +270,18 @@ def run_law(law, vectors, saturated):
     )
     law.compute_demand(settings, state, signals, 0.0, 1e-3)
     law.finish(settings, state, signals, 1e-3, saturated)
+
+
+@checking
+def test_index_past_the_end_in_a_function_of_a_law_is_an_error(tmp_path):
+    law = law_of_text(tmp_path / 'law.py', CHANGING)
+    vectors = np.zeros((3, 4))
+    vectors[:, 0] = 3  # the last of four entries is values[2]
+    given = called(law(3), *[few_of(each) for each in vectors])
+    with pytest.raises(IndexError):
+        run_law(given, vectors, saturated=False)
+    run_law(given.with_gains(law(2)), vectors, saturated=False)
+    assert vectors[2].tolist() == [3.0, 0.0, 0.0, 1.0]
 
 
 @compiling
@@ -412,6 +448,16 @@ def test_error_of_a_law_is_told_with_its_line(right, supervised, tmp_path):
     with pytest.raises(BlfDscError) as raised:
         blf.simulate(loop.controller, plant, supervised=supervised)
     assert str(raised.value) == f'{law}, line {line}: AssertionError: wrong time'
+
+
+@checking
+def test_index_past_the_end_is_told_before_anything_moves(tmp_path):
+    """In the first sample; it would overwrite what follows the array."""
+    statement = 'signals.demand[settings.n] = 0.0'
+    law, _ = computed_torque_with(tmp_path / 'law.py', statement)
+    loop = blf.load_loop('recommended', {'blf_dsc_controller': {'law': law}})
+    with pytest.raises(BlfDscError, match=r'law\.py: an index is past the end of'):
+        controller_of(loop.controller)
 
 
 def test_law_without_a_first_torque_does_not_start(tmp_path):

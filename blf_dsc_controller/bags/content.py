@@ -29,7 +29,7 @@ from blf_dsc_controller.configuration.received import (
     without_law,
 )
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.errors import BlfDscError, check_type
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
     MOTIONS,
@@ -256,13 +256,17 @@ class Content:
         return values, source
 
 
-def read_content(path: Path, namespace: str = '', names: NameMap = NO_NAMES) -> Content:
+def read_content(
+    path: str | Path, namespace: str = '', names: NameMap = NO_NAMES
+) -> Content:
     """Read the messages of our topics from a folder, storage file or ROS 1 `.bag`.
 
     Raises:
         BagError: there is no bag, it is damaged, it lacks the joint states or a topic of `names`,
             or it holds the topics of several robots.
     """
+    check_type('path', path, (str, Path), 'give the folder of a bag')
+    path = Path(path)
     with open_bag(path) as bag:
         if not any(bag.counts.values()):
             raise BagError(f'{path} is empty: it holds no message')

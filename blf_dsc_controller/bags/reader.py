@@ -63,7 +63,7 @@ def read_run(path: str | Path, namespace: str = '', names: NameMap = NO_NAMES) -
             robots, or the states of several runs.
         UnreadableMessageError: a message in it cannot be decoded.
     """
-    return recorded_run(read_content(Path(path), namespace, names), np.asarray)
+    return recorded_run(read_content(path, namespace, names), np.asarray)
 
 
 def recorded_run(

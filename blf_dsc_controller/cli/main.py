@@ -24,7 +24,7 @@ from blf_dsc_controller.cli.parser import (
     make_parser,
     parse,
 )
-from blf_dsc_controller.cli.result_folder import discard_unbegun
+from blf_dsc_controller.cli.result_folder import discard_empty, discard_unbegun
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.errors import BlfDscError
@@ -67,11 +67,10 @@ def _code_of(options: argparse.Namespace) -> int:
         code: int | None = command(options)
     except BrokenPipeError:
         return 1  # nobody reads any more
-    except BlfDscError as error:
-        print(f'blf_dsc {options.command}: {error}', file=sys.stderr)
-        return 1
-    except OSError as error:
-        print(f'blf_dsc {options.command}: {_place_text(error)}', file=sys.stderr)
+    except (BlfDscError, OSError) as error:
+        discard_empty()
+        text = _place_text(error) if isinstance(error, OSError) else error
+        print(f'blf_dsc {options.command}: {text}', file=sys.stderr)
         return 1
     except UnicodeEncodeError as error:
         print(

@@ -8,6 +8,7 @@ A command names the folder, and the file that is in it once the run has begun. U
 from __future__ import annotations
 
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from blf_dsc_controller.errors import BlfDscError
@@ -62,7 +63,7 @@ def refuse_existing(path: Path) -> None:
 def discard_unbegun() -> list[Path]:
     """Remove this process's folders whose run has not begun; return them.
 
-    After an error a command may leave its folder instead, if logs in it say why.
+    After an error `discard_empty` leaves those with logs in them, which say why.
     """
     discarded = [
         folder
@@ -73,3 +74,10 @@ def discard_unbegun() -> list[Path]:
         shutil.rmtree(folder, ignore_errors=True)
     _unbegun.clear()
     return discarded
+
+
+def discard_empty() -> None:
+    """Remove this process's folders in which nothing was written, as on a full disk."""
+    for folder in _unbegun:
+        with suppress(OSError):  # there is none, or something is in it
+            folder.rmdir()

@@ -175,12 +175,12 @@ def commissioned(
 
     Raises BlfDscError if a run is not one of its motions, or has a stop.
     """
-    _check_runs(config, runs)
+    names = names or [''] * len(runs)
+    _check_runs(config, runs, names)
     T = config.sample_time
     measured_with = as_measured(config, [made for _, made in runs])
     arm, _ = design_of(measured_with)
-    each_name = names or [''] * len(runs)
-    responses = tuple(map(partial(_response_of, T), runs, each_name))
+    responses = tuple(map(partial(_response_of, T), runs, names))
     found = findings_of([run for run, _ in runs], responses)
     assumed = _assumed_inertia(arm, responses)
     inertia = _largest_inertia(arm, found, assumed)
@@ -222,14 +222,16 @@ def _response_of(sample_time: float, measured: Measured, name: str) -> Response:
         return response_of(measured[0], lines_in(measured[1]), sample_time)
 
 
-def _check_runs(config: ControllerConfig, runs: Sequence[Measured]) -> None:
+def _check_runs(
+    config: ControllerConfig, runs: Sequence[Measured], names: Sequence[str]
+) -> None:
     """Raise BlfDscError if there is none, or if one is of other joints."""
     if not runs:
         raise BlfDscError(
             'there is no run of a motion in a posture: give the bags of these, too'
         )
-    for run, _ in runs:
-        check_joints('the run', run.joints, config)
+    for (run, _), name in zip(runs, names, strict=True):
+        check_joints(name or 'the run', run.joints, config)
 
 
 def _assumed_inertia(arm: Design, responses: Sequence[Response]) -> Floats:

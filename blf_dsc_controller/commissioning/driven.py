@@ -17,7 +17,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.errors import BlfDscError
 
 
 class Driven(PostureByPosture):
@@ -64,4 +63,4 @@ class Driven(PostureByPosture):
         if outcome.end is not End.DURATION:
             raise self._ended(name, outcome.end, outcome.text)
         if controller.output_problem:
-            raise BlfDscError(f'{name}: {controller.output_problem}')
+            raise self._not_whole(name)

@@ -30,7 +30,7 @@ def measured_in(bag: str | Path, config: ControllerConfig | None = None) -> Meas
     Raises BagError if it cannot be read, or has no configuration; BlfDscError if it is of other
     joints than `config`.
     """
-    content = read_content(Path(bag))
+    content = read_content(bag)
     recorded = content.controller_config()
     if config is not None:
         check_joints(str(bag), recorded.joints, config)

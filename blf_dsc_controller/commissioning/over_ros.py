@@ -164,7 +164,7 @@ class OverRos(PostureByPosture):
         if end is not End.DURATION:
             raise self._ended(name, end, text)
         if node.outputs.problem:
-            raise BlfDscError(f'{name}: {node.outputs.problem}')
+            raise self._not_whole(name)
 
     def _until_over(
         self, guard: Guard, disturbed: _Disturbed, duration: float

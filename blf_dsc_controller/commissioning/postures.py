@@ -242,7 +242,8 @@ class PostureByPosture(ABC):
 
     def _measure(self, name: str) -> tuple[Planned, Path]:
         """Measure the arm where it rests, repeatedly if need be; return the last motion and bag."""
-        planned = self.aside(self._commissioning.motion, self.position())
+        with named(name):
+            planned = self.aside(self._commissioning.motion, self.position())
         bag = self._run(planned.config, planned.duration, name)
         for _ in range(REPEATS):
             with named(name):
@@ -307,8 +308,17 @@ class PostureByPosture(ABC):
     def _ended(self, name: str, end: End, text: str) -> EndedError:
         """Return the error of a run that ended for this reason, with what is left."""
         reason = f': {text}' if text else ''
-        left = self._left or (
+        return EndedError(end, f'{name}: {end}{reason}. {self._what_is_left()}')
+
+    def _not_whole(self, name: str) -> BlfDscError:
+        """Return the error of a run whose bag is not whole; why was told when it happened."""
+        return BlfDscError(
+            f'{name}: its bag is not whole, so the run shows nothing: name a folder on another '
+            f'disk with --record. {self._what_is_left()}'
+        )
+
+    def _what_is_left(self) -> str:
+        return self._left or (
             f'No gains were chosen or written; whole bags of {self._measured} postures are in '
             f'{self._folder}'
         )
-        return EndedError(end, f'{name}: {end}{reason}. {left}')

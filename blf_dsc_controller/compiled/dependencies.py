@@ -15,6 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+CHECKED = 'law_'
+"""How the names of modules begin in whose functions each index is checked."""
+
 PACKAGE = Path(__file__).resolve().parents[1]
 # Layouts and arm models reach a kernel through the types of its arguments.
 _IN_EVERY_KERNEL = (*PACKAGE.glob('compiled/*.py'), *PACKAGE.glob('arms/*.py'))

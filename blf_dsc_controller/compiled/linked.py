@@ -46,6 +46,7 @@ from numba.core.errors import UnsupportedError
 from numba.core.runtime import rtsys
 from numba.core.typed_passes import NativeLowering
 
+from blf_dsc_controller.compiled.dependencies import CHECKED
 from blf_dsc_controller.compiled.file_lock import FileLock
 from blf_dsc_controller.compiled.own_folder import is_own, make_own
 
@@ -87,13 +88,16 @@ class _Linked(JITCodeLibrary):  # type: ignore[misc]
         """Do nothing: this is left to the kernel."""
 
 
-def _without_reference_counts(state: Any) -> None:
-    """Compile without counting the references to arrays.
+def _choose_checks(state: Any) -> None:
+    """Compile without counting the references to arrays; check the indices of laws of files.
 
     The caller of a kernel keeps its arrays alive; a kernel allocates none: nothing
-    would free it.
+    would free it. A law of a file would write past an array into whatever is there.
     """
-    state.targetctx = state.targetctx.subtarget(enable_nrt=False)
+    is_checked = state.func_id.modname.startswith(CHECKED)
+    state.targetctx = state.targetctx.subtarget(
+        enable_nrt=False, enable_boundscheck=is_checked
+    )
     state.targetctx.cached_internal_func = _INTERNAL
 
 
@@ -102,7 +106,7 @@ class _LowerLinked(NativeLowering):  # type: ignore[misc]
     _name = 'lower_linked'
 
     def run_pass(self, state: Any) -> bool:
-        _without_reference_counts(state)
+        _choose_checks(state)
         state.library = _Linked(state.targetctx.codegen(), state.func_id.func_qualname)
         return bool(super().run_pass(state))
 
@@ -113,7 +117,7 @@ class _LowerKernel(NativeLowering):  # type: ignore[misc]
 
     def run_pass(self, state: Any) -> bool:
         """Lower a kernel, and set the environments of the functions in it."""
-        _without_reference_counts(state)
+        _choose_checks(state)
         changed = bool(super().run_pass(state))
         library = state.library
         module = library._final_module  # noqa: SLF001 - as numba's cache

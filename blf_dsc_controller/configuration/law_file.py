@@ -30,6 +30,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any, NamedTuple
 
+from blf_dsc_controller.compiled.dependencies import CHECKED
 from blf_dsc_controller.configuration.schema import Parameter
 from blf_dsc_controller.errors import BlfDscError
 
@@ -40,6 +41,7 @@ _METHODS = {
     'compute_demand': ('self', 'settings', 'state', 'signals', 't', 'dt'),
     'finish': ('self', 'settings', 'state', 'signals', 'dt', 'saturated'),
 }
+_PAST_THE_END = 'index is out of bounds'
 _WRITTEN = re.compile(r'(.+\.py)(?:@([0-9a-f]{12,64}))?', re.DOTALL)
 
 
@@ -128,6 +130,11 @@ def errors_told_with_line(law: str) -> Iterator[None]:
     except Exception as error:
         raised = traceback.extract_tb(error.__traceback__)[-1]
         path = _File.of(law).path if is_file(law) else None
+        if path and str(error) == _PAST_THE_END:  # which numba tells without a line
+            raise BlfDscError(
+                f'{path}: an index is past the end of an array. Run it with NUMBA_DISABLE_JIT=1 '
+                'for the line: see doc/tutorial_law.md'
+            ) from error
         # Kernels that are kept name a file of this content, perhaps elsewhere.
         if path is None or Path(raised.filename).name != path.name:
             raise
@@ -138,7 +145,7 @@ def errors_told_with_line(law: str) -> Iterator[None]:
 @functools.cache
 def _load(place: Path, content: bytes) -> type:
     # Kernels and pickles find the module by this name, another content has another one.
-    name = f'law_{place.stem}_{hashlib.sha256(content).hexdigest()[:12]}'
+    name = f'{CHECKED}{place.stem}_{hashlib.sha256(content).hexdigest()[:12]}'
     spec = importlib.util.spec_from_file_location(name, place)
     if spec is None:
         raise BlfDscError(f'{place} is not a Python file')

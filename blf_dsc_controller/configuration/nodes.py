@@ -33,7 +33,7 @@ from blf_dsc_controller.configuration.side_nodes import (
     ViewConfig,
     WatchdogConfig,
 )
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.errors import ConfigurationError, check_type
 from blf_dsc_controller.writing import write_text
 
 PLANT = 'sim_plant'
@@ -125,6 +125,8 @@ def locate(given: str | Path) -> Path:
     `./name` is the file. Raises ConfigurationError, which lists the presets, if neither
     exists.
     """
+    remedy = 'give the name of a preset, or the path of a file'
+    check_type('config', given, (str, Path), remedy)
     presets = {
         path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))
     }
@@ -253,6 +255,7 @@ def _check_overrides(overrides: Mapping[str, Any]) -> None:
     expected = (
         f"give them by node and name, such as {{'{PLANT}': {{'duration': 10.0}}}}"
     )
+    check_type('overrides', overrides, Mapping, expected)
     problems = [
         f'{name}: no node has this name{suggestion(name, NODES)}; {expected}'
         for name in overrides

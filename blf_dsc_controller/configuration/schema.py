@@ -33,7 +33,12 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 import yaml
 
 from blf_dsc_controller.configuration.files import DECIMAL_POINT, parse_scalar
-from blf_dsc_controller.errors import ArgumentTypeError, BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import (
+    ArgumentTypeError,
+    BlfDscError,
+    ConfigurationError,
+    check_type,
+)
 
 Config = TypeVar('Config')
 Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
@@ -325,6 +330,9 @@ def change(config: Config, given: Mapping[str, object], source: str = '') -> Con
             f'config: got {type(config).__name__}, expected ControllerConfig or PlantConfig: give '
             'the .controller or .plant of load_loop'
         )
+    check_type(
+        'given', given, Mapping, "give parameters by name, such as {'law': 'paper'}"
+    )
     return build(type(config), {**flatten(config), **given}, source)
 
 

@@ -170,7 +170,7 @@ class ArmController:
             LoopEndedError: the controller is closed.
         """
         self._check_open()
-        if not math.isfinite(stamp):
+        if not _is_finite(stamp):
             raise StateError(f'stamp: got {stamp}, but a finite time in s is needed')
         n = len(self.joints)
         values = self._measurement(q, dq, effort)
@@ -256,11 +256,13 @@ class ArmController:
         It begins at once, or at the time `begin` [s] since the start.
 
         Raises:
+            ArgumentTypeError: the points are no sequence.
             TrajectoryError: with the reasons why it cannot be followed; the reference
                 stays.
             LoopEndedError: the controller is closed.
         """
         self._check_open()
+        check_type('points', points, Sequence, 'give a list of TrajectoryPoint')
         names = tuple(joints) or self.joints
         for point in points:
             if not isinstance(point, TrajectoryPoint):
@@ -472,3 +474,11 @@ class ArmController:
     def estimate_names(self) -> tuple[str, ...]:
         """Names of the learned parameters."""
         return tuple(self._loop.estimates)
+
+
+def _is_finite(stamp: float) -> bool:
+    """Whether a stamp is a finite number; it may be anything."""
+    try:
+        return math.isfinite(stamp)
+    except TypeError:
+        return False

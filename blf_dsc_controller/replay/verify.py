@@ -94,7 +94,6 @@ def verify(
             controller, or cannot be read; or its law is a file and `law` does not name
             one.
     """
-    path = Path(path)
     if law:  # before a large bag is read
         law_file.check_pinned(law)
     content = read_content(path, namespace, names)
@@ -173,7 +172,7 @@ def _first_difference(
     return min(differences, key=lambda found: found.stamp, default=None)
 
 
-def _check_format(path: Path, configure: Event) -> None:
+def _check_format(path: str | Path, configure: Event) -> None:
     """Raise BlfDscError if a journal is of a later version."""
     number = configure.content.get('format', 0)
     if number > FORMAT:
