@@ -273,7 +273,10 @@ class PlainUrdfLaw:
         self.direction = np.full(m, 1.0 / np.sqrt(m))
         self.viscous = slice(g.p, g.p + n)
         self.reversals = Reversals(g, g.p + n)
-        self.ripple = slice(g.p + 2 * n, g.m)
+        loads = n * g.load_friction
+        self.load = slice(g.p + 2 * n, g.p + 2 * n + loads)
+        self.ripple = slice(self.load.stop, g.m)
+        self.gear_torque = np.zeros(n)
 
     # Learning
 
@@ -285,13 +288,20 @@ class PlainUrdfLaw:
             blocks += [np.diag(np.sin(cycles * q)), np.diag(np.cos(cycles * q))]
         return np.hstack(blocks)
 
+    def load_friction_at(self, velocity):
+        """Return the columns of friction that grows with the load, if there are any."""
+        g = self.gains
+        rubs = np.abs(self.gear_torque) * np.tanh(velocity / g.coulomb_velocity)
+        return np.diag(rubs)[:, : g.n * g.load_friction]
+
     def add_row(self, dt, q, dq, dqr, applied):
         """Filter the row of the last interval, and put every k-th into the window."""
         g = self.gains
         Yp, Yr = self.arm.momentum_regressors(q, dq)
         columns = np.diag(dq), np.diag(np.tanh(dq / g.coulomb_velocity))
         ripple = self.ripple_at(q - 0.5 * g.lag * dq)
-        now = Yp, np.column_stack([Yr, *columns, ripple])
+        load = self.load_friction_at(dq)
+        now = Yp, np.column_stack([Yr, *columns, load, ripple])
         pole = 1.0 - exp(-g.pole * dt)
         if self.samples:
             late = 1.0 - exp(-dt / (0.5 * g.lag))
@@ -439,6 +449,8 @@ class PlainUrdfLaw:
         lead = 1.5 * dt + 0.5 * g.lag
         ahead = dqr + lead * ddqr
         H_r[:, self.viscous] = np.diag(ahead)
+        self.gear_torque = H_r[:, :p] @ self.theta[:p]
+        H_r[:, self.load] = self.load_friction_at(ahead)
         there = qr + lead * dqr + 0.5 * lead**2 * ddqr
         H_r[:, self.ripple] = self.ripple_at(there)
         coulomb = self.reversals.compensation(self.theta, ahead)

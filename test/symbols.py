@@ -16,7 +16,9 @@ _PARTS = {
     'feedback': 'gain=Kp robust_gain=d2 damping_rate follows_inertia decoupled',
     'disturbance': 'gain=gamma leakage=eta bumpless',
     'torque': 'limit=torque_limit rate_limit drive',
-    'columns': 'bias viscous coulomb coulomb_velocity frequencies ripple_cycles',
+    'columns': (
+        'bias viscous coulomb coulomb_velocity load_friction frequencies ripple_cycles'
+    ),
     'row': 'prediction filter_pole=pole motion_scale lag omega row_weight',
     'window': 'length=window row_interval interval prior_weight regularization=rho',
     'excitation': (

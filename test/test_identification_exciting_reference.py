@@ -158,6 +158,20 @@ def test_ripple_has_the_columns_of_the_law():
     assert problem.evaluate(problem.parameters(np.ones(3 + 6))).gain > 0.0
 
 
+def test_load_friction_has_the_column_of_the_law():
+    config = change(chain_problem()[0], {'learning.load_friction': True})
+    problem = ExcitationProblem(config, 1, 0.02, -3.0)
+    settings = settings_of_config(config)
+    q = np.linspace(0.0, 1.0, 3 * 64).reshape(64, 3)
+    dq = np.linspace(-1.0, 1.0, 3 * 64).reshape(64, 3)
+    rows = problem._rows(q, dq, 0.0 * q)
+    assert rows.shape == (64, 3, settings.m)
+    load = rows[:, :, : settings.p] @ settings.initial_estimate[: settings.p]
+    sign = np.tanh(dq / config.learning.coulomb_velocity)
+    for i in range(3):
+        np.testing.assert_allclose(rows[:, i, -3 + i], np.abs(load[:, i]) * sign[:, i])
+
+
 def test_lack_of_room_counts_as_an_excess():
     config, problem = chain_problem()
     low = ExcitationProblem(config, 1, 0.02, 3.0)  # a floor above the arm

@@ -38,6 +38,7 @@ CASES = {
         'feedback.joint_stiffness': [600.0] * 3 + [150.0] * 3,
         'feedback.joint_damping': [40.0] * 3 + [8.0] * 3,
     },
+    'load friction': WHOLE | {'learning.load_friction': True},
 }
 
 

@@ -21,7 +21,14 @@ from symbols import replaced
 
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
-from blf_dsc_controller.law import adaptation, columns, excitation, ripple, window
+from blf_dsc_controller.law import (
+    adaptation,
+    columns,
+    excitation,
+    load_friction,
+    ripple,
+    window,
+)
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
@@ -261,6 +268,7 @@ def test_columns_match_their_names():
         'learning.viscous': True,
         'learning.coulomb': True,
         'learning.coulomb_velocity': 0.2,
+        'learning.load_friction': True,
         'learning.frequencies': [1.5, 4.0],
         'learning.ripple_cycles': [20.0, 30.0],
     }
@@ -271,10 +279,14 @@ def test_columns_match_their_names():
     dq = np.array([0.3, -0.1])
     rows = np.full((2, settings.m), np.nan)
     columns.fill_columns(settings.columns, t, dq, rows)
+    tau = np.array([-3.0, 2.0])
+    load_friction.fill_measured(settings.columns, tau, dq, rows)
     for i in range(2):
         ripple.fill_ripple(settings.columns, i, q[i], rows)
 
-    value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': np.tanh(dq / 0.2)}
+    rubs = np.tanh(dq / 0.2)
+    value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': rubs}
+    value['load friction'] = np.abs(tau) * rubs
     for w in (1.5, 4.0):
         value[f'sin {w:g} rad/s'] = np.full(2, np.sin(w * t))
         value[f'cos {w:g} rad/s'] = np.full(2, np.cos(w * t))

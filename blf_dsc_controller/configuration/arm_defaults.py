@@ -61,6 +61,7 @@ def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
         'learning.weighing': has_exact_rows(given),
         'feedback.stiffness': arm.stiffness,
         'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
+        'learning.load_friction': _has_load_friction(given, robot, arm),
         **tuning.gains_of(arm, np.array(bound) if is_whole else None),
         **followed,
         **_gains_of_law(given, arm),
@@ -126,6 +127,14 @@ def _observer_bandwidth(
     is_own = given.get('law', LAWS[0]) in OWN and has_exact_rows(given)
     is_soft = arm.joints is not None
     return _OBSERVER if has_sensors and is_own and is_soft else 0.0
+
+
+def _has_load_friction(
+    given: Mapping[str, Any], robot: Robot, arm: tuning.Design
+) -> bool:
+    """Whether friction that grows with the load is learned: a torque loop hides it."""
+    is_own = given.get('law', LAWS[0]) in OWN and has_exact_rows(given)
+    return is_own and arm.joints is not None and not robot.torque_loop
 
 
 def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:

@@ -394,6 +394,12 @@ class Learning:
         'rad/s',
         above=0.0,
     )
+    load_friction: bool = sizing(
+        False,
+        'also estimate the share of the torque in its gear by which the Coulomb friction of each '
+        'joint grows. The default of arms from a URDF without robot.torque_loop and feedback '
+        'through the inertia matrix is true',
+    )
     frequencies: tuple[float, ...] = sizing(
         (),
         'also estimate a sinusoidal disturbance of each joint at each of these frequencies',

@@ -22,6 +22,8 @@ from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.run import LearnedArm
 
 _MOST_FRICTION = 3.0  # times its initial estimate
+_LOAD_FRICTION = 'load friction'
+_SHARE, _MOST_SHARE = 0.05, 0.2  # of the torque in a gear: standard deviation, and most
 _RIPPLE = 0.01  # standard deviation of a torque ripple, of the rated torque
 
 
@@ -47,7 +49,7 @@ class Column(NamedTuple):
 
 
 def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
-    """Return the disturbance columns, in the order of `columns` and `ripple`.
+    """Return the disturbance columns, in the order of `columns`, `load_friction` and `ripple`.
 
     The standard deviation is half the initial estimate, or 5 % of the rated torque
     where that is zero, for `viscous` at the largest velocity of the reference.  Ripple
@@ -73,6 +75,7 @@ def _column_blocks(config: ControllerConfig) -> list[str]:
         'bias': learning.bias,
         'viscous': learning.viscous,
         'coulomb': learning.coulomb,
+        _LOAD_FRICTION: learning.load_friction,
     }
     blocks = [name for name, is_on in switched.items() if is_on]
     for w in learning.frequencies:
@@ -84,13 +87,16 @@ def _column_blocks(config: ControllerConfig) -> list[str]:
 
 def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Column:
     """Return the column of a block for joint i, with its initial estimate."""
+    name = f'{block} {config.joints[i]}'
+    if block == _LOAD_FRICTION:
+        return Column(name, '1', 0.0, _SHARE, 0.0, _MOST_SHARE, is_friction=False)
     is_viscous = block == 'viscous'
     is_friction = block in {'viscous', 'coulomb'}
     velocity = config.limits.velocity[i] if is_viscous else 1.0
     share = _RIPPLE if block.endswith(' q') else UNKNOWN_FRICTION
     usual = share * config.torque.limit[i] / velocity
     return Column(
-        name=f'{block} {config.joints[i]}',
+        name=name,
         unit=config.units[i].of('N m s/rad' if is_viscous else 'N m'),
         initial=initial,
         deviation=0.5 * initial or usual,

@@ -176,11 +176,15 @@ class ExcitationProblem:
         ones = np.ones_like(dq)
         t = self._times[:, np.newaxis]
         columns = [ones] * given.bias + [dq] * given.viscous
-        columns += [slidings(dq, given.coulomb_velocity)] * given.coulomb
+        rubs = slidings(dq, given.coulomb_velocity)
+        columns += [rubs] * given.coulomb
+        H = regressors_at(self._settings.model, q, dq, dq, ddq)
+        if given.load_friction:
+            tau = H @ self._settings.initial_estimate[: given.first]
+            columns.append(np.abs(tau) * rubs)
         waves = (np.sin, np.cos)
         columns += [wave(w * t) * ones for w in given.frequencies for wave in waves]
         columns += [wave(c * q) for c in given.ripple_cycles for wave in waves]
-        H = regressors_at(self._settings.model, q, dq, dq, ddq)
         D = [column[:, :, np.newaxis] * np.eye(self.n) for column in columns]
         return np.concatenate((H, *D), axis=2)
 

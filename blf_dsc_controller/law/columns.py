@@ -3,8 +3,8 @@
 
     tau_dist = D d,    D = [ I | diag(dq) | diag(tanh(dq / v_c)) | I sin(w t) | I cos(w t) | ... ]
 
-for each block that is configured, and those of `ripple`.  (22)-(24) instead subtract the
-estimate d^3 from the torque, which hides the parameter error.
+for each block that is configured, and those of `load_friction` and `ripple`.  (22)-(24) instead
+subtract the estimate d^3 from the torque, which hides the parameter error.
 """
 
 from typing import Annotated, NamedTuple
@@ -23,6 +23,7 @@ class Settings(NamedTuple):
     viscous: int  # 1: a column dq_i per joint
     coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
     coulomb_velocity: float  # rad/s
+    load_friction: int  # 1: the column of `load_friction` per joint
     tones: int  # number of frequencies, each with a sine and a cosine column per joint
     # number of ripple cycles, each with a sine and a cosine column per joint
     ripples: int
@@ -54,6 +55,7 @@ def fill_columns(settings: Settings, t: float, dq: Array, Yr: Array) -> None:
         if settings.coulomb == 1:
             set_block(Yr, at, i, sliding(dq[i], settings.coulomb_velocity))
             at += n
+        at += n * settings.load_friction
         for k in range(settings.tones):
             set_block(Yr, at, i, sin(settings.frequencies[k] * t))
             set_block(Yr, at + n, i, cos(settings.frequencies[k] * t))

@@ -3,7 +3,7 @@
 
 `observe`, before the torque is known:
 
-columns, ripple   the columns of what is learned besides P
+columns, load_friction, ripple    the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
 joint_sensors     what joint torque sensors show, where there are any
 window            sums of the rows over tau_d
@@ -30,6 +30,7 @@ from blf_dsc_controller.law import (
     external_torque,
     friction,
     joint_sensors,
+    load_friction,
     load_observer,
     motor_friction,
     prediction,
@@ -52,7 +53,7 @@ def observe(
     compute_regressors(settings, state, signals)
     fill_friction(settings, state, signals, dt)
     friction.follow_motion(settings.friction, state.friction, signals.friction)
-    fill_columns(settings, signals, t, dt)
+    fill_columns(settings, state, signals, t, dt)
     form_row(settings, state, signals, dt)
     friction.filter_shapes(settings.friction, state.friction, signals.dq, dt)
     if state.samples[0] == 0.0:
@@ -101,7 +102,9 @@ def check_excitation(
 
 
 @inner
-def fill_columns(settings: Settings, signals: Signals, t: float, dt: float) -> None:
+def fill_columns(
+    settings: Settings, state: State, signals: Signals, t: float, dt: float
+) -> None:
     """Fill the disturbance columns of H, along the reference, and of [Yr | D], for the row."""
     of = settings.columns
     lag = settings.row.lag
@@ -110,6 +113,11 @@ def fill_columns(settings: Settings, signals: Signals, t: float, dt: float) -> N
     ripple.fill_compensated_ripple(of, lag, qr, dqr, ddqr, dt, signals.H)
     columns.fill_columns(of, t, dq, signals.row.Yr)
     ripple.fill_measured_ripple(of, lag, q, dq, signals.row.Yr)
+    if of.load_friction == 1:
+        tau = signals.gear_torque
+        load_friction.fill_gear_torque(settings.p, signals.H, state.estimate, tau)
+        load_friction.fill_compensated(of, lag, tau, dqr, ddqr, dt, signals.H)
+        load_friction.fill_measured(of, tau, dq, signals.row.Yr)
 
 
 @inner

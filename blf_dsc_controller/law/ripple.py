@@ -20,7 +20,8 @@ from blf_dsc_controller.numerics.elementary import cos, sin
 def fill_ripple(settings: Settings, i: int, angle: float, H: Array) -> None:
     """Fill the ripple columns of row i of a regressor H (n, m) at the position `angle` [rad]."""
     n = H.shape[0]
-    blocks = settings.bias + settings.viscous + settings.coulomb + 2 * settings.tones
+    blocks = settings.bias + settings.viscous + settings.coulomb
+    blocks += settings.load_friction + 2 * settings.tones
     at = settings.first + n * blocks
     for k in range(settings.ripples):
         for j in range(2 * n):

@@ -147,6 +147,7 @@ class Signals(NamedTuple):
     dalpha2: Annotated[Array, 'n']  # rad/s^2
     xi2: Annotated[Array, 'n']  # rad/s
     model_torque: Annotated[Array, 'n']  # H(q, dq, v, a_f) P^(0), N m
+    gear_torque: Annotated[Array, 'n']  # tau_L, of the learned model, N m
     applied: Annotated[Array, 'n']  # mean whole torque of the last interval, N m
     effort: Annotated[Array, 'n']  # measured torque of the last interval, N m
     demand: Annotated[Array, 'n']  # whole torque (28) before saturation, N m
