@@ -10,6 +10,7 @@ import sys
 import threading
 from contextlib import closing
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ pytest.importorskip('can')
 
 import can
 import lockstep_damiao
+from command import wait_for
 from lockstep_damiao import LockstepArm, LockstepDriver, LockstepTicks
 from markdown_it import MarkdownIt
 from motor_arm import loop_of
@@ -39,7 +41,7 @@ from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.damiao import Register, Status
-from blf_dsc_controller.motors.frame import Frame
+from blf_dsc_controller.motors.frame import Frame, torque_alone
 from sim_plant.damiao import DamiaoArm
 
 CONFIG = loop_of(0.004).controller
@@ -196,13 +198,14 @@ def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypa
         driver.motors.mute = set()
         monkeypatch.setattr(LockstepTicks, 'answers', lockstep_damiao.PATIENCE)
 
-    driver = made(at={100: mute, 103: unmute, 150: mute})
+    driver = made(at={100: mute, 104: unmute, 150: mute})
     read, states = driver.read, []
     monkeypatch.setattr(driver, 'read', lambda: states.append(read()) or states[-1])
     outcome = run(driver)
-    before, bridged = states[100:102]  # the one of state 100 may be there already
-    assert bridged.dq[2] == before.dq[2] != 0.0
-    assert bridged.q[2] == before.q[2] + 0.004 * before.dq[2]
+    # the answer of state 100 may be there already
+    for before, bridged in pairwise(states[100:103]):
+        assert bridged.dq[2] == before.dq[2] != 0.0
+        assert bridged.q[2] == before.q[2] + 0.004 * before.dq[2]
     assert outcome.end is End.LOST
     assert outcome.states in (
         159,
@@ -264,32 +267,108 @@ def test_last_frame_holds_with_the_whole_torque_of_the_one_before(made):
     np.testing.assert_allclose(driver.motors.frame.torque, 2.5, atol=0.1)
 
 
-def test_another_client_on_the_bus_ends_the_run(made):
-    def interfere(driver):
-        with can.Bus(
-            interface='virtual', channel=driver.address.partition(':')[2]
-        ) as bus:
-            bus.send(
-                can.Message(arbitration_id=2, data=damiao.DISABLE, is_extended_id=False)
+def send_from_elsewhere(driver, identifier=0, data=b'', **given):
+    """Send a frame on the bus of a driver."""
+    channel = driver.address.partition(':')[2]
+    with can.Bus(interface='virtual', channel=channel) as bus:
+        bus.send(
+            can.Message(
+                arbitration_id=identifier, data=data, is_extended_id=False, **given
             )
+        )
 
-    driver = made(at={100: interfere})
+
+def test_another_client_on_the_bus_ends_the_run_and_the_motors_hold(made):
+    def interfere(driver):
+        send_from_elsewhere(driver, 2, damiao.ENABLE)
+        for joint in range(7):
+            data = damiao.request_data(joint + 1, damiao.REFRESH)
+            send_from_elsewhere(driver, damiao.TO_ALL, data)
+
+    driver = made(at={100: interfere}, feedback='host')
     with pytest.raises(
         DriverError, match=r'another program commands these motors.*0x002'
     ):
         run(driver)
+    wait_for(lambda: driver.motors.frame.stiffness.min() > 0.0)
+    assert_holds(driver.motors.frame)
 
 
-def test_an_error_frame_ends_the_run(made):
-    def break_bus(driver):
-        with can.Bus(
-            interface='virtual', channel=driver.address.partition(':')[2]
-        ) as bus:
-            bus.send(can.Message(is_error_frame=True))
+def test_answer_that_comes_too_late_is_none_to_the_next_frame(made):
+    """Else the loop would be a period behind this motor from then on."""
+    driver = made()
+    driver.start()
+    before = driver.read()
+    late = damiao.StateCodes(7, Status.ENABLED, 0, 2048, 2048, 30, 30)  # at -12.5 rad
+    send_from_elsewhere(driver, 0x17, damiao.state_data(late))
+    driver.write_frame(torque_alone(np.zeros(7)))
+    np.testing.assert_allclose(driver.read().q, before.q, atol=0.01)  # rad, in 4 ms
 
-    outcome = run(made(at={100: break_bus}))
+
+def test_frames_of_other_devices_and_those_that_are_cut_are_left_out(made):
+    def stray(driver):
+        send_from_elsewhere(driver, 0x123, bytes(8))
+        send_from_elsewhere(driver, 0x11, bytes(3))
+
+    assert run(made(at={20: stray}), 0.2).end is End.DURATION
+
+
+@pytest.mark.parametrize(
+    ('word', 'status', 'call', 'text'),
+    [
+        (
+            damiao.ENABLE,
+            Status.DISABLED,
+            DamiaoDriver.start,
+            'not enabled after 3 commands to do so',
+        ),
+        (
+            damiao.CLEAR,
+            Status.HOT_ROTOR,
+            DamiaoDriver.recover,
+            'its winding is too hot',
+        ),
+    ],
+    ids=['enable', 'clear'],
+)
+def test_motor_that_ignores_a_command_is_named(made, word, status, call, text):
+    driver = made()
+    take = driver.motors._take
+
+    def ignore(joint, data):
+        if joint == 3 and data == word:
+            driver.motors._send_state(joint)
+        else:
+            take(joint, data)
+
+    driver.motors._take = ignore
+    driver.motors.status[3] = status
+    with pytest.raises(DriverError, match=f'motor 0x04 of openarm_left_joint4.*{text}'):
+        call(driver)
+
+
+@pytest.mark.parametrize('method', ['read', 'write'])
+def test_an_error_frame_ends_the_run_and_the_motors_hold(made, method, monkeypatch):
+    """It may tell of a disturbance that is over: a host's last torque would move the arm.
+
+    It comes while the answer of a motor is waited for, or just before the next frame.
+    """
+    monkeypatch.setattr(LockstepTicks, 'answers', 0.2)
+    driver = made(at={99: lambda driver: driver.motors.mute.add(6)}, feedback='host')
+    call, calls = getattr(driver, method), []
+
+    def break_bus(*given):
+        calls.append(given)
+        if len(calls) == 100:
+            send_from_elsewhere(driver, is_error_frame=True)
+        return call(*given)
+
+    monkeypatch.setattr(driver, method, break_bus)
+    outcome = run(driver)
     assert outcome.end is End.LOST
     assert 'the CAN bus reports an error, or is off' in outcome.text
+    wait_for(lambda: driver.motors.frame.stiffness.min() > 0.0)
+    assert_holds(driver.motors.frame)
 
 
 @pytest.mark.parametrize(

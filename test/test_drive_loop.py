@@ -125,6 +125,19 @@ def test_other_threads_yield_to_the_loop_until_it_ends(monkeypatch, tmp_path):
     assert sys.getswitchinterval() == before
 
 
+def test_arm_that_does_not_come_to_rest_is_left_after_settle_time(monkeypatch):
+    """0.3 s of 1 ms each, and 0.2 s, but for the rounding of stamps."""
+    driver = PlantDriver('mistaken@1000', CONFIG, DriveConfig())  # if it goes on
+    driver.connect()
+    monkeypatch.setattr(blf.ArmController, 'is_settled', False)
+    with blf.ArmController(CONFIG) as controller:
+        loop = DriveLoop(driver, controller, duration=0.3, settle_time=0.2)
+        outcome = loop.run()
+    assert outcome.end is End.DURATION
+    assert outcome.states == pytest.approx(501, abs=1)
+    assert driver.calls[-1] == 'finish'
+
+
 def test_a_second_request_ends_at_once(tmp_path):
     driver, _, outcome = drive('impatient@300', tmp_path)
     assert outcome.end is End.REQUESTED

@@ -28,9 +28,10 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.drive import script_process
+from blf_dsc_controller.drive import loop_process, script_process
 from blf_dsc_controller.drive.arguments import checked_overrides
 from blf_dsc_controller.drive.driver import ReflexError, disagreements
+from blf_dsc_controller.drive.loop_process import LoopProcess
 from blf_dsc_controller.drive.script import Script, _far_beyond
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import (
@@ -332,6 +333,67 @@ def test_a_script_is_told_that_the_arm_runs_once_the_law_has_its_first_sample():
     assert told == [script_link.RUNNING]
 
 
+def test_second_signal_ends_the_loop_at_once():
+    """The first one brakes the arm before the loop is asked to end."""
+    script, requests = Script.__new__(Script), []
+    script._asked = 0
+    script._loop = SimpleNamespace(request_end=lambda: requests.append('end'))
+    script.request_close()
+    assert not requests
+    script.request_close()
+    assert len(requests) == 2  # at a second request, the loop ends at once
+
+
+@pytest.fixture
+def silent(monkeypatch):
+    """A loop that runs and whose process tells nothing, and the clock [s] of its script."""
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(loop_process, 'time', clock)
+    loop = LoopProcess.__new__(LoopProcess)
+    loop._owner, loop._closed = os.getpid(), False
+    loop._news = threading.Condition()
+    loop._link = SimpleNamespace(put=lambda *_: None, flush=lambda: True)
+    loop._forget()
+    tell(loop, script_link.RUNNING, ['joint1'])
+    return loop, clock
+
+
+def tell(loop, kind, content):
+    loop._take(kind, topic_link.encode(content))
+
+
+def test_loop_that_says_nothing_for_a_minute_is_an_error(silent):
+    """Else a script would wait for ever for one that hangs."""
+    loop, clock = silent
+    clock.now = 59.0
+    tell(loop, topic_link.LOG, {'level': 'info', 'text': 'a word'})
+    clock.now = 118.0
+    loop.check()
+    clock.now = 120.0
+    with pytest.raises(LoopEndedError, match='nothing for 61 s: look at the arm'):
+        loop.check()
+
+
+@pytest.mark.parametrize('says', [True, False])
+def test_loop_that_ends_is_waited_for_as_long_as_it_says_something(
+    silent, caplog, says
+):
+    """A minute at most after its last word; then it is killed."""
+    loop, clock = silent
+    clock.now = 300.0  # nobody has asked meanwhile
+
+    def poll():
+        clock.now += 10.0
+        if says:
+            tell(loop, topic_link.LOG, {'level': 'info', 'text': 'it brakes'})
+        return 0 if clock.now > 400.0 else None
+
+    loop._process = SimpleNamespace(poll=poll)
+    loop._close_softly()
+    assert ('the loop does not end: silent for 60 s' in caplog.text) != says
+    assert clock.now == (410.0 if says else 380.0)  # a look each 10 s
+
+
 def test_a_block_does_not_end_silently_with_an_arm_that_has_stopped():
     push = {'events.begin': [0.2], 'events.force': [0.0, 0.0, 500.0]}
     given = {'sim_plant': push | {'events.duration': [0.1], 'events.payload': [0.0]}}
@@ -423,6 +485,18 @@ start = arm.state.q
 arm.move_to(q, speed=1.0, wait=False)
 while abs(arm.state.q - start).max() < 0.01: time.sleep(0.01)
 """
+# Its fork holds the link to the loop, and ends once the bag is whole.
+FORKED = """
+if not os.fork():
+    os.close(1), os.close(2)
+    for _ in range(2500):
+        if os.path.exists(sys.argv[2] + '/metadata.yaml'): break
+        time.sleep(0.1)
+    os._exit(0)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+# As a service or a container that is stopped gets it, in all of its processes.
+TERMINATED = 'os.kill(arm._loop.pid, signal.SIGTERM); arm.wait()'
 STREAMS = """
 start = arm.state.q
 while abs(arm.state.q - start).max() < 0.01:
@@ -436,7 +510,8 @@ while abs(arm.state.q - start).max() < 0.01:
     [
         (MOVES, '', 0, ''),
         (MOVES, 'raise RuntimeError("a mistake")', 1, 'a mistake'),
-        (MOVES, 'os.kill(os.getpid(), signal.SIGKILL)', -9, ''),
+        (MOVES, FORKED, -9, ''),
+        (MOVES, TERMINATED, 1, 'pre-empted by the end of the script'),
         (STREAMS, 'os._exit(3)', 3, ''),
         (
             MOVES,
@@ -599,7 +674,11 @@ def test_a_motion_is_waited_for_stopped_and_given_up(arm):
 
 
 def test_ctrl_c_in_a_motion_brakes_the_arm_also_where_no_block_ends(arm):
-    """As in a notebook, whose kernel goes on."""
+    """As in a notebook, whose kernel goes on.
+
+    A terminal sends Ctrl-C to all processes of its group: the loop is in none of them.
+    """
+    assert os.getsid(arm._loop.pid) != os.getsid(0)
     start = arm.state.q
 
     def interrupt():

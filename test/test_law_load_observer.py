@@ -194,11 +194,12 @@ def test_what_d3_gives_up_only_since_r_is_late_fades():
     np.testing.assert_allclose(r, 0.0, atol=1e-9)
 
 
-def test_r_that_is_left_out_hands_nothing_over():
+@pytest.mark.parametrize('left_out', ['unsettled', 'faded'])
+def test_r_that_is_left_out_hands_nothing_over(left_out):
     """d^3 has what is learned, for good."""
-    state, work = settled()
-    run(state, work, X[:, :P] @ LINKS, 1.0)
-    state.faded[0] = 1.0
+    state, work = new() if left_out == 'unsettled' else settled()
+    run(state, work, X[:, :P] @ LINKS, 0.01)
+    state.faded[0] = float(left_out == 'faded')
     d3 = np.zeros(N)
     after, before = links(THETA + 1.0), links(THETA)
     load_observer.hand_over(SETTINGS, state, d3, 2.0 * X, after, before)
@@ -318,6 +319,21 @@ def test_r_takes_over_what_is_learned_no_longer_beyond_its_limit_until_it_needs_
     for load, shown in ((2.0, 13.5), (1.0, 9.0), (1.5, 9.0), (0.1, 0.9), (1.5, 6.0)):
         r = run(state, work, X[:, :P] @ (LINKS + load * learned[:P]), 1.0)
         assert r[1] == pytest.approx(shown, rel=1e-6)
+
+
+def test_torque_is_the_same_where_r_is_at_its_limit_when_it_takes_over():
+    """9 N m of joint 2 are beyond what is learned, of 6 N m that r may have."""
+    state, work = settled()
+    learned = np.array([0.0, 2.0, 2.0, 0.0])
+    before, after = THETA + learned, THETA
+    sensed = X[:, :P] @ (LINKS + 2.0 * learned[:P])
+    r = run(state, work, sensed, 1.0, theta=before)
+    assert r[1] == 6.0
+    torque, d3 = X @ before + r, np.zeros(N)
+    disturbance.transfer_learned(d3, X, after, before)
+    load_observer.transfer_learned(SETTINGS, state, d3, links(after), links(before))
+    r = run(state, work, sensed, DT)
+    np.testing.assert_allclose(X @ after + r + d3, torque, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

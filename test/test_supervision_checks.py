@@ -18,6 +18,7 @@ from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.check_state import INVALID, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.checks import check_sample
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.sample_check import SampleCheck
@@ -416,6 +417,16 @@ def test_messages_that_cannot_be_read_are_no_silence():
     rig.step(200)
     assert rig.supervisor.reason is Reason.BAD_MESSAGE
     assert len(rig.commands) == 220
+
+
+def test_messages_of_another_arm_hide_no_silence():
+    rig = Rig(HOLDING, live=True)
+    rig.step(20)
+    other = JointStateEncoder(('left', 'right'))
+    rig.sense = lambda state: [state.raw(other)]
+    rig.step(100)
+    assert rig.supervisor.reason is Reason.STATE_TIMEOUT
+    assert rig.guard.foreign == 100
 
 
 CALLS = {

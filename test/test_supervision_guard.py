@@ -24,7 +24,7 @@ from blf_dsc_controller.reference.trajectory import (
     TrajectoryPoint,
 )
 from blf_dsc_controller.run import TURNING
-from blf_dsc_controller.supervision.braking import braking_matrix
+from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import LatePlanError
@@ -33,6 +33,7 @@ from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_stop import SafeStop
 from blf_dsc_controller.supervision.safe_torque import SafeTorque, safe_torque
 from blf_dsc_controller.supervision.state_check import StateCheck
+from blf_dsc_controller.supervision.state_watchdog import Watchdog
 from blf_dsc_controller.supervision.stop_cause import chatter_of
 from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
@@ -73,6 +74,19 @@ def test_safe_torque_does_what_its_name_says_limited_and_finite(
     limited = {'torque.limit': (limit, limit)}
     got = safe_torque(safety, settings(**limited), last, estimate, np.zeros(2))
     np.testing.assert_allclose(got, expected)
+
+
+def test_damping_alone_is_what_a_gap_of_states_allows():
+    damping = np.array([20.0, 10.0])
+    last = LastState(2)
+    last.take(1, np.concatenate((Q, np.zeros(4))), DQ)
+    last.gap = 0.1
+    safety = Safety(torque='damping', damping=tuple(damping))
+    unlimited = settings(**{'torque.limit': (1e3, 1e3)})
+    borne = within_gap(unlimited, damping, Q, last.gap)
+    assert (borne < 0.5 * damping).all()
+    got = safe_torque(safety, unlimited, last, P, np.zeros(2))
+    np.testing.assert_allclose(got, -borne * DQ)
 
 
 def test_ramp_is_linear_and_ends_at_a_moving_goal():
@@ -134,6 +148,19 @@ def test_silence_stops_if_stamps_are_live_or_the_watchdog_is_on(
     assert rig.commands[-1].any() != stops
     rig.step(20)
     assert rig.supervisor.running != stops
+
+
+def test_silence_is_none_by_a_check_that_comes_late():
+    """States may wait in the queue of a process that hung; the next check decides."""
+    clock = SimpleNamespace(now=0)
+    watchdog = Watchdog(lambda: clock.now, lambda: clock.now)
+    found = []
+    for pause in (8, 8, 100, 8):  # ms
+        clock.now += pause * MILLISECOND
+        if len(found) == 0:
+            watchdog.restart()
+        found.append(watchdog.measure_silence(0.05))
+    assert found == [0.0, 0.0, 0.0, pytest.approx(0.116)]
 
 
 @pytest.mark.parametrize('ramp', ['stop_ramp', 'deactivation_ramp'])
@@ -212,8 +239,10 @@ def test_arm_yields_to_a_contact_only_until_the_next_ramp():
     ramp.begin_ramp(0.0, np.zeros(2))
     ramp.yield_to_contact()
     np.testing.assert_allclose(torque(), weight(Q))
+    assert not ramp.carries
     ramp.begin_ramp(0.0, np.zeros(2))
     assert not torque().any()
+    assert ramp.carries
 
 
 def test_single_jerk_changes_the_observed_load_by_what_a_torque_at_the_limit_would():
@@ -912,9 +941,9 @@ def test_measurement_of_another_shape_is_rejected(shape):
 
 
 def test_each_stop_counts_the_time_anew_for_which_the_arm_is_faster():
-    """0.3 s is longer than 0.2 s; each stop says so once."""
+    """0.3 s is longer than 0.2 s; each stop says so once, also after one at a higher speed."""
     speed = StopSpeed()
-    for at_stop in (0.0, 1.0):
+    for at_stop in (0.0, 1.0, 0.0):
         speed.begin(at_stop)
         faster = 2.0 * at_stop + 0.51
         found = [speed.observe(faster, 0.1) for _ in range(4)]

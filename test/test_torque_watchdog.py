@@ -10,8 +10,10 @@ from random_arm import CONFIG
 
 from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 from sim_plant.plant import plant_of
 
@@ -42,7 +44,7 @@ class Watched(Rig):
             values = np.concatenate((state.q, state.dq, state.effort))
             self.line.take_state(state.stamp, values, now)
             if self.plant.sample % self.period == 0:
-                torque = self.line.poll(now)
+                torque = self.line.poll(now + 5e-4)  # between two states
                 if torque is not None:
                     self.taken.append(torque.copy())
                     self.input.torque[:] = torque
@@ -133,6 +135,10 @@ def test_nothing_is_commanded_before_the_controller_or_while_states_stand_still(
         rig.line.take_state(state.stamp + min(k, 499) * MILLISECOND, values, k * 1e-3)
         assert rig.line.poll(k * 1e-3) is None
     assert rig.line.leave() is None
+    armed = TorqueWatchdog(rig.config, TIMEOUT, armed=True)
+    for k in range(1000):
+        armed.take_state(state.stamp, values, k * 1e-3)
+        assert armed.poll(k * 1e-3) is None
 
 
 def test_controller_that_is_back_takes_over_at_once_and_the_torque_fades_with_the_states():
@@ -150,9 +156,12 @@ def test_controller_that_is_back_takes_over_at_once_and_the_torque_fades_with_th
         assert rig.line.takeovers == takeovers
     assert rig.line.leave().all()
     now = rig.plant.sample * 1e-3
-    faded = [rig.line.poll(now + k * 1e-3) for k in range(1000)]
-    last = [torque.copy() for torque in faded if torque is not None][-1]
-    assert not last.any()
+    polled = [rig.line.poll(now + k * 1e-3) for k in range(1000)]
+    faded = [torque.copy() for torque in polled if torque is not None]
+    assert not faded[-1].any()
+    safety = rig.config.safety
+    seconds = rig.config.sample_time + safety.state_timeout + safety.fade_time
+    assert len(faded) * 1e-3 == pytest.approx(seconds, abs=0.005)
     assert not rig.line.active
     rig.step(200)
     assert not rig.line.active
@@ -176,6 +185,22 @@ def test_torque_is_finite_and_within_its_rate_from_what_the_controller_commanded
     steps = np.diff([np.nan_to_num(last), *rig.taken], axis=0)
     assert np.abs(steps).max() == pytest.approx(0.3)
     assert np.abs(restarted.taken[0]).min() > 1.0  # half of gravity
+
+
+def test_restarted_one_holds_by_the_model_it_was_given_last():
+    """A drive holds the arm by a torque that it does not know: none is observed."""
+    config = Watched(AT_REST).config
+    settings = settings_of_config(config)
+    estimate = settings.initial_estimate
+    other = {'learning.initial_estimate': tuple(2.0 * estimate[: settings.p])}
+    line = TorqueWatchdog(change(config, other), TIMEOUT, armed=True)
+    line.configure(config)
+    q = np.array([0.3, -0.4])
+    for k in range(100):
+        line.take_state(START + k * MILLISECOND, np.append(q, np.zeros(4)), k * 1e-3)
+        if (torque := line.poll(k * 1e-3)) is not None:
+            break
+    np.testing.assert_allclose(torque, gravity_torque(settings, estimate, q), atol=0.01)
 
 
 def test_it_says_whether_it_watches_and_whether_anybody_commands():
@@ -229,6 +254,8 @@ def test_it_does_not_stand_down_while_it_commands():
     rig.dead = True
     rig.step(100)
     assert not rig.line.stand_down()
+    assert rig.line.active
+    rig.line.stand_by()  # a reset of the silent controller
     assert rig.line.active
     rig.step(100)
     assert rig.line.takeovers == 1

@@ -12,6 +12,7 @@ torque that it had.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from math import inf
 from typing import ClassVar
 
@@ -130,7 +131,8 @@ class DamiaoDriver(Driver):
         A motor whose answer is lost is taken to have moved on at its velocity.
         """
         motors = self._motors
-        missing = motors.collect(self._ticks.left(_SHARE))
+        with self._holding_if_lost():
+            missing = motors.collect(self._ticks.left(_SHARE))
         if stopped := motors.stopped:
             self._hold()
             raise ReflexError(f'{stopped}; the others hold the arm')
@@ -151,14 +153,20 @@ class DamiaoDriver(Driver):
         if torque is not None:
             self.write_frame(torque_alone(torque))
             return
-        self._stamp = self._ticks.wait()
+        self._await_tick()
         self._motors.ask()
 
     def write_frame(self, frame: Frame) -> None:
         """Send a frame to each motor, at the next tick."""
         self._torque = frame.torque_at(*self._motors.state[:2])
-        self._stamp = self._ticks.wait()
+        self._await_tick()
         self._motors.send(frame)
+
+    def _await_tick(self) -> None:
+        """Wait for the next tick; answers that have not been taken by then are too late."""
+        self._stamp = self._ticks.wait()
+        with self._holding_if_lost():
+            self._motors.clear()
 
     def finish(self) -> None:
         """Let the motors hold the arm where it is, or disable them: `drive.at_end`."""
@@ -166,6 +174,16 @@ class DamiaoDriver(Driver):
             self._hold()
         else:
             self._motors.disable()
+
+    @contextmanager
+    def _holding_if_lost(self) -> Iterator[None]:
+        """Hold the arm by the motors that can still be reached, if the bus reports an error."""
+        try:
+            yield
+        except ConnectionLostError:
+            with suppress(ConnectionLostError):
+                self._hold()
+            raise
 
     def _hold(self) -> None:
         """Send frames that hold the arm where it is, with the torque that it had."""

@@ -106,8 +106,12 @@ class DamiaoMotors:
         """Return a motor and its joint in words."""
         return f'motor 0x{self._ids[joint]:02x} of {self._joints[joint]}'
 
+    def clear(self) -> None:
+        """Drop answers that wait: they are too late."""
+        self._bus.clear()
+
     def send(self, frame: Frame) -> None:
-        """Send each its frame; answers that wait are too late, and dropped."""
+        """Send each its frame."""
         self._bus.clear()
         sent = self._mounting.frame_at_motors(frame)
         commands = damiao.command_data(sent, self._at_motors)

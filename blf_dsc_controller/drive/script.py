@@ -77,7 +77,7 @@ class Script(Beside):
         """Close after the next torque; the second time end at once; for signals."""
         self._asked += 1
         if self._asked > 1:
-            self._end_loop()
+            self._end_at_once()
 
     def follow(self) -> None:
         """Do what the script wants; end with it."""
@@ -92,12 +92,15 @@ class Script(Beside):
         """Brake, then end at rest; the second time end at once."""
         self._closes += 1
         if self._closes > 1:
-            self._end_loop()
-            self._end_loop()  # a second request ends at once
+            self._end_at_once()
         elif not self._guard.supervisor.running:
             self._end_loop()
         else:
             self._rests_at = self._inputs.stop(self._guard, 'the end of the script')
+
+    def _end_at_once(self) -> None:
+        self._end_loop()
+        self._end_loop()  # a second request ends at once
 
     def _end_loop(self) -> None:
         if self._loop is not None:
