@@ -25,6 +25,7 @@ GROUPS = {
     'gains': {
         'margins': 'margins of the default gains, and errors at a pick-up',
         'elastic': 'where the gains of the presets hold, by the stiffness of gears',
+        'presets': 'what the presets err by, with and without learning',
         'soft-arms': 'errors at gains that gears bear, against goals and rivals',
         'measured-arms': 'the same arms, each commissioned by itself first',
         'two-encoders': 'what encoders at motors and links are worth together',

@@ -286,7 +286,7 @@ def test_columns_match_their_names():
 
     rubs = np.tanh(dq / 0.2)
     value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': rubs}
-    value['load friction'] = np.abs(tau) * rubs
+    value['load_friction'] = np.abs(tau) * rubs
     for w in (1.5, 4.0):
         value[f'sin {w:g} rad/s'] = np.full(2, np.sin(w * t))
         value[f'cos {w:g} rad/s'] = np.full(2, np.cos(w * t))

@@ -31,6 +31,7 @@ _ARRAYS = {  # of a run, with a column per joint: unit
 _VALUES = {  # prefix of names in the vectors: unit
     **dict.fromkeys((topics.DISTURBANCE, 'bias ', 'coulomb ', 'sin ', 'cos '), 'N m'),
     'viscous ': 'N m s/rad',
+    'load_friction ': '1',
     topics.POSITION: 'rad',
     topics.VELOCITY: 'rad/s',
     topics.DISTANCE: 'rad',

@@ -112,7 +112,6 @@ class DamiaoMotors:
 
     def send(self, frame: Frame) -> None:
         """Send each its frame."""
-        self._bus.clear()
         sent = self._mounting.frame_at_motors(frame)
         commands = damiao.command_data(sent, self._at_motors)
         for each, data in zip(self._ids, commands, strict=True):

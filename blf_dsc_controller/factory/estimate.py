@@ -22,7 +22,7 @@ from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.run import LearnedArm
 
 _MOST_FRICTION = 3.0  # times its initial estimate
-_LOAD_FRICTION = 'load friction'
+_LOAD_FRICTION = 'load_friction'
 _SHARE, _MOST_SHARE = 0.05, 0.2  # of the torque in a gear: standard deviation, and most
 _RIPPLE = 0.01  # standard deviation of a torque ripple, of the rated torque
 

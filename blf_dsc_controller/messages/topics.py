@@ -164,7 +164,7 @@ TOPICS = (
 # In the vectors truth, timing, monitor.
 DISTURBANCE = 'disturbance '  # followed by the joint
 # prefixes of disturbance columns
-COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'sin ', 'cos ')
+COLUMNS = ('bias ', 'viscous ', 'coulomb ', 'load_friction ', 'sin ', 'cos ')
 POSITION = 'position '  # followed by the joint
 VELOCITY = 'velocity '  # followed by the joint
 RATIO = 'max_error_ratio '  # followed by the joint: the largest |xi1| / k_c so far

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the presets err by with learning, and without it but with all else equal.
+
+    python -m benchmark presets [PRESET ...]
+
+Each runs for 60 s; by default those with elastic gears, which pick up 2 kg at 20 s, in full motion,
+and put them down at 45 s.  A cell has the largest error of any joint [mrad], with learning /
+without: a PID over the URDF's model along the reference, with the load observer where the arm
+has joint torque sensors.  The last row is the load with its 95 % interval, 5 s after the pick-up.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+
+from benchmark.harness import print_table
+from benchmark.load_observer import without_learning
+from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.law.samples import sample_columns
+from blf_dsc_controller.simulation.loop import Record, simulate
+from blf_dsc_controller.studies.runs import cores
+
+PRESETS = ('fr3_direct', 'fr3', 'panda', 'ur5e', 'ur5e_driver')
+SPANS = {  # s
+    'first 3 s': (0.0, 3.0),
+    '4 to 20 s': (4.0, 20.0),
+    '15 to 20 s': (15.0, 20.0),
+    'at the pick-up': (20.0, 24.0),
+    'with the load, 24 to 45 s': (24.0, 45.0),
+    'put down': (45.0, 49.0),
+}
+SECONDS = 60.0
+WEIGHED = 25.0  # s
+
+
+def weight_of(record: Record) -> str:
+    """Return the load that an arm has found at WEIGHED, with its 95 % interval."""
+    sample = sample_columns(record.samples, record.controller.settings)
+    at = int(np.searchsorted(1e-9 * record.stamps, WEIGHED))
+    mass, half = sample.load[at, 0], sample.load[at, 4]
+    return f'{mass:.3f} ± {half:.3f} kg'
+
+
+def column(preset: str) -> list[str]:
+    """Return the column of a preset."""
+    loop = load_loop(preset, {PLANT: {'duration': SECONDS}})
+    records = [
+        simulate(controller, loop.plant)
+        for controller in (loop.controller, without_learning(loop.controller))
+    ]
+    runs = [record.run() for record in records]
+    for run in runs:
+        if run.stops or run.oscillations:
+            return [f'does not hold: {run.stops or run.oscillations}']
+    errors = [1e3 * np.abs(np.asarray(run.error)).max(axis=1) for run in runs]
+    time = runs[0].time
+    cells = [
+        ' / '.join(
+            f'{each[(time >= begin) & (time < end)].max():.2g}' for each in errors
+        )
+        for begin, end in SPANS.values()
+    ]
+    return [*cells, weight_of(records[0])]
+
+
+def rows(presets: list[str]) -> Iterator[list[str]]:
+    """Compute the rows of the table."""
+    with ProcessPoolExecutor(cores()) as pool:
+        columns = list(pool.map(column, presets))
+    for name, *cells in zip((*SPANS, 'weighed'), *columns, strict=True):
+        yield [name, *cells]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument('presets', nargs='*', metavar='PRESET', default=list(PRESETS))
+
+
+def main(options: argparse.Namespace) -> None:
+    """Print the table."""
+    print_table(['', *options.presets], rows(options.presets))
