@@ -380,6 +380,11 @@ def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypa
     assert found == [0.25, 0.5]
 
 
+def test_arm_of_an_older_bag_learned_no_load_friction():
+    recorded = {'robot.urdf': 'arm.urdf', 'learning.viscous': True}
+    assert older_parameters.completed(recorded)['learning.load_friction'] is False
+
+
 def test_values_of_an_older_bag_need_no_word_to_insist(tmp_path):
     """It has been recorded with what is refused now."""
     given = {'barrier.bound': [2.0, 2.0], 'insist': ['barrier.bound']}

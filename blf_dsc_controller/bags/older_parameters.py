@@ -43,6 +43,7 @@ _IGNORED = dict.fromkeys(
 
 ADDED: dict[str, Value] = {
     'disturbance.observer_bandwidth': 0.0,
+    'learning.load_friction': False,
     'safety.oscillation': 'ignore',
     'insist': CHECKED,
 }
