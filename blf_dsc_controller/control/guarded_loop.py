@@ -24,6 +24,9 @@ Vector = NDArray[np.float64]
 class GuardedLoop:
     """The guarded law of one arm with its telemetry.
 
+    Who has one asks `guard.update` for the torque, sends it, and only then calls `guard.perceive`
+    and encodes the messages: both may take longer than the drives should wait.
+
     Attributes:
         guard: the law between its checks.
         telemetry: encoders of the messages.

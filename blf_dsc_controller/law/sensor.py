@@ -40,7 +40,7 @@ _WRONG = 0.5  # of the larger mean square
 _LATE = 0.9  # of the larger mean square: a first-order lag has less than 1
 _SECOND = 2.0  # readings before that of a second difference
 _ROW = 0.01  # s: up to here, the ends of an interval show the velocity within it
-_GAP = 2.5  # samples: readings are missing in an interval that is also longer than this
+LONG_GAP = 2.5  # samples: states are missing in an interval that is longer than this
 SLOW = 0.03  # rad/s: slower motion shows nothing
 
 
@@ -110,7 +110,7 @@ def compare_velocities(
     state.readings[0] += 1.0
     share = min(1.0, dt / FILTER)
     slow = min(1.0, dt / _POWER)
-    is_gap = dt > max(_ROW, _GAP * sample_time)
+    is_gap = dt > max(_ROW, LONG_GAP * sample_time)
     is_wrong = False
     for i in range(n):
         if begins:

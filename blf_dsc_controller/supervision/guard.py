@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences
 from blf_dsc_controller.law.check_state import INVALID
 from blf_dsc_controller.law.checks import is_valid_state
+from blf_dsc_controller.law.sensor import LONG_GAP
 from blf_dsc_controller.messages.errors import (
     DuplicatedJointError,
     MessageError,
@@ -40,7 +41,7 @@ from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.motions import Motions
 from blf_dsc_controller.supervision.starting import Starting
-from blf_dsc_controller.supervision.state_check import LONG_GAP, SKIP
+from blf_dsc_controller.supervision.state_check import SKIP
 from blf_dsc_controller.supervision.state_watchdog import PERIOD
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason
 

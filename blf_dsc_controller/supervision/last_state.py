@@ -18,9 +18,8 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.law.sensor import FILTER
+from blf_dsc_controller.law.sensor import FILTER, LONG_GAP
 from blf_dsc_controller.supervision.recent_motion import is_gap
-from blf_dsc_controller.supervision.state_check import LONG_GAP
 
 Vector = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.law.sensor import LONG_GAP
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.model_torque import needed_torque
-from blf_dsc_controller.supervision.state_check import LONG_GAP
 
 Array = NDArray[np.float64]
 

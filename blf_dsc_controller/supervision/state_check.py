@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller_groups import Safety
+from blf_dsc_controller.law.sensor import LONG_GAP
 from blf_dsc_controller.run import NANOSECOND, JointUnits
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
 _PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Franka's 30
 _REPEATS = 3  # states in a row with the stamp of the one before that are ignored
-LONG_GAP = 2.5
-"""Samples between two stamps: a shorter step of the clock does no harm."""
 _MOVING = 0.02  # rad/s: a slower motion shows no time
 _LESS = 0.5  # of the time by the stamps
 _AVERAGED = 1.0  # s, over which missed states are
