@@ -19,6 +19,7 @@ from benchmark.random_arms import THIS
 from benchmark.soft_arms import ALL, drawn, figures
 from benchmark.studies import load_study
 from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law import friction, reversals
@@ -481,6 +482,16 @@ def test_friction_that_grows_with_the_load_is_learned():
     )
     assert learned.errors[2] < 0.7 * without.errors[2]
     assert learned.rms < 0.85 * without.rms
+
+
+def test_load_friction_needs_coulomb_friction():
+    given = {'learning.coulomb': False}
+    assert not load_loop(
+        'ur5e', {'blf_dsc_controller': given}
+    ).controller.learning.load_friction
+    given['learning.load_friction'] = True
+    with pytest.raises(BlfDscError, match=r'learning\.load_friction: got true without'):
+        load_loop('ur5e', {'blf_dsc_controller': given})
 
 
 def test_weak_ripple_that_is_listed_costs_nothing():

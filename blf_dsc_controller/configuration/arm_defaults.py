@@ -134,7 +134,9 @@ def _has_load_friction(
 ) -> bool:
     """Whether friction that grows with the load is learned: a torque loop hides it."""
     is_own = given.get('law', LAWS[0]) in OWN and has_exact_rows(given)
-    return is_own and arm.joints is not None and not robot.torque_loop
+    has_friction = given.get('learning.coulomb', True)
+    is_soft = arm.joints is not None
+    return bool(is_own and is_soft and has_friction and not robot.torque_loop)
 
 
 def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:

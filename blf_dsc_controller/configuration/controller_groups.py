@@ -397,8 +397,8 @@ class Learning:
     load_friction: bool = sizing(
         False,
         'also estimate the share of the torque in its gear by which the Coulomb friction of each '
-        'joint grows. The default of arms from a URDF without robot.torque_loop and feedback '
-        'through the inertia matrix is true',
+        'joint grows; needs learning.coulomb. True by default where an arm from a URDF has gains '
+        'of joints and no torque loop',
     )
     frequencies: tuple[float, ...] = sizing(
         (),
@@ -435,7 +435,12 @@ class Learning:
     )
 
     def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
-        """Check the window's size, and the initial estimate against model and ball."""
+        """Check the window's size, the columns, and the initial estimate against model and ball."""
+        if self.load_friction and not self.coulomb:
+            yield (
+                'learning.load_friction: got true without learning.coulomb, with which it changes '
+                'sign: write learning.coulomb: true, or learning.load_friction: false'
+            )
         samples = self.window / sample_time
         (fewest, most) = _SAMPLES
         if not fewest - 0.5 <= samples <= most + 0.5:

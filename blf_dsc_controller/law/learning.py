@@ -3,7 +3,8 @@
 
 `observe`, before the torque is known:
 
-columns, load_friction, ripple    the columns of what is learned besides P
+columns, ripple   the columns of what is learned besides P
+load_friction     those of friction that grows with the load
 prediction        a row [X | u] with X theta = u, of the last interval
 joint_sensors     what joint torque sensors show, where there are any
 window            sums of the rows over tau_d
@@ -116,7 +117,7 @@ def fill_columns(
     if of.load_friction == 1:
         tau = signals.gear_torque
         load_friction.fill_gear_torque(settings.p, signals.H, state.estimate, tau)
-        load_friction.fill_compensated(of, lag, tau, dqr, ddqr, dt, signals.H)
+        load_friction.fill_compensated(of, tau, signals.friction.sign, signals.H)
         load_friction.fill_measured(of, tau, dq, signals.row.Yr)
 
 

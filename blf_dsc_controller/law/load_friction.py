@@ -29,36 +29,22 @@ def fill_gear_torque(first: int, H: Array, estimate: Array, tau: Array) -> None:
 
 
 @inner
-def fill_block(
-    settings: Settings, i: int, tau: float, velocity: float, H: Array
-) -> None:
-    """Fill the block in row i of a regressor H (n, m), at tau_L [N m] and a velocity [rad/s]."""
+def fill_block(settings: Settings, tau: Array, i: int, sign: float, H: Array) -> None:
+    """Fill the block in row i of a regressor H (n, m), at tau_L (n,) [N m] and s of a velocity."""
     blocks = settings.bias + settings.viscous + settings.coulomb
-    rubs = abs(tau) * sliding(velocity, settings.coulomb_velocity)
-    set_block(H, settings.first + H.shape[0] * blocks, i, rubs)
+    set_block(H, settings.first + tau.size * blocks, i, abs(tau[i]) * sign)
 
 
 @inner
 def fill_measured(settings: Settings, tau: Array, dq: Array, Yr: Array) -> None:
     """Fill the block of [Yr | D] (n, m) for the row, at tau_L (n,) [N m] and dq (n,) [rad/s]."""
-    for i in range(dq.size):
-        fill_block(settings, i, tau[i], dq[i], Yr)
+    for i in range(tau.size):
+        sign = sliding(dq[i], settings.coulomb_velocity)
+        fill_block(settings, tau, i, sign, Yr)
 
 
 @inner
-def fill_compensated(
-    settings: Settings,
-    lag: float,
-    tau: Array,
-    dqr: Array,
-    ddqr: Array,
-    dt: float,
-    H: Array,
-) -> None:
-    """Fill the block of H (n, m), at the velocity that the reference has when the torque acts.
-
-    Torques act 1.5 samples and half of the `lag` [s] late.
-    """
-    lead = 1.5 * dt + 0.5 * lag
-    for i in range(dqr.size):
-        fill_block(settings, i, tau[i], dqr[i] + lead * ddqr[i], H)
+def fill_compensated(settings: Settings, tau: Array, sign: Array, H: Array) -> None:
+    """Fill the block of H (n, m), with `sign` (n,), the s at which `friction` is compensated."""
+    for i in range(tau.size):
+        fill_block(settings, tau, i, sign[i], H)
