@@ -104,6 +104,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             {'sensr.offset': [1.0, 1.0]},
             'unknown parameter, did you mean sensor.offset?',
         ),
+        (
+            PLANT,
+            {'load': {'torque': [1.0, 2.0]}},
+            'a group, no parameter: give those in it by name, such as load.',
+        ),
         # Types. ROS does not accept an integer for a double, nor does a run without
         # ROS.
         (
@@ -115,6 +120,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             PLANT,
             {'load.torque': [1, 2]},
             'got [1, 2], but a double array is expected, with a dec',
+        ),
+        (
+            CONTROLLER,
+            {'reference.waypoints': np.zeros((3, 2))},
+            'got 3 lists, but a double array is expected: write all their entries as one',
         ),
         (PLANT, {'duration': '1'}, 'got "1", but a double is expected'),
         (

@@ -118,6 +118,10 @@ class Parameter:
             yield f'{self.name}: got {format_value(given)}, {expected}'
             return
         entries = list(given) if self.is_array else [given]
+        if self.is_array and any(isinstance(entry, _ARRAYS) for entry in entries):
+            remedy = 'write all their entries as one list, row after row'
+            yield f'{self.name}: got {len(entries)} lists, {expected}: {remedy}'
+            return
         if not all(_is(entry, self.type) for entry in entries):
             lacks_point = self.type is float and all(
                 _is(entry, int | float) for entry in entries
@@ -372,6 +376,9 @@ def unknown(name: str, known: Iterable[str]) -> str:
     ours = _ELSEWHERE.get(name.rpartition('.')[2].lower())
     if ours in known:
         return f'{name}: unknown parameter, did you mean {ours}?'
+    of_group = [each for each in known if each.startswith(f'{name}.')]
+    if of_group:
+        return f'{name}: a group, no parameter: give those in it by name, such as {of_group[0]}'
     return f'{name}: unknown parameter{suggestion(name, known)}'
 
 
