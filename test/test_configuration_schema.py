@@ -123,8 +123,8 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         ),
         (
             CONTROLLER,
-            {'reference.waypoints': np.zeros((3, 2))},
-            'got 3 lists, but a double array is expected: write all their entries as one',
+            {'reference.waypoints': np.zeros((1, 2))},
+            'got [[0.0, 0.0]], but a double array is expected: write all entries as one',
         ),
         (PLANT, {'duration': '1'}, 'got "1", but a double is expected'),
         (
@@ -339,6 +339,13 @@ def test_invalid_value_is_rejected_with_what_it_is_and_what_is_expected(
     for cls in classes:
         (problem,) = problems_of(cls, given)
         assert problem.startswith(f'{name}: {message}')
+
+
+def test_long_value_of_another_type_is_shortened():
+    (problem,) = problems_of(ControllerConfig, {'law': list(range(1000))})
+    assert problem.startswith('law: got [0, 1, 2, ')
+    assert problem.endswith(' ..., but a string is expected: write it in quotes')
+    assert len(problem) < 300
 
 
 @pytest.mark.parametrize(
