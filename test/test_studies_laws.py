@@ -390,6 +390,9 @@ def test_events_of_a_file_become_the_pick_up_of_its_heaviest_load():
     plant = laws.trial('ur5e_rigid', 0, {'sim_plant': events}).plant
     assert plant.events.payload == (2.0,)
     assert plant.events == laws.trial('ur5e_rigid', 0).plant.events
+    none = {name: [] for name in events}
+    rated = {'sim_plant': none, 'blf_dsc_controller': {'robot.payload': 4.0}}
+    assert laws.trial('ur5e_rigid', 0, rated).plant.events.payload == (4.0,)
 
 
 def test_every_trial_has_its_own_truth_motion_and_noise():

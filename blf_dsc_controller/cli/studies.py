@@ -39,8 +39,10 @@ def arms(options: Namespace) -> None:
     with announced_compilation(print_notice):
         found = laws.compare(folder, options.config, options.laws)
     for arm, results in found.items():
+        load = laws.load_of(laws.trial(arm, 0))
         print(
-            f'{arm}: {laws.TRUTHS} runs of each law; errors in mrad, of the model in %'
+            f'{arm}: {laws.TRUTHS} runs of each law, {load:g} kg picked up at {laws.PICK_UP:g} s; '
+            'errors in mrad, of the model in %'
         )
         print(laws.format_results(results))
     print(f'wrote {options.out}: figures.json')
