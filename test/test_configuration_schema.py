@@ -106,6 +106,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         ),
         (
             PLANT,
+            {'sim_plant.duration': 1.0},
+            'unknown parameter, did you mean duration?',
+        ),
+        (
+            PLANT,
             {'load': {'torque': [1.0, 2.0]}},
             'a group, no parameter: give those in it by name, such as load.',
         ),

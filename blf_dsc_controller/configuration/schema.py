@@ -384,7 +384,8 @@ _ELSEWHERE = {
 def unknown(name: str, known: Iterable[str]) -> str:
     """Return the problem for an unknown name, suggesting the closest known one."""
     known = [*known]
-    ours = _ELSEWHERE.get(name.rpartition('.')[2].lower())
+    last = name.rpartition('.')[2].lower()
+    ours = _ELSEWHERE.get(last, last)
     if ours in known:
         return f'{name}: unknown parameter, did you mean {ours}?'
     of_group = [each for each in known if each.startswith(f'{name}.')]
