@@ -178,12 +178,11 @@ def test_it_follows_trajectories_and_stops_on_request():
     controller = blf.ArmController(LOOP.controller)
     plant = plant_of(LOOP.plant)
     run(controller, plant, LOOP.plant, 10)
-    goal = blf.TrajectoryPoint(2.0, (2.2, 1.6))
-    controller.follow([goal])
+    controller.follow([(2.0, np.array([2.2, 1.6]))])
     with pytest.raises(TrajectoryError, match='rejected'):
         controller.follow([blf.TrajectoryPoint(1e-3, (90.0, 90.0))])
-    with pytest.raises(TrajectoryError, match='got a tuple, but each point is a Traj'):
-        controller.follow([(2.0, (2.2, 1.6))])
+    with pytest.raises(TrajectoryError, match='each point is a time and positions'):
+        controller.follow([2.2, 1.6])
     for step in range(10, 2500):
         q, dq, effort = plant.measure().reshape(3, -1)
         plant.step(controller.update(1.0 + 1e-3 * step, q, dq, effort))

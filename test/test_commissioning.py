@@ -28,6 +28,7 @@ from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.cli.commission import _file as file_for
 from blf_dsc_controller.cli.commission import _lags as lags_of
+from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import files, postures, simulated
 from blf_dsc_controller.commissioning.better_known import as_measured
@@ -74,6 +75,7 @@ from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import FIRST_STAMP, Oscillation, Stop
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.expected_errors import expected_errors
+from sim_plant.settings import true_rotors
 
 ROTORS = (0.3, 0.1)  # kg m^2
 SPRINGS = (3e3, 1.5e3)  # N m/rad: free resonances of 26 and 29 Hz
@@ -935,6 +937,25 @@ def test_gains_of_the_law_in_a_file_give_way_to_those_that_were_chosen(tmp_path)
     assert 'barrier.weight' not in given
     assert given['feedback.joint_damping'] == found().config.feedback.joint_damping
     assert given['barrier.bound'] == [0.3, 0.3]
+
+
+def test_simulated_arm_keeps_its_drives_whatever_is_measured_of_them(tmp_path):
+    """By default they are those that the file assumes, and the measured ones would replace them."""
+    source = tmp_path / 'arm.yaml'
+    source.write_text(
+        '/**:\n  ros__parameters:\n'
+        '    robot: {urdf: two_link.urdf, gravity: [0.0, 0.0, 0.0]}\n'
+        '/**/sim_plant:\n  ros__parameters:\n    truth: {rotor_factor: 1.3}\n'
+    )
+    out = tmp_path / 'out.yaml'
+    file = CommissionedFile(
+        out, source, 'arm', '', is_simulated=True, ripple_follows=True
+    )
+    file.write(found(), file.content(found()))
+    before, after = load_loop(source), load_loop(out)
+    np.testing.assert_allclose(true_rotors(after.plant), true_rotors(before.plant))
+    measured_ones = list(after.controller.robot.rotor_inertia)
+    assert measured_ones != pytest.approx(true_rotors(after.plant).tolist(), rel=0.1)
 
 
 def test_gains_without_the_margin_are_no_parameters():

@@ -321,6 +321,20 @@ def test_reference_to_hold_visits_where_the_arm_is(arm):
         postures_of(config)
 
 
+def test_postures_differ_although_one_tone_passes_them_again_on_its_way_back(arm):
+    tone = {
+        'reference.type': 'sinusoids',
+        'reference.amplitude': [0.3, 0.2],
+        'reference.frequency': [1.0],
+        'reference.phase': [0.0],
+    }
+    config = change(blf.load_loop(arm).controller, tone)
+    shares = (postures_of(config) - config.reference.offset) / [0.3, 0.2]
+    # cosine of 30, 150 and 270 degrees
+    expected = np.array([[3.0**0.5 / 2.0, -(3.0**0.5) / 2.0, 0.0]] * 2).T
+    np.testing.assert_allclose(shares, expected, atol=1e-9)
+
+
 def test_gains_that_nobody_measured_are_told_where_a_robot_is_meant():
     preset = blf.load_loop('fr3_direct').controller
     assert 'nobody has measured' in not_commissioned(preset)

@@ -104,6 +104,16 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             {'sensr.offset': [1.0, 1.0]},
             'unknown parameter, did you mean sensor.offset?',
         ),
+        (
+            PLANT,
+            {'sim_plant.duration': 1.0},
+            'unknown parameter, did you mean duration?',
+        ),
+        (
+            PLANT,
+            {'load': {'torque': [1.0, 2.0]}},
+            'a group, no parameter: give those in it by name, such as load.',
+        ),
         # Types. ROS does not accept an integer for a double, nor does a run without
         # ROS.
         (
@@ -115,6 +125,11 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
             PLANT,
             {'load.torque': [1, 2]},
             'got [1, 2], but a double array is expected, with a dec',
+        ),
+        (
+            CONTROLLER,
+            {'reference.waypoints': np.zeros((1, 2))},
+            'got [[0.0, 0.0]], but a double array is expected: write all entries as one',
         ),
         (PLANT, {'duration': '1'}, 'got "1", but a double is expected'),
         (
@@ -329,6 +344,13 @@ def test_invalid_value_is_rejected_with_what_it_is_and_what_is_expected(
     for cls in classes:
         (problem,) = problems_of(cls, given)
         assert problem.startswith(f'{name}: {message}')
+
+
+def test_long_value_of_another_type_is_shortened():
+    (problem,) = problems_of(ControllerConfig, {'law': list(range(1000))})
+    assert problem.startswith('law: got [0, 1, 2, ')
+    assert problem.endswith(' ..., but a string is expected: write it in quotes')
+    assert len(problem) < 300
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,21 @@ def test_robot_that_does_not_answer_is_a_problem(capsys, monkeypatch, tmp_path):
     assert '172.16.0.2 does not answer' in found['robot'][0][1]
 
 
+@pytest.mark.parametrize('address', ['simulated', 'can0', 'slcan:/dev/ttyACM0'])
+def test_robot_that_is_in_no_network_is_not_asked(
+    capsys, monkeypatch, tmp_path, address
+):
+    ping = tmp_path / 'ping'
+    ping.write_text(SILENT)
+    ping.chmod(0o755)
+    monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
+    code, found = diagnosed(capsys, '--robot', address)
+    assert code == 0
+    ((level, text),) = found['robot']
+    assert level == 'ok'
+    assert text.startswith(f'{address} is not in the network')
+
+
 def test_computer_without_ping_says_how_to_get_it(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv('PATH', str(tmp_path))
     _, found = diagnosed(capsys, '--robot', '172.16.0.2')

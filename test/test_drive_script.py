@@ -107,6 +107,20 @@ def test_simulated_drives_take_no_first_torque_for_a_jump():
         driver.read()
 
 
+def test_simulated_brakes_leave_no_torque_of_an_earlier_run_to_the_next():
+    """It would look like drives that hold the arm, and the law would refuse to start."""
+    loop = blf.load_loop('ur5e')
+    driver = simulated(loop.plant)(SIMULATED, loop.controller, DriveConfig())
+    driver.connect()
+    driver.start()
+    for _ in range(6):
+        driver.write(np.full(6, 5.0))  # N m
+    assert (driver.read().effort > 1.0).all()
+    driver.finish()
+    driver.start()
+    np.testing.assert_array_equal(driver.read().effort, np.zeros(6))
+
+
 def test_simulated_robot_reports_motors_that_have_encoders():
     loop = blf.load_loop('panda', {PLANT: {'sensor.side': 'both'}})
     for plant, has in ((loop.plant, True), (blf.load_loop('panda').plant, False)):

@@ -107,7 +107,8 @@ IMPORTS = (
 @pytest.mark.parametrize(
     ('text', 'problem'),
     [
-        ('1 / 0', 'cannot be imported: ZeroDivisionError'),
+        ('1 / 0', 'law.py, line 3, cannot be imported: ZeroDivisionError'),
+        ('1 +', '(law.py, line 3)'),
         ('law = 3', 'expected LAW, a NamedTuple of gains'),
         ('class LAW(NamedTuple):\n    k: float', 'LAW.k must be declared'),
         ('class LAW(NamedTuple):\n    pass', 'LAW has no gains'),
@@ -124,6 +125,15 @@ IMPORTS = (
             METHODS.replace('pass', 'state.memory[0] += dt', 1)
             + '    has_barrier = True\n',
             'state.memory is used, but there is no MEMORY',
+        ),
+        (
+            METHODS
+            + '    has_barrier = True\n\nclass MEMORY(NamedTuple):\n    sum: float',
+            'MEMORY.sum is a number, which kernels cannot write: declare it as Cell',
+        ),
+        (
+            METHODS + '    def has_barrier(self):\n        return True\n',
+            'LAW.has_barrier is a method: put @property above it',
         ),
     ],
 )
@@ -179,12 +189,23 @@ checking = pytest.mark.skipif(
             'an array has no sum_of: read what the law keeps as',
         ),
         ('signals', 'these shapes or types do not fit'),
+        ('memory_of(state.memory, settings).sums[0]', 'did you mean memory.sum?'),
+        ('memory_of(state.memory).sum[0]', 'memory_of takes settings only where'),
+        ('settings.model.mass_of(t)', 'TwoLink has no mass_of'),
+        ('np.clip(t, 0.0, 1.0)', 'a number has no shape: of numbers, use min, max'),
+        ('self.n', 'LAW has no gain n: it is settings.n'),
+        (
+            'self.has_barrier',
+            'the method has_barrier is not compiled: make it a function',
+        ),
     ],
 )
 def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tmp_path):
     path = tmp_path / 'law.py'
     helper = 'import numpy as np\n\n\ndef doubled(x):\n    return x\n\n\n'
     helper += "MEMORY = NamedTuple('MEMORY', [('sum', Annotated[np.ndarray, 'n'])])\n"
+    helper += 'from blf_dsc_controller.compiled.layout import view_of\n'
+    helper += 'memory_of = view_of(MEMORY)\n'
     mistaken = METHODS.replace('pass', f'signals.demand[0] += {line}', 1)
     law = law_of_text(path, helper + mistaken)(1.0)
     with pytest.raises(BlfDscError) as raised:
@@ -197,6 +218,15 @@ def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tm
     )
     assert told.startswith(f'{path}, line {number + 1}: ')
     assert problem in told
+
+
+@compiling
+@pytest.mark.parametrize('line', ['self.k += t', 'signals.demand = signals.q'])
+def test_what_cannot_be_set_is_told_with_its_line(line, tmp_path):
+    path = tmp_path / 'law.py'
+    law = law_of_text(path, METHODS.replace('pass', line, 1))(1.0)
+    with pytest.raises(BlfDscError, match=r'law\.py, line 7: \w+ cannot be set'):
+        for_kernels(law, *views())
 
 
 @compiling

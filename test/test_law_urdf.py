@@ -83,6 +83,9 @@ def test_given_parameters_override_the_derived_ones():
 
 def test_urdf_may_be_given_as_text_or_file(tmp_path):
     assert panda(robot__urdf=PANDA_TEXT).learning == panda().learning
+    echoed = tmp_path / 'echoed.urdf'  # as `ros2 topic echo` writes the text
+    echoed.write_text(f'{PANDA_TEXT}\n---\n')
+    assert panda(robot__urdf=str(echoed)).learning == panda().learning
     # as a failed xacro leaves it: not to select the two-link arm
     empty = tmp_path / 'arm.urdf'
     empty.write_text('\n')

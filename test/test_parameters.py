@@ -266,7 +266,8 @@ def test_text_on_the_topic_that_is_no_urdf_is_refused(ros, tmp_path, text):
 
 def test_topic_is_rejected_outside_a_node():
     with pytest.raises(
-        ConfigurationError, match=r'robot.urdf: .* is a topic, which only a node'
+        ConfigurationError,
+        match=r'robot.urdf: .* only a node can read: .* data robot_description > arm',
     ):
         build(ControllerConfig, ON_TOPIC)
 

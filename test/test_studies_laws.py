@@ -345,6 +345,19 @@ def test_unsuitable_law_is_refused_by_its_name_and_else_left_out(
     assert ran == ['proposed', 'no_learning', 'slotine_li', 'computed_torque_tuned']
 
 
+def test_arm_that_is_as_its_urdf_says_is_noted_before_laws_are_compared(
+    tmp_path, monkeypatch, capsys
+):
+    text = locate('ur5e_rigid').read_text(encoding='utf-8')
+    ideal = tmp_path / 'ideal.yaml'
+    ideal.write_text(re.sub(r' +truth:\n( {6}.*\n)+', '', text), encoding='utf-8')
+    monkeypatch.setattr(laws, 'compare', lambda *_: {})
+    for config, notes in ((str(ideal), 1), ('ur5e_rigid', 0)):
+        out = tmp_path / f'out_{notes}'
+        assert main(['arms', '--config', config, '--out', str(out)]) == 0
+        assert capsys.readouterr().err.count('exactly that of the URDF') == notes
+
+
 def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
     stiff = laws.trial('ur5e_rigid', 1).controller
     soft = arms.soft_trial('ur5e_rigid', 1, 0.25).controller
@@ -390,6 +403,9 @@ def test_events_of_a_file_become_the_pick_up_of_its_heaviest_load():
     plant = laws.trial('ur5e_rigid', 0, {'sim_plant': events}).plant
     assert plant.events.payload == (2.0,)
     assert plant.events == laws.trial('ur5e_rigid', 0).plant.events
+    none = {name: [] for name in events}
+    rated = {'sim_plant': none, 'blf_dsc_controller': {'robot.payload': 4.0}}
+    assert laws.trial('ur5e_rigid', 0, rated).plant.events.payload == (4.0,)
 
 
 def test_every_trial_has_its_own_truth_motion_and_noise():

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -346,6 +347,13 @@ def test_warnings_speak_of_the_bound_at_the_tool():
     times = float(load.partition(' times this bound at the tool')[0].split()[-1])
     wide = preset('panda_rigid', **{'barrier.tool_bound': 0.0005 * times})
     assert config_warnings(wide.controller) == []
+
+
+def test_page_shows_the_warning_of_the_preset_that_it_names():
+    page = Path(__file__).resolve().parents[1] / 'doc' / 'tool_bound.md'
+    shown = page.read_text(encoding='utf-8').partition('```text')[2].partition('```')[0]
+    tight = preset('panda_rigid', **{'barrier.tool_bound': 0.001})
+    assert ' '.join(shown.split()) in config_warnings(tight.controller)
 
 
 @pytest.fixture(scope='module')

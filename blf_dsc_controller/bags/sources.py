@@ -12,7 +12,7 @@ from __future__ import annotations
 import difflib
 import errno
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import SEEK_CUR, SEEK_END, BytesIO
 from pathlib import Path
@@ -263,28 +263,31 @@ def _reason(path: Path, error: Exception) -> str:
         return 'it is a table, which only blf_dsc identify reads: give a bag'
     files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
     is_mcap = bool(files) and files[0].suffix == '.mcap'
-    text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__
     if path.is_dir() and not (path / METADATA).exists():
         text = f'the folder has no {METADATA}'
         if not is_mcap:
             return text + _instead_of(path)
-        text += ', as after an interrupted recording'
-    elif isinstance(error, OSError) or not is_mcap:
-        is_other = path.is_file() and path.suffix not in FILES
-        return (
-            'a bag is a folder, or a file in .mcap, .db3 or .bag' if is_other else text
+        return _reason_of_mcap(
+            files, f'{text}, as after an interrupted recording', path
         )
+    text = ' '.join(f'{error}'.split()).rstrip('.') or type(error).__name__
+    if is_mcap and not isinstance(error, OSError):
+        return _reason_of_mcap(files, text, path)
+    is_other = path.is_file() and path.suffix not in FILES
+    return 'a bag is a folder, or a file in .mcap, .db3 or .bag' if is_other else text
+
+
+def _reason_of_mcap(files: Sequence[Path], text: str, path: Path) -> str:
+    """Return why the files of a bag cannot be read, which `text` says if they are MCAP."""
     for file in files:
         encoding = other_encoding(file)
         if encoding:
             return f'its messages are {encoding}, not CDR of ROS 2: {_remedy(encoding)}'
     if not any(file.stat().st_size for file in files):
-        text = NOTHING_RECORDED
-    elif not any(map(_has_magic, files)):
-        text = 'it is no MCAP file: give a bag'
-    else:
-        text += f'; to save the undamaged part: blf_dsc recover {path}'
-    return text
+        return NOTHING_RECORDED
+    if not any(map(_has_magic, files)):
+        return 'it is no MCAP file: give a bag'
+    return f'{text}; to save the undamaged part: blf_dsc recover {path}'
 
 
 def _missing(folder: Path) -> str:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 from blf_dsc_controller import __version__
 from blf_dsc_controller.commissioning import files, page, ripple_page
 from blf_dsc_controller.commissioning.commissioned import Commissioned
-from blf_dsc_controller.configuration.nodes import dump, read
+from blf_dsc_controller.configuration.nodes import dump, load_loop, read
+from sim_plant.settings import true_rotors
 
 _WIDTH = 98
 
@@ -49,7 +50,9 @@ class CommissionedFile(NamedTuple):
         lines = wrapped([origin, *found_out, *self.missing])
         if not found.has_margin:
             return Content(lines, {})
-        return Content(lines, files.of_commissioned(read(self.source), found))
+        arm = load_loop(self.source).plant if self.is_simulated else None
+        rotors = true_rotors(arm) if arm else None
+        return Content(lines, files.of_commissioned(read(self.source), found, rotors))
 
     def write(self, found: Commissioned, content: Content) -> None:
         """Write the file; with the table of the torque ripple, if it was looked for."""

@@ -29,6 +29,7 @@ from blf_dsc_controller.configuration.nodes import (
     load,
     locate,
 )
+from blf_dsc_controller.drive.drivers import is_in_network
 from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
@@ -170,7 +171,10 @@ def _configuration(path: str) -> Iterator[Finding]:
 
 
 def _network(address: str) -> Iterator[Finding]:
-    """Yield how long a robot's computer takes to answer."""
+    """Yield how long a robot's computer takes to answer, if there is one."""
+    if not is_in_network(address):
+        yield ok('robot', f'{address} is not in the network: `blf_dsc drive` asks it')
+        return
     ping = shutil.which('ping')
     if ping is None:
         yield note(

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from blf_dsc_controller.analysis.output import write_json
 from blf_dsc_controller.cli.result_folder import make_folder
+from blf_dsc_controller.cli.run import notes_on_ideal_arm
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import print_notice
@@ -29,8 +30,10 @@ def arms(options: Namespace) -> None:
     """Tune and run every law on URDF arms, write figures.json and print the table."""
     names = laws.chosen_laws(options.laws)  # before there is a folder
     for config in options.config:
-        controller = laws.trial(config, 0).controller
-        problems = (laws.unsuitable(each, controller) for each in names)
+        loop = laws.trial(config, 0)
+        for note in notes_on_ideal_arm(loop):
+            print_notice(f'note: {config}: {note}')
+        problems = (laws.unsuitable(each, loop.controller) for each in names)
         for problem in filter(None, problems):
             if options.laws:
                 raise BlfDscError(f'--config {config}, {problem}')
@@ -39,8 +42,10 @@ def arms(options: Namespace) -> None:
     with announced_compilation(print_notice):
         found = laws.compare(folder, options.config, options.laws)
     for arm, results in found.items():
+        load = laws.load_of(laws.trial(arm, 0))
         print(
-            f'{arm}: {laws.TRUTHS} runs of each law; errors in mrad, of the model in %'
+            f'{arm}: {laws.TRUTHS} runs of each law, {load:g} kg picked up at {laws.PICK_UP:g} s; '
+            'errors in mrad, of the model in %'
         )
         print(laws.format_results(results))
     print(f'wrote {options.out}: figures.json')

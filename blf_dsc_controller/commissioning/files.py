@@ -10,6 +10,7 @@ from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.configuration.files import Section
 from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, PLANT, STUDY
+from blf_dsc_controller.run import Floats
 
 _Values = Mapping[str, object]
 
@@ -28,12 +29,13 @@ def of_motion(sections: Sequence[Section], planned: Planned) -> dict[str, _Value
 
 
 def of_commissioned(
-    sections: Sequence[Section], found: Commissioned
+    sections: Sequence[Section], found: Commissioned, rotors: Floats | None = None
 ) -> dict[str, _Values]:
     """Return the sections of a file with what was measured in the place of guesses.
 
     Gains of the law that the file gives are left out, since they follow; so is a factor on the
-    rotors of the simulated arm, which those that were measured have.
+    rotors of the simulated arm, which those that were measured have.  An arm that was simulated
+    keeps its `rotors` (n,) [kg m^2]: they may follow from the guesses.
     """
     chosen = found.parameters()
     of_robot = {
@@ -41,6 +43,8 @@ def of_commissioned(
     }
     own = {name: value for name, value in chosen.items() if name not in of_robot}
     given = {'/**': of_robot, f'/**/{CONTROLLER}': own}
+    if rotors is not None:
+        given[f'/**/{PLANT}'] = {'truth.rotor_inertia': rotors.tolist()}
     return _with(sections, given, removed=(*FOLLOWED, 'truth.rotor_factor'))
 
 

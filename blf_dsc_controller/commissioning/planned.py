@@ -33,6 +33,8 @@ TRAVEL = 0.01
 POSTURES = 3
 """Postures of the reference in which an arm is measured, if nothing else is asked for."""
 
+_SAME = 0.01  # rad or m, between postures that show the same
+
 FROM_LIMITS = {TURNING: 0.05, SLIDING: 2.0 * TRAVEL}  # rad or m
 
 
@@ -73,7 +75,12 @@ def postures_of(
                 'that moves'
             )
         return here[None]
-    return np.asarray(along(config, count)[0])
+    found = np.asarray(along(config, count)[0])
+    distances = np.abs(found[:, None] - found).max(axis=2)
+    if distances[np.triu_indices(count, 1)].min(initial=np.inf) > _SAME:
+        return found
+    # One tone, all joints in phase: an arm passes its postures again on the way back.
+    return np.asarray(along(config, 4 * count)[0][1::4])
 
 
 def plan(

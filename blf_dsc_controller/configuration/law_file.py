@@ -157,7 +157,11 @@ def _load(place: Path, content: bytes) -> type:
         exec(code, vars(module))  # noqa: S102 - the user has named this file
     except Exception as error:
         del sys.modules[name]
-        raise BlfDscError(f'{place} cannot be imported: {error!r}') from error
+        raised = traceback.extract_tb(error.__traceback__)
+        lines = [f', line {at.lineno},' for at in raised if at.filename == str(place)]
+        where = f'{place}{lines[-1] if lines else ""}'  # a SyntaxError tells its line
+        told = f'{where} cannot be imported: {type(error).__name__}: {error}'
+        raise BlfDscError(told) from error
     law = getattr(module, 'LAW', None)
     problem = _problem(law) or _problem_of_memory(module, code)
     if problem:
@@ -189,15 +193,25 @@ def _problem_of_methods(law: type) -> str:
             return f'LAW.{name} must have the arguments {", ".join(arguments)}'
     if not hasattr(law, 'has_barrier'):
         return 'LAW does not say by has_barrier whether it keeps the error inside its bound'
+    if callable(law.has_barrier):
+        return 'LAW.has_barrier is a method: put @property above it'
     return ''
 
 
 def _problem_of_memory(module: ModuleType, code: CodeType) -> str:
-    """Return that a file uses `state.memory` without `MEMORY`, or nothing.
+    """Return what is wrong with `MEMORY` of a file, or nothing.
 
-    The memory would have no numbers, and what a law keeps would overwrite others.
+    Without it the memory has no numbers, and what a law keeps would overwrite others.
     """
-    if hasattr(module, 'MEMORY') or 'memory' not in _names_in(code):
+    if hasattr(module, 'MEMORY'):
+        for name, hint in typing.get_type_hints(module.MEMORY).items():
+            if hint in (int, float):
+                return (
+                    f'MEMORY.{name} is a number, which kernels cannot write: declare it as Cell '
+                    f'(from blf_dsc_controller.compiled.layout), and write memory.{name}[0]'
+                )
+        return ''
+    if 'memory' not in _names_in(code):
         return ''
     return (
         'state.memory is used, but there is no MEMORY, which says how many numbers it has: add '

@@ -445,14 +445,8 @@ class PlantConfig(ArmConfig):
                     )
         springs = joint.stiffness or (0.0,) * len(self.joints)
         for name in ('backlash', 'hysteresis'):
-            given = getattr(joint, name) or springs
-            rigid = [
-                each
-                for each, value, stiffness in zip(
-                    self.joints, given, springs, strict=True
-                )
-                if value and not stiffness
-            ]
+            of_joints = zip(self.joints, springs, getattr(joint, name), strict=False)
+            rigid = [each for each, spring, value in of_joints if value and not spring]
             if rigid:
                 yield (
                     f'joint.{name}: {", ".join(rigid)} without a spring: give '

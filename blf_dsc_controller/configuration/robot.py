@@ -330,12 +330,12 @@ def read_urdf(given: str) -> str:
         return mjcf.urdf_of_text(given) if mjcf.is_mjcf(given) else given
     if given.startswith(TOPIC):
         raise BlfDscError(
-            f'{given!r} is a topic, which only a node can read: save its message to a file '
-            '(`ros2 topic echo --once --field data`) and give that'
+            f'{given!r} is a topic, which only a node can read: save its message by `ros2 topic '
+            f'echo --once --field data {given.removeprefix(TOPIC)} > arm.urdf` and give this file'
         )
     try:
         path = resolve(given)
-        text = read_text(path)
+        text = read_text(path).removesuffix('\n---\n')  # which `ros2 topic echo` adds
     except FileNotFoundError as error:
         problem = f'{given!r} cannot be read: there is no {places_of(given)}'
         known = [each.name for each in (share_folder() / 'config').glob('*.urdf')]

@@ -46,6 +46,7 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...
 
 _NAMES = {bool: 'bool', int: 'integer', float: 'double', str: 'string'}
 _ARRAYS = (list, tuple, array.array)  # rclpy gives array.array
+_LONGEST = 200  # characters of a value in a message
 
 
 @dataclass(frozen=True)
@@ -109,31 +110,45 @@ class Parameter:
 
         Each problem names the parameter, what it got, and what is expected.
         """
-        article = 'an' if self.type is int and not self.is_array else 'a'
-        expected = f'but {article} {self.kind} is expected'
         if self.is_array and not isinstance(given, _ARRAYS):
-            example = self.default or ((given,) if isinstance(given, self.type) else ())
-            each = '' if self.default else ', an entry for each'
-            expected += f': write a list, like {format_value(example)}{each}'
-            yield f'{self.name}: got {format_value(given)}, {expected}'
+            yield self._mistyped(given, self._as_list(given))
             return
         entries = list(given) if self.is_array else [given]
         if not all(_is(entry, self.type) for entry in entries):
-            lacks_point = self.type is float and all(
-                _is(entry, int | float) for entry in entries
-            )
-            if lacks_point:
-                expected += ', with a decimal point'
-                expected += f': {DECIMAL_POINT}' if _alternate(entries) else ''
-            if self.type is str and not any(isinstance(each, str) for each in entries):
-                expected += ': write it in quotes'
-            if self.type is not str and any(isinstance(each, str) for each in entries):
-                expected += self._unquoted(entries)
-            yield f'{self.name}: got {format_value(given)}, {expected}'
+            yield self._mistyped(given, self._of_type(entries))
             return
         if not (entries or self.omittable or self.length):
             yield f'{self.name}: got an empty list, but at least one entry is needed'
         yield from self._entry_problems(entries)
+
+    def _mistyped(self, given: Any, remedy: str) -> str:
+        """Return the problem of a value of another type."""
+        article = 'an' if self.type is int and not self.is_array else 'a'
+        shown = format_value(given)
+        shown = f'{shown[:_LONGEST]} ...' if len(shown) > _LONGEST else shown
+        return (
+            f'{self.name}: got {shown}, but {article} {self.kind} is expected{remedy}'
+        )
+
+    def _as_list(self, given: Any) -> str:
+        """Return the remedy for a single value in the place of a list."""
+        example = self.default or ((given,) if isinstance(given, self.type) else ())
+        each = '' if self.default else ', an entry for each'
+        return f': write a list, like {format_value(example)}{each}'
+
+    def _of_type(self, entries: Sequence[Any]) -> str:
+        """Return the remedy for entries of another type, or nothing."""
+        if self.is_array and any(isinstance(each, _ARRAYS) for each in entries):
+            return ': write all entries as one list, row after row'
+        has_text = any(isinstance(each, str) for each in entries)
+        if self.type is str:
+            return '' if has_text else ': write it in quotes'
+        if has_text:
+            return self._unquoted(entries)
+        if self.type is float and all(_is(each, int | float) for each in entries):
+            comma = f': {DECIMAL_POINT}' if _alternate(entries) else ''
+            return f', with a decimal point{comma}'
+        return ''
 
     def _entry_problems(self, entries: Sequence[Any]) -> Iterator[str]:
         """Yield what is wrong with values of the right type, each mistake once."""
@@ -369,9 +384,13 @@ _ELSEWHERE = {
 def unknown(name: str, known: Iterable[str]) -> str:
     """Return the problem for an unknown name, suggesting the closest known one."""
     known = [*known]
-    ours = _ELSEWHERE.get(name.rpartition('.')[2].lower())
+    last = name.rpartition('.')[2].lower()
+    ours = _ELSEWHERE.get(last, last)
     if ours in known:
         return f'{name}: unknown parameter, did you mean {ours}?'
+    of_group = [each for each in known if each.startswith(f'{name}.')]
+    if of_group:
+        return f'{name}: a group, no parameter: give those in it by name, such as {of_group[0]}'
     return f'{name}: unknown parameter{suggestion(name, known)}'
 
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -245,13 +245,15 @@ class ArmController:
 
     def follow(
         self,
-        points: Sequence[TrajectoryPoint],
+        points: Sequence[Sequence[Any]],
         joints: Sequence[str] = (),
         begin: float | None = None,
     ) -> None:
         """Follow a trajectory.
 
-        Its values are in the order of `joints`, by default the arm's.
+        Each point is a `TrajectoryPoint`, or likewise its time [s], positions [rad], and perhaps
+        velocities [rad/s] and accelerations [rad/s^2], in the order of `joints`, by default the
+        arm's.
 
         It begins at once, or at the time `begin` [s] since the start.
 
@@ -262,17 +264,14 @@ class ArmController:
             LoopEndedError: the controller is closed.
         """
         self._check_open()
-        check_type('points', points, Sequence, 'give a list of TrajectoryPoint')
+        check_type('points', points, Sequence, 'give a list of points')
         names = tuple(joints) or self.joints
-        for point in points:
-            if not isinstance(point, TrajectoryPoint):
-                got = type(point).__name__
-                raise TrajectoryError(
-                    [
-                        f'got a {got}, but each point is a TrajectoryPoint(time, positions)'
-                    ]
-                )
-        trajectory = Trajectory(names, tuple(points), begin)
+        try:
+            given = tuple(_point(*point) for point in points)
+        except (TypeError, ValueError) as error:
+            expected = 'each point is a time and positions, as in (1.0, [0.1, 0.2])'
+            raise TrajectoryError([f'{error}; {expected}']) from error
+        trajectory = Trajectory(names, given, begin)
         guard = self._loop.guard
         plan = guard.motions.plan(trajectory)
         guard.motions.adopt(plan)
@@ -482,3 +481,9 @@ def _is_finite(stamp: float) -> bool:
         return math.isfinite(stamp)
     except TypeError:
         return False
+
+
+def _point(time: float, *values: Any) -> TrajectoryPoint:
+    """Return a point whose fields may be arrays; TypeError or ValueError if it is none."""
+    fields = (tuple(np.asarray(each, float).tolist()) for each in values)
+    return TrajectoryPoint(float(time), *fields)

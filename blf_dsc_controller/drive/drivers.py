@@ -77,6 +77,11 @@ def _check_kind(address: str, path: Path, settings: DriveConfig) -> None:
         )
 
 
+def is_in_network(address: str) -> bool:
+    """Whether an address is that of a computer, not of a CAN bus or the simulated arm."""
+    return address != SIMULATED and _BUS.match(address) is None
+
+
 def is_nearly_simulated(address: str) -> bool:
     """Return whether `simulated` was meant, as by sim, simulation or Simulated."""
     word = address.lower()

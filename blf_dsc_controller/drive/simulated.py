@@ -77,7 +77,8 @@ class SimulatedDriver(Driver):
         """Begin to wait for torques: those of an earlier run are forgotten, as no jump counts."""
         plant = self.plant
         now = plant_views(plant.arm, plant.settings, plant.state)[1]
-        now.drives.command[:] = 0.0  # the drives have held the arm themselves
+        # The drives have held the arm themselves, by their brakes.
+        now.drives.command[:] = now.drives.applied[:] = 0.0
         self._is_braked = True
         self._due = time.monotonic()
 

@@ -105,18 +105,35 @@ def _unknown_attribute(
     law: type, _source: ast.Module, match: re.Match[str]
 ) -> _Mistake:
     name, owner = match.groups()
-    for argument, layout in _ARGUMENTS.items():
+    memory = getattr(sys.modules[law.__module__], 'MEMORY', None)
+    layouts = _ARGUMENTS | ({'memory': memory} if memory else {})
+    for argument, layout in layouts.items():
         if owner == layout.__name__:
             return _unknown_field(argument, layout, name), None
     if owner == law.__name__:
-        gains = getattr(law, '_fields', ())
-        near = get_close_matches(name, gains, 1)
-        remedy = f'did you mean self.{near[0]}?' if near else 'declare it as a gain'
-        return f'{owner} has no gain {name}: {remedy}', None
-    return (
-        f'an array has no {name}: read what the law keeps as memory = memory_of(state.memory, '
-        'settings), with memory_of = view_of(Memory) at the top of the file'
-    ), None
+        return _unknown_gain(law, name), None
+    if owner == 'array':
+        return (
+            f'an array has no {name}: read what the law keeps as memory = memory_of(state.memory, '
+            'settings), with memory_of = view_of(Memory) at the top of the file'
+        ), None
+    if owner.startswith(('float', 'int')):
+        return f'a number has no {name}: of numbers, use min, max and math', None
+    return f'{owner} has no {name}', None
+
+
+def _unknown_gain(law: type, name: str) -> str:
+    near = get_close_matches(name, getattr(law, '_fields', ()), 1)
+    if near:
+        return f'{law.__name__} has no gain {name}: did you mean self.{near[0]}?'
+    if hasattr(law, name):
+        return (
+            f'the method {name} is not compiled: make it a function with @inner above it (from '
+            'blf_dsc_controller.compiled.jit import inner)'
+        )
+    if name in Settings._fields:
+        return f'{law.__name__} has no gain {name}: it is settings.{name}'
+    return f'{law.__name__} has no gain {name}: declare it as a gain'
 
 
 def _unknown_field(argument: str, layout: type, name: str) -> str:
@@ -162,10 +179,26 @@ def _allocates(_law: type, source: ast.Module, _match: re.Match[str]) -> _Mistak
     ), line or _line_with(source, 'np') or _line_with(source, 'numpy')
 
 
-def _set(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
+def _set(_law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
+    name = match[1]
+    line = _line_of(
+        source,
+        lambda node: (
+            isinstance(node, ast.Attribute)
+            and node.attr == name
+            and isinstance(node.ctx, ast.Store)
+        ),
+    )
     return (
-        f'{match[1]} cannot be set: write to entries of arrays, as signals.demand[i]; what the law '
+        f'{name} cannot be set: write to entries of arrays, as signals.demand[i]; what the law '
         'keeps is MEMORY'
+    ), line
+
+
+def _memory(_law: type, _source: ast.Module, _match: re.Match[str]) -> _Mistake:
+    return (
+        "memory_of takes settings only where MEMORY has a length of the arm, such as 'n': with "
+        'cells alone, write memory_of(state.memory)'
     ), None
 
 
@@ -178,13 +211,15 @@ def _other(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
 
 
 _Rule = Callable[[type, ast.Module, 're.Match[str]'], _Mistake]
+_NO_MATCH = r'No implementation of function .*? found for signature:\s+>>> '
 _RULES: dict[str, _Rule] = {
     r"Unknown attribute '(\w+)' of type (?:Reference\()?(\w+)": _unknown_attribute,
     r"NameError: name '(\w+)' is not defined": _undefined,
     r"Untyped global name '(\w+)':?.*?<class '(\w+)'>": _uncompiled,
-    r'No implementation of function .*? found for signature:\s+>>> (?!chosen)(.+)': _impossible,
+    rf'{_NO_MATCH}(?!chosen|generated)(.+)': _impossible,
+    rf'{_NO_MATCH}generated\(': _memory,
     r'allocates an array|NRT required but not enabled': _allocates,
-    r'Cannot resolve setattr: .*\.(\w+) = ': _set,
+    r'(?:Cannot resolve setattr:|No definition for lowering) .*\.(\w+) = ': _set,
     r"module '(\w+)' has no attribute '(\w+)'": _not_in_module,
     r'\(step: [^)]*\)\s+(\S.*)': _other,
 }

@@ -284,6 +284,11 @@ class Result:
         return np.asarray((np.array(rows) * units).T)
 
 
+def load_of(loop: LoopConfig) -> float:
+    """Return what the arm picks up [kg]: the largest load of its file, or the rated one."""
+    return max(loop.plant.events.payload, default=0.0) or loop.controller.robot.payload
+
+
 def trial(
     name: str, seed: int, overrides: Mapping[str, Mapping[str, Any]] | None = None
 ) -> LoopConfig:
@@ -295,7 +300,6 @@ def trial(
     """
     loop = load_loop(name, overrides)
     reference = loop.controller.reference
-    events = loop.plant.events
     if loop.controller.model != 'urdf' or reference.type != 'sinusoids':
         raise BlfDscError(
             f'--config {name}: got model {loop.controller.model} and reference {reference.type}, '
@@ -305,7 +309,7 @@ def trial(
         'duration': DURATION,
         'seed': seed,
         'truth.seed': loop.plant.truth.seed + seed,
-    } | pick_ups([PICK_UP], [max(events.payload, default=0.0)])
+    } | pick_ups([PICK_UP], [load_of(loop)])
     # No funnel, since the other laws have none: all approach the motion from rest.
     law = change(
         loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
