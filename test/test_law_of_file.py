@@ -132,6 +132,10 @@ IMPORTS = (
             'MEMORY.sum is a number, which kernels cannot write: declare it as Cell',
         ),
         (
+            METHODS + '    has_barrier = True\n\nMEMORY = 5',
+            'MEMORY is 5, no class whose parts have names',
+        ),
+        (
             METHODS + '    def has_barrier(self):\n        return True\n',
             'LAW.has_barrier is a method: put @property above it',
         ),

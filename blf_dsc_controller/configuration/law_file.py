@@ -204,6 +204,8 @@ def _problem_of_memory(module: ModuleType, code: CodeType) -> str:
     Without it the memory has no numbers, and what a law keeps would overwrite others.
     """
     if hasattr(module, 'MEMORY'):
+        if not isinstance(module.MEMORY, type):
+            return f'MEMORY is {module.MEMORY!r}, no class whose parts have names'
         for name, hint in typing.get_type_hints(module.MEMORY).items():
             if hint in (int, float):
                 return (
