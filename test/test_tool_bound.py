@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -247,6 +249,14 @@ def test_joint_bounds_follow_from_the_bound_at_the_tool(name):
         turned = certified(preset(name, **given).controller)
         assert turned[0] <= given.get('barrier.tool_bound', np.inf)
         assert 0.99 * angle / 2.0 < turned[1] <= angle / 2.0
+
+
+def test_warning_on_the_page_is_that_of_the_preset():
+    page = (Path(__file__).parents[1] / 'doc/tool_bound.md').read_text()
+    (shown,) = re.findall(r'```text\n(.*?)```', page, re.DOTALL)
+    given = {'barrier.tool_bound': 0.003, 'barrier.tool_angle_bound': 0.01}
+    warnings = config_warnings(preset('panda', **given).controller)
+    assert ' '.join(shown.split()) in warnings
 
 
 def test_configuration_with_its_joint_bounds_can_be_read_again(tmp_path):
