@@ -314,7 +314,8 @@ def test_command_after_a_gap_is_what_efforts_show_if_they_are_torques(effort):
     if effort in ('unknown', 'current'):
         assert held.command() is None
         return
-    np.testing.assert_allclose(held.command(), acting, atol=1e-12)
+    for _ in range(2):  # the measurement is left as it is
+        np.testing.assert_allclose(held.command(), acting, atol=1e-12)
     held.after_gap[14:] = 1e3 * np.sign(acting - 4.5)
     limit = settings.torque.limit
     np.testing.assert_array_equal(held.command(), limit * np.sign(acting - 4.5))
