@@ -214,6 +214,30 @@ def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
     np.testing.assert_array_equal(rig.guard.safe_torque.load, observed)
 
 
+def test_stopped_arm_is_held_by_what_was_learned():
+    """The initial estimate is half of the truth, which is known by now."""
+    given = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.0}
+    rig = Rig(given, plant={'disturbance.constant': [0.0, 0.0]})
+    rig.step(200)
+    rig.guard.estimates.estimate[:3] = P
+    torque = rig.guard.fail('why')
+    np.testing.assert_allclose(torque, weight(rig.state().q), atol=1.0)
+
+
+def test_deactivated_arm_is_held_although_its_model_is_wrong():
+    """From the first torque on, by the load that its last motion shows."""
+    half = {'learning.initial_estimate': (0.5 * P).tolist(), 'learning.weight': 0.0}
+    rig = Rig(
+        half | {'safety.torque': 'hold_gravity'},
+        plant={'disturbance.constant': [0.0, 0.0]},
+    )
+    rig.step(500)
+    rig.guard.deactivate()
+    lacking = 0.5 * weight(rig.state().q)
+    assert np.abs(lacking).min() > 1.0
+    np.testing.assert_allclose(rig.guard.safe_torque.load, lacking, atol=1.0)
+
+
 def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
     """Without motion, the commanded torque says nothing about the load."""
     ramp = SafeTorque(2)
