@@ -78,7 +78,8 @@ def test_a_remainder_beyond_its_range_leaves_the_torque_alone():
     far = Motion(q + 0.5, q)
     gains = Gains(np.full(7, 400.0), np.ones(7))
     frame = split(q + 1.0, Motion(q, q), far, far, gains, RANGES)
-    assert not (frame.stiffness.any() or frame.damping.any())
+    assert not frame.stiffness.any()
+    assert not frame.damping.any()
     np.testing.assert_allclose(frame.torque, 1.0, atol=0.5 * RANGES.torque.step.max())
 
 
