@@ -220,8 +220,10 @@ def test_stopped_arm_is_held_by_what_was_learned():
     rig = Rig(given, plant={'disturbance.constant': [0.0, 0.0]})
     rig.step(200)
     rig.guard.estimates.estimate[:3] = P
-    torque = rig.guard.fail('why')
-    np.testing.assert_allclose(torque, weight(rig.state().q), atol=1.0)
+    needed = weight(rig.state().q)
+    unlearned = rig.guard.held.load_before_learning()
+    np.testing.assert_allclose(unlearned, 0.5 * needed, atol=1.0)
+    np.testing.assert_allclose(rig.guard.fail('why'), needed, atol=1.0)
 
 
 def test_deactivated_arm_is_held_although_its_model_is_wrong():
