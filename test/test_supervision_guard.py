@@ -224,6 +224,20 @@ def test_stopped_arm_is_held_by_what_was_learned():
     unlearned = rig.guard.held.load_before_learning()
     np.testing.assert_allclose(unlearned, 0.5 * needed, atol=1.0)
     np.testing.assert_allclose(rig.guard.fail('why'), needed, atol=1.0)
+    carried = rig.guard.safe_stop.carried(rig.config.safety)  # after a reset
+    np.testing.assert_allclose(carried, 0.5 * needed, atol=1.0)
+
+
+def test_safe_torque_follows_what_the_law_finds_of_rotors_and_encoders():
+    guard = Guard(ControllerConfig())
+    found, used = guard.controller, guard.safe_torque
+    for law, stop in (
+        (found.state.rotors.gain_scale, used.scale),
+        (found.checks.sensor.noise[:2], used.noise),
+        (found.checks.sensor.resolution, used.resolution),
+    ):
+        law[:] = 0.25
+        assert (stop == 0.25).all()
 
 
 def test_deactivated_arm_is_held_although_its_model_is_wrong():
