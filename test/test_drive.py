@@ -310,11 +310,17 @@ def test_command_after_a_gap_is_what_efforts_show_if_they_are_torques(effort):
     acting = np.arange(1.0, 8.0)
     added = added_torque(settings.torque, q) if effort == 'whole' else np.zeros(7)
     assert held.command() is None
+    guard.estimates.disturbance[:] = acting
+    np.testing.assert_array_equal(held.load(), acting)  # which is all that is known
     held.after_gap = np.concatenate((q, np.zeros(7), acting + added))
     if effort in ('unknown', 'current'):
         assert held.command() is None
         return
-    np.testing.assert_allclose(held.command(), acting, atol=1e-12)
+    for _ in range(2):  # the measurement is left as it is
+        np.testing.assert_allclose(held.command(), acting, atol=1e-12)
+    whole = acting + added_torque(settings.torque, q)
+    model = gravity_torque(settings, guard.estimates.estimate, q)
+    np.testing.assert_allclose(held.load(), whole - model, atol=1e-9)
     held.after_gap[14:] = 1e3 * np.sign(acting - 4.5)
     limit = settings.torque.limit
     np.testing.assert_array_equal(held.command(), limit * np.sign(acting - 4.5))

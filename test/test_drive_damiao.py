@@ -157,8 +157,10 @@ def test_at_the_end_the_motors_hold_or_are_disabled(made, feedback):
 def test_at_the_end_the_motors_are_disabled_where_that_is_wanted(made):
     driver = made(at_end='release')
     run(driver, 0.3)
-    driver.positions()  # all frames have been taken
-    assert set(driver.motors.status) == {Status.DISABLED}
+    driver.start()
+    driver.read()  # which says if one is not enabled again
+    driver.finish()
+    wait_for(lambda: set(driver.motors.status) == {Status.DISABLED})
 
 
 def fail(joint, status):
@@ -218,7 +220,8 @@ def test_lost_answers_are_bridged_and_a_silent_motor_ends_the_run(made, monkeypa
     for _ in range(3):  # they have got the frames before
         driver.positions()
     assert_holds(driver.motors.frame)
-    assert run(driver, 0.1).end is End.DURATION  # what was lost before counts no more
+    driver.start()
+    assert not driver._missed.any()  # what was lost before counts no more
 
 
 def test_a_bus_is_left_before_it_is_opened_again(made, monkeypatch):
@@ -247,10 +250,10 @@ def test_states_after_a_start_and_after_no_torque_are_measured(made):
     driver = made()
     for _ in range(2):
         driver.start()
-        driver.read()
+        first = driver.read()
         assert not driver._missed.any()
         driver.write(None)
-        driver.read()
+        assert driver.read().stamp == pytest.approx(first.stamp + 0.004)  # s
         assert not driver._missed.any()
 
 
@@ -294,6 +297,23 @@ def test_another_client_on_the_bus_ends_the_run_and_the_motors_hold(made):
     assert_holds(driver.motors.frame)
 
 
+def test_another_program_that_writes_registers_is_noticed(made):
+    driver = made()
+    write = 0x55  # of another program, to the register of the time-out
+    data = damiao.request_data(1, write, Register.TIMEOUT)
+    send_from_elsewhere(driver, damiao.TO_ALL, data)
+    with pytest.raises(DriverError, match=r'another program commands.*0x7ff'):
+        driver.positions()
+
+
+def test_motor_that_falls_silent_before_the_start_is_named(made):
+    driver = made()
+    driver.motors.mute = {2}
+    driver._motors.patience = 0.2  # s
+    with pytest.raises(DriverError, match=r'motor 0x03 of .*joint3.*: no answer'):
+        driver.start()
+
+
 def test_answer_that_comes_too_late_is_none_to_the_next_frame(made):
     """Else the loop would be a period behind this motor from then on."""
     driver = made()
@@ -303,14 +323,18 @@ def test_answer_that_comes_too_late_is_none_to_the_next_frame(made):
     send_from_elsewhere(driver, 0x17, damiao.state_data(late))
     driver.write_frame(torque_alone(np.zeros(7)))
     np.testing.assert_allclose(driver.read().q, before.q, atol=0.01)  # rad, in 4 ms
+    send_from_elsewhere(driver, 0x17, damiao.state_data(late))
+    np.testing.assert_allclose(driver.positions(), before.q, atol=0.01)
 
 
 def test_frames_of_other_devices_and_those_that_are_cut_are_left_out(made):
-    def stray(driver):
-        send_from_elsewhere(driver, 0x123, bytes(8))
-        send_from_elsewhere(driver, 0x11, bytes(3))
-
-    assert run(made(at={20: stray}), 0.2).end is End.DURATION
+    driver = made()
+    driver.start()
+    before = driver.read()
+    send_from_elsewhere(driver, 0x123, bytes(8))
+    send_from_elsewhere(driver, 0x11, bytes(3))
+    driver._motors.ask()
+    np.testing.assert_allclose(driver.read().q, before.q, atol=0.01)  # rad
 
 
 @pytest.mark.parametrize(
@@ -426,8 +450,9 @@ TURNED = {
 def test_motors_that_turn_the_other_way_from_another_zero_get_and_send_theirs(made):
     """Bytes of both directions, as damiao-motor codes them for motors at d q + o."""
     theirs = pytest.importorskip('damiao_motor.core.motor').DaMiaoMotor
-    driver = made(**TURNED)
+    driver = made(can_fd=True, **TURNED)
     d, o = np.array(TURNED['motor_directions']), np.array(TURNED['motor_offsets'])
+    np.testing.assert_allclose(driver.ranges.position.most, 12.5 - d * o)
     channel = driver.address.partition(':')[2]
     q, dq, torque = np.random.default_rng(4).uniform(-0.9, 0.9, (3, 7))
     kp, kd = np.full(7, 100.0), np.full(7, 1.0)
@@ -436,6 +461,9 @@ def test_motors_that_turn_the_other_way_from_another_zero_get_and_send_theirs(ma
         driver.write_frame(Frame(q, dq, kp, kd, torque))
         seen = [spy.recv(lockstep_damiao.PATIENCE) for _ in range(14)]
         state = driver.read()
+    sent = [each for each in seen if each.arbitration_id <= 7]
+    assert all(each.is_fd and each.bitrate_switch for each in sent)
+    assert not any(each.is_extended_id for each in sent)
     data = {each.arbitration_id: bytes(each.data) for each in seen}
     assert len(data) == 14
     for i in range(7):

@@ -50,6 +50,8 @@ def test_sum_of_a_frame_is_the_torque_up_to_the_rounding_of_the_last_field():
         gains = Gains(random.uniform(0.0, 700.0, 7), random.uniform(0.0, 7.0, 7))
         torque = random.uniform(-0.5, 0.5, 7) * TORQUE
         frame = split(torque, Motion(q, dq), reference, reference, gains, RANGES)
+        for field, values in zip(RANGES, frame, strict=True):  # as it is sent
+            np.testing.assert_allclose(values, field.nearest(values), atol=1e-12)
         off = np.abs(frame.torque_at(q, dq) - torque)
         assert (off <= 0.5 * RANGES.torque.step + 1e-12).all()
         whole = frame.stiffness > 0.0
@@ -74,8 +76,10 @@ def test_mean_torque_of_an_arm_that_follows_is_that_of_the_law():
 def test_a_remainder_beyond_its_range_leaves_the_torque_alone():
     q = np.zeros(7)
     far = Motion(q + 0.5, q)
-    frame = split(q + 1.0, Motion(q, q), far, far, Gains(np.full(7, 400.0), q), RANGES)
-    assert (frame.stiffness == 0.0).all()
+    gains = Gains(np.full(7, 400.0), np.ones(7))
+    frame = split(q + 1.0, Motion(q, q), far, far, gains, RANGES)
+    assert not frame.stiffness.any()
+    assert not frame.damping.any()
     np.testing.assert_allclose(frame.torque, 1.0, atol=0.5 * RANGES.torque.step.max())
 
 

@@ -395,6 +395,7 @@ def test_states_before_the_first_start_are_not_back_after_a_silence():
     rig.guard.deactivate()
     rig.step(2)
     assert not rig.commands
+    assert rig.guard.release() is None
     assert not rig.guard.silenced
     assert not rig.supervisor.text
 
@@ -419,14 +420,12 @@ def test_messages_that_cannot_be_read_are_no_silence():
     assert len(rig.commands) == 220
 
 
-def test_messages_of_another_arm_hide_no_silence():
-    rig = Rig(HOLDING, live=True)
-    rig.step(20)
+def test_messages_of_another_arm_are_counted():
+    rig = Rig()
     other = JointStateEncoder(('left', 'right'))
-    rig.sense = lambda state: [state.raw(other)]
-    rig.step(100)
-    assert rig.supervisor.reason is Reason.STATE_TIMEOUT
-    assert rig.guard.foreign == 100
+    rig.sense = lambda state: [state.raw(other), state.raw()]
+    rig.step(3)
+    assert rig.guard.foreign == 3
 
 
 CALLS = {
@@ -545,6 +544,16 @@ def test_last_torque_is_the_safe_torque_of_an_arm_at_rest(safety, on_a_ramp):
         torque, holding if safety == 'hold_gravity' else [0.0, 0.0]
     )
     assert np.abs(load).min() > 0.01
+
+
+def test_end_says_whether_the_arm_rests():
+    """Else a watchdog would leave an arm in motion to itself."""
+    rig = moving(LEARNED)
+    rig.guard.deactivate()
+    for rests in (False, True):
+        rig.guard.release()
+        assert rig.guard.journal.pending[-1].content == {'resting': rests}
+        rig.step(4000)
 
 
 def test_arm_settles_after_a_deactivation():

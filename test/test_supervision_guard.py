@@ -28,6 +28,7 @@ from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.plan import LatePlanError
+from blf_dsc_controller.supervision.recent_motion import RecentMotion
 from blf_dsc_controller.supervision.retuning import apply, apply_bumpless
 from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_stop import SafeStop
@@ -208,6 +209,49 @@ def test_stopped_arm_rests_although_its_model_may_be_wrong(factor, angle):
     assert np.abs(rig.state().q - start).max() < angle
     assert np.abs(rig.state().dq).max() < 0.02
     np.testing.assert_allclose(rig.commands[-1], weight(rig.state().q), atol=0.15)
+    observed = rig.guard.safe_torque.load.copy()
+    rig.guard.deactivate()  # which goes on to hold it
+    np.testing.assert_array_equal(rig.guard.safe_torque.load, observed)
+
+
+def test_stopped_arm_is_held_by_what_was_learned():
+    """The initial estimate is half of the truth, which is known by now."""
+    given = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.0}
+    rig = Rig(given, plant={'disturbance.constant': [0.0, 0.0]})
+    rig.step(200)
+    rig.guard.estimates.estimate[:3] = P
+    needed = weight(rig.state().q)
+    unlearned = rig.guard.held.load_before_learning()
+    np.testing.assert_allclose(unlearned, 0.5 * needed, atol=1.0)
+    np.testing.assert_allclose(rig.guard.fail('why'), needed, atol=1.0)
+    carried = rig.guard.safe_stop.carried(rig.config.safety)  # after a reset
+    np.testing.assert_allclose(carried, 0.5 * needed, atol=1.0)
+
+
+def test_safe_torque_follows_what_the_law_finds_of_rotors_and_encoders():
+    guard = Guard(ControllerConfig())
+    found, used = guard.controller, guard.safe_torque
+    for law, stop in (
+        (found.state.rotors.gain_scale, used.scale),
+        (found.checks.sensor.noise[:2], used.noise),
+        (found.checks.sensor.resolution, used.resolution),
+    ):
+        law[:] = 0.25
+        assert (stop == 0.25).all()
+
+
+def test_deactivated_arm_is_held_although_its_model_is_wrong():
+    """From the first torque on, by the load that its last motion shows."""
+    half = {'learning.initial_estimate': (0.5 * P).tolist(), 'learning.weight': 0.0}
+    rig = Rig(
+        half | {'safety.torque': 'hold_gravity'},
+        plant={'disturbance.constant': [0.0, 0.0]},
+    )
+    rig.step(500)
+    rig.guard.deactivate()
+    lacking = 0.5 * weight(rig.state().q)
+    assert np.abs(lacking).min() > 1.0
+    np.testing.assert_allclose(rig.guard.safe_torque.load, lacking, atol=1.0)
 
 
 def test_load_is_bounded_and_left_as_it_is_while_brakes_hold_the_arm():
@@ -948,6 +992,32 @@ def test_each_stop_counts_the_time_anew_for_which_the_arm_is_faster():
         faster = 2.0 * at_stop + 0.51
         found = [speed.observe(faster, 0.1) for _ in range(4)]
         assert found == [False, False, True, False]
+
+
+BREAKS = {
+    'gap': (50 * MILLISECOND, 0.0),
+    'earlier stamp': (-MILLISECOND, 0.0),
+    'torque that is no number': (MILLISECOND, np.nan),
+}
+
+
+@pytest.mark.parametrize('what', [*BREAKS, 'restart'])
+def test_load_by_the_last_motion_is_unknown_after_a_break(what):
+    """Of an arm that stands still and carries 1 N m more than its model."""
+    recent = RecentMotion(2, 1e-3)
+    state = np.concatenate((Q, np.zeros(4)))
+    for k in range(recent.size):
+        assert recent.load(settings(), P) is None
+        recent.take((1 + k) * MILLISECOND, state, weight(Q) + 1.0)
+    np.testing.assert_allclose(recent.load(settings(), P), 1.0)
+    if what == 'restart':
+        recent.restart()
+    else:
+        later, torque = BREAKS[what]
+        stamp = recent.size * MILLISECOND + later
+        recent.take(stamp, state, np.full(2, torque))
+        recent.take(stamp + MILLISECOND, state, weight(Q))
+    assert recent.load(settings(), P) is None
 
 
 def test_load_known_at_the_stop_is_that_of_the_last_ramp():

@@ -262,6 +262,7 @@ def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted
     before = build(ControllerConfig, given)
     after = change(before, changed)
     loop = ByHand(ros, before)
+    watchdog = loop.watchdog
     loop.go_on(0.05, commands=True)
     yesterday = loop.torque()
     loop.go_on(0.01, commands=True)
@@ -276,6 +277,7 @@ def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted
     limited = np.clip(loop.holding, *np.outer((-1.0, 1.0), after.torque.limit))
     np.testing.assert_allclose(today, limited, atol=0.1)
     assert np.abs(today - yesterday).min() > 0.5
+    assert loop.watchdog is watchdog  # and knows what it has observed
 
 
 def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(ros):
@@ -360,6 +362,32 @@ def test_watchdog_takes_over_from_a_controller_that_ends_in_motion(ros, monkeypa
     loop.go_on(0.01, commands=True)
     ros.until(lambda: len(periods) > 1)
     assert periods == [0.001, 0.004]
+
+
+def test_watchdog_stands_down_for_a_controller_that_leaves_no_torque(ros):
+    """Whether the arm moves or not: nobody holds it."""
+    loop = ByHand(ros, build(ControllerConfig, {'safety.torque': 'zero'}))
+    loop.go_on(0.02, commands=True)
+    loop.note(EventType.RELEASE, resting=False)
+    loop.go_on(0.2, commands=False)
+    assert loop.watchdog.takeovers == 0
+    assert loop.node.status().text == 'the controller is silent on purpose'
+
+
+def test_watchdog_watches_the_arm_of_the_next_controller(ros):
+    """It has other joints, and waits for the one before to end."""
+    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
+    first = loop._events
+    other = build(ControllerConfig, OTHER_FILES['the file of another arm'])
+    loop.restart(other, starts=False)
+    loop._events = first
+    loop.note(ENDED[0], **ENDED[1])
+    loop.pause(0.1)
+    ros.until(lambda: loop.watchdog.config == other)
+    loop._encoder = JointStateEncoder(other.joints)
+    loop.go_on(0.02, commands=True)
+    assert np.abs(loop.torque()).min() > 0.5
 
 
 REFUSED = EventType.STOP, {'reason': 'start rejected', 'text': 'of the test'}
@@ -501,11 +529,18 @@ def test_journal_that_cannot_be_read_is_reported_and_ends_nothing(ros):
         )
 
     loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop.go_on(0.02, commands=True)
     ros.until(lambda: journal.get_subscription_count() == 1)
     journal.publish(String(data='{"of": "another version"}'))
     ros.until(lambda: reported('acts by the parameters from before'))
+    loop.note(EventType.RESET)
+    assert not loop.node.problem
     loop.note(EventType.PARAMETERS, parameters={'torque.limit': 'none'})
     assert not loop.node.finished
+    assert loop.node.problem
+    loop.note(EventType.PARAMETERS, parameters={'safety.fade_time': 0.3})
+    assert loop.watchdog.config.safety.fade_time == 0.3
+    assert not loop.node.problem
     loop.go_on(0.02, commands=True)
     assert np.abs(loop.torque()).min() > 0.5
 

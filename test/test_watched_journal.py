@@ -9,6 +9,7 @@ from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.supervision.watched_journal import Meaning, WatchedJournal
 
 FIRST, OTHER = {'safety.damping': 1.0}, {'safety.damping': 2.0}
+CHANGE = {'torque.limit': 9.0}
 
 
 def event(kind, number=0, commands=0, **content):
@@ -55,10 +56,29 @@ def test_parameters_of_a_second_controller_count_from_its_start_on(journal):
     assert journal.take(configure(OTHER), is_engaged=True) is Meaning.NOTHING
     activate = event(EventType.ACTIVATE, 1)
     assert journal.take(activate, is_engaged=True) is Meaning.NOTHING
+    changed = event(EventType.PARAMETERS, 2, parameters=CHANGE)
+    assert journal.take(changed, is_engaged=True) is Meaning.NOTHING
     assert journal.parameters == FIRST
-    start = event(EventType.START, 2, resumed=False)
+    start = event(EventType.START, 3, resumed=False)
     assert journal.take(start, is_engaged=True) is Meaning.BACK
-    assert journal.parameters == OTHER
+    assert journal.parameters == OTHER | CHANGE
+
+
+@pytest.mark.parametrize('commands', [0, 100])
+def test_change_of_parameters_leaves_the_others_as_they_are(journal, commands):
+    changed = event(EventType.PARAMETERS, 1, commands, parameters=CHANGE)
+    journal.take(changed, is_engaged=False)
+    journal.adopt_next()
+    assert journal.parameters == FIRST | CHANGE
+
+
+def test_change_of_parameters_of_which_the_others_are_unknown_does_not_count():
+    """Else they would be the defaults: those of another arm."""
+    journal = WatchedJournal()
+    journal.take(
+        event(EventType.PARAMETERS, 7, 100, parameters=CHANGE), is_engaged=True
+    )
+    assert not journal.parameters
 
 
 @pytest.mark.parametrize(

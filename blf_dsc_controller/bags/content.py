@@ -117,6 +117,23 @@ class Content:
         of_events = (event.content.get('version', '') for _, event in self.events)
         return next(of_events, '')
 
+    def joints_of(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Return the names that these joints have in its states.
+
+        Raises:
+            BlfDscError: as for `NameMap.joints_of`, or a joint is mapped to a name that no
+                state has.
+        """
+        found = self.names.joints_of(joints)
+        named = set().union(*self.topics[topics.JOINT_STATES].name_lists())
+        for joint, theirs in self.names.joints.items():
+            if theirs not in named:
+                reason = (
+                    f'the joint states have no {theirs}, but {", ".join(sorted(named))}'
+                )
+                raise _bad_entry(f'{joint}={theirs}', reason)
+        return found
+
     @property
     def losses(self) -> dict[str, str]:
         """Missing messages of the loop's streams, which have one publisher each."""

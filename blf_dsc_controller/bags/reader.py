@@ -74,7 +74,7 @@ def recorded_run(
     Its `Values` are read when needed, unless `loaded` reads them into memory.
     """
     joints = _joints(content)
-    run = single_run(content, content.names.joints_of(joints))
+    run = single_run(content, content.joints_of(joints))
     stamp = run.states.stamp
     begin, end = run.received
     events = [event for at, event in content.events if begin <= at < end]

@@ -77,7 +77,6 @@ class DamiaoMotors:
         """
         self.close()  # what was lost: some adapters are open once at a time
         self._open = CanBus(self._address, (*self._ids, damiao.TO_ALL), fd=self._fd)
-        self._bus.clear()
         for joint, mode in enumerate(self.registers(Register.MODE)):
             if mode != damiao.MIT:
                 raise DriverError(

@@ -62,7 +62,7 @@ def read_bag(
     messages = content.topics[JOINT_STATES]
     named = messages.name_lists()
     joints = tuple(joints) or _arm_joints(text, set().union(*named), names)
-    theirs = names.joints_of(joints)
+    theirs = content.joints_of(joints)
     groups = _groups(theirs, named)
     source = f'effort of {messages.name}'
     if not _has_stamps(messages, groups[0]):

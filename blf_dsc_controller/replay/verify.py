@@ -135,7 +135,7 @@ def _rerun(
         BlfDscError: the first state is missing, or an event cannot be repeated.
     """
     states, errors = content.topics[topics.JOINT_STATES].readable_states(
-        content.names.joints_of(config.joints), ('position',)
+        content.joints_of(config.joints), ('position',)
     )
     _check_first_state(content.path, events, states)
     messages = content.topics[topics.TRACKING_ERROR]

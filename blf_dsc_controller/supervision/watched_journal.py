@@ -14,7 +14,7 @@ from typing import Any
 from blf_dsc_controller.messages.journal import Event, EventType
 
 Parameters = dict[str, Any]
-_BACK_IN_COMMAND = (EventType.CONFIGURE, EventType.ACTIVATE, EventType.RESET)
+_BACK_IN_COMMAND = (EventType.ACTIVATE, EventType.RESET)
 
 
 class Meaning(Enum):
