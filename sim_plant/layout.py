@@ -47,6 +47,7 @@ class Disturbance(NamedTuple):
     ripple: Annotated[Array, 'n']  # N m
     ripple_frequency: float  # rad/rad
     load_share: float  # additional Coulomb friction, relative to the load on the gear
+    load_asymmetry: float  # of this share: more where the motor drives the load
     warm_factor: float  # friction in the end, relative to that at the start
     warm_samples: float  # samples in which 63 % of this change has happened
 

@@ -131,9 +131,13 @@ def attach_load(plant: PlantSettings, now: PlantState) -> None:
 def dry_friction(
     plant: PlantSettings, now: PlantState, i: int, dq: float, load: float
 ) -> float:
-    """Return Coulomb and Stribeck friction [N m] of a joint, with a load [N m] on its gear."""
+    """Return Coulomb and Stribeck friction [N m] of a joint, with a load [N m] on its gear.
+
+    The motor drives the load where this has the sign of the velocity.
+    """
     given = plant.disturbance
-    level = now.acting.coulomb[i] + given.load_share * abs(load)
+    driven = given.load_asymmetry * (load if dq > 0.0 else -load)
+    level = now.acting.coulomb[i] + given.load_share * (abs(load) + driven)
     if level == 0.0:
         return 0.0
     if given.stribeck != 0.0:

@@ -93,7 +93,9 @@ class MujocoPlant(Plant):
         speed = data.qvel / friction.stribeck_velocity
         self.model.dof_damping[:] = acting.viscous
         self.model.dof_frictionloss[:] = acting.coulomb
-        self.model.dof_frictionloss += friction.load_share * np.abs(now.drives.whole)
+        torque = now.drives.whole
+        driven = friction.load_asymmetry * torque * np.sign(data.qvel)
+        self.model.dof_frictionloss += friction.load_share * (abs(torque) + driven)
         self.model.dof_frictionloss *= 1.0 + friction.stribeck * np.exp(-(speed**2))
         data.xfrc_applied[self._tip.id, :3] = self._to_world @ acting.force
         wave = friction.amplitude * np.sin(

@@ -164,7 +164,8 @@ def _friction_slope(config: PlantConfig) -> np.ndarray:
         np.reshape(each or 0.0, (-1, n) if each else (1, 1)).max(axis=0)
         for each in (events.viscous, events.coulomb)
     )
-    load = given.load_share * np.array(config.actuator.torque_limit)
+    share = given.load_share * (1.0 + abs(given.load_asymmetry))
+    load = share * np.array(config.actuator.torque_limit)
     slope = (
         (np.array(given.coulomb) + coulomb + load)
         * (1.0 + given.stribeck)

@@ -77,12 +77,14 @@ class Written:
         viscous=0.0,
         coulomb=0.0,
         share=0.0,
+        asymmetry=0.0,
         play=0.0,
         loop=(),
         most=0.0,
         sensor=(1.0, 0.0),
     ):
-        self.viscous, self.coulomb, self.share = viscous, coulomb, share
+        self.viscous, self.coulomb = viscous, coulomb
+        self.driving, self.driven = share * (1.0 + asymmetry), share * (1.0 - asymmetry)
         self.play, self.loop, self.most = play, loop, most
         self.factor, self.offset = sensor
 
@@ -102,7 +104,8 @@ class Written:
         if self.most:
             dz = K * (dtheta - dq) * (1.0 - np.sign(dtheta - dq) * z / self.most)
         s = spring + damper
-        level = self.coulomb + self.share * abs(s)
+        share = self.driving if s * dtheta > 0.0 else self.driven
+        level = self.coulomb + share * abs(s)
         friction = self.viscous * dtheta + level * np.tanh(dtheta / 0.5)
         du = 0.0
         motor = torque
@@ -146,6 +149,14 @@ def start_of(play=0.0):
         ),
         (
             {
+                'disturbance__load_share': 0.1,
+                'disturbance__load_asymmetry': 0.6,
+                'disturbance__coulomb_velocity': 0.5,
+            },
+            Written(share=0.1, asymmetry=0.6),
+        ),
+        (
+            {
                 'actuator__loop_gain': 4.0,
                 'actuator__loop_damping': 8e-3,
                 'actuator__loop_lag': 3e-4,
@@ -165,7 +176,10 @@ def start_of(play=0.0):
         ({'joint__backlash': [2e-3]}, Written(play=1e-3)),
         ({'joint__hysteresis': [2.0]}, Written(most=2.0)),
     ],
-    ids=['spring', 'friction', 'torque loop', 'sensor', 'backlash', 'hysteresis'],
+    ids=[
+        *('spring', 'friction', 'friction by the direction of the torque'),
+        *('torque loop', 'sensor', 'backlash', 'hysteresis'),
+    ],
 )
 def test_joint_with_a_spring_moves_as_an_independent_integration_says(given, written):
     """To a thousandth of the largest excursion of each quantity: the steps are 25 us."""

@@ -114,6 +114,16 @@ def test_friction_grows_with_the_torque_of_the_drive():
     np.testing.assert_allclose(disturbance, level * np.tanh(dq / 0.01), rtol=1e-13)
 
 
+def test_gear_may_lose_more_where_the_motor_drives_the_load():
+    """By 0.6 of the share of 5 %, and as much less where the load drives the motor."""
+    arm = plant(velocity=(0.3, -0.2), load_share=0.05, load_asymmetry=0.6)
+    arm.step(TORQUE)
+    _, disturbance, _, dq = np.split(arm.truth(), [3, 5, 7])
+    assert dq[0] > 0.0 > dq[1]  # TORQUE brakes the first joint, and drives the second
+    level = np.array([0.02, 0.08]) * np.abs(TORQUE)
+    np.testing.assert_allclose(disturbance, level * np.tanh(dq / 0.01), rtol=1e-13)
+
+
 def test_friction_changes_as_the_arm_gets_warm():
     """To half of it, with a time constant of 0.2 s; drives compensate what there is."""
     arm = plant(

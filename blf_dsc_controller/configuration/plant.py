@@ -211,6 +211,13 @@ class PlantDisturbance:
     load_share: float = non_negative(
         0.0, 'Coulomb friction that grows with the torque on the gear, relative to it'
     )
+    load_asymmetry: float = parameter(
+        0.0,
+        'how much larger this share is where the motor drives the load, and smaller where the '
+        'load drives the motor, relative to it',
+        at_least=-1.0,
+        at_most=1.0,
+    )
     warm_factor: float = positive(
         1.0, 'friction of the warm arm, relative to that at the start'
     )
