@@ -50,8 +50,9 @@ class CommissionedFile(NamedTuple):
         lines = wrapped([origin, *found_out, *self.missing])
         if not found.has_margin:
             return Content(lines, {})
-        arm = load_loop(self.source).plant if self.is_simulated else None
-        rotors = true_rotors(arm) if arm else None
+        rotors = None
+        if self.is_simulated:
+            rotors = true_rotors(load_loop(self.source).plant)
         return Content(lines, files.of_commissioned(read(self.source), found, rotors))
 
     def write(self, found: Commissioned, content: Content) -> None:
