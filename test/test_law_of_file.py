@@ -132,6 +132,11 @@ IMPORTS = (
             'MEMORY.sum is a number, which kernels cannot write: declare it as Cell',
         ),
         (
+            METHODS
+            + '    has_barrier = True\n\nclass MEMORY(NamedTuple):\n    sum: "Arry"',
+            "MEMORY cannot be read: name 'Arry' is not defined",
+        ),
+        (
             METHODS + '    has_barrier = True\n\nMEMORY = 5',
             'MEMORY is 5, no class whose parts have names',
         ),

@@ -206,7 +206,11 @@ def _problem_of_memory(module: ModuleType, code: CodeType) -> str:
     if hasattr(module, 'MEMORY'):
         if not isinstance(module.MEMORY, type):
             return f'MEMORY is {module.MEMORY!r}, no class whose parts have names'
-        for name, hint in typing.get_type_hints(module.MEMORY).items():
+        try:
+            hints = typing.get_type_hints(module.MEMORY)
+        except NameError as error:
+            return f'MEMORY cannot be read: {error}'
+        for name, hint in hints.items():
             if hint in (int, float):
                 return (
                     f'MEMORY.{name} is a number, which kernels cannot write: declare it as Cell '
