@@ -14,11 +14,11 @@ import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
+import cpu_times
 import hypothesis
 import node_garbage
 import pytest
 from cpu_times import (  # noqa: F401 - hooks
-    pytest_addoption,
     pytest_runtest_makereport,
     pytest_runtest_protocol,
     pytest_terminal_summary,
@@ -122,6 +122,15 @@ def blank_pictures(monkeypatch):
 
     monkeypatch.setattr(figures, 'draw_panels', lambda path, *_, **__: path.touch())
     monkeypatch.setattr(figures.Picture, 'save', lambda _, path: path.touch())
+
+
+def pytest_addoption(parser):
+    cpu_times.pytest_addoption(parser)
+    parser.addoption(
+        '--regenerate-refusals',
+        action='store_true',
+        help='write into test/refusals what is said now, where it is something else',
+    )
 
 
 def pytest_collection_finish():

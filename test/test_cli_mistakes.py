@@ -8,20 +8,16 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
-import numpy as np
 import pytest
 import recorded_run
 from command import finished
 from recorded_run import Synthetic, limited_files, small_disk
 
-from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.cli.run import loop_configuration, notes_on_ideal_arm
 from blf_dsc_controller.compiled.announcement import COMPILING
-from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
 
 INTERRUPTED_WHILE_COMPILING = """
@@ -102,252 +98,6 @@ def test_place_that_cannot_be_written_is_refused_before_minutes_of_work(
 
 
 @pytest.mark.parametrize(
-    ('words', 'answer'),
-    [
-        (
-            'report BAG --out page.pdf',
-            'page.pdf: the report is a page: give a name in .ht',
-        ),
-        ('report table.csv', 'only blf_dsc identify reads: give a bag'),
-        (
-            'excite no/e.yaml --config panda',
-            'there is no folder no: make it, or choose',
-        ),
-    ],
-)
-def test_file_of_another_kind_or_place_is_answered_with_what_to_give(
-    bag, tmp_path, monkeypatch, capsys, words, answer
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'table.csv').write_text('time,q1\n0,1\n')
-    assert main([str(bag) if word == 'BAG' else word for word in words.split()]) == 1
-    assert answer in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ['table.csv']
-
-
-@pytest.mark.parametrize(
-    ('words', 'answer'),
-    [
-        ('run --ofline', 'run: no option --ofline, did you mean --offline?'),
-        ('run --out=x --seeed=3', 'no option --seeed, did you mean --seed?'),
-        ('run panda', 'no argument panda: a file or preset is --config panda'),
-        ('plot bag pictures', 'plot: no argument pictures; for example: blf_dsc plot'),
-        ('--verison', 'blf_dsc: no option --verison, did you mean --version?'),
-        ('run --duration ten', "invalid float value: 'ten'; for example: blf_dsc run"),
-        ('plot', 'required: bag; for example: blf_dsc plot run1/bag --out pictures ('),
-        ('helpp', 'no command helpp; there are run, '),
-        ('view', 'no command view: blf_dsc run --view shows a run, arm_view a'),
-        ('--config ur5e run', '--config belongs behind the command: blf_dsc run --co'),
-        ('monte-carlo --runs 0', 'got 0: give a whole number above 0'),
-        ('excite e.urdf --config ur5e', 'got e.urdf, but it will be a parameter file'),
-        ('excite e.yaml --config ur5e --harmonics 0', 'got 0: give a whole number'),
-        ('excite e.yaml --config ur5e --starts -1', 'got -1: give a whole number'),
-        ('monte-carlo --workers two', 'got two: give a whole number above 0'),
-        ('commission --config ur5e --out a.png', 'got a.png, but it will be a param'),
-        ('commission --config ur5e --write a.txt', 'got a.txt, but it will be a param'),
-        ('commission --config ur5e --margin 1', 'got 1: give a number above 0 and be'),
-        ('commission --config ur5e --torque 5', 'got 5: give a number above 0 and be'),
-        ('commission --config ur5e --torque ?', 'got ?: give a number above 0 and be'),
-        ('excite e.yaml --config ur5e --radius 0', 'got 0: give a number above 0'),
-        ('excite e.yaml --config ur5e --radius nan', 'got nan: give a number'),
-        ('excite e.yaml --config ur5e --floor inf', 'got inf: give a number'),
-        ('identify bag --urdf a.urdf --gravity 0 nan 0', 'got nan: give a number'),
-        (
-            'identify bag --urdf a.urdf --rated-payload -1',
-            'got -1: give a number of at least 0',
-        ),
-    ],
-)
-def test_wrong_option_is_one_line_with_what_to_type(words, answer, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(words.split())
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert answer in line
-    assert line.split(': ')[0] in ('blf_dsc', f'blf_dsc {words.split()[0]}')
-
-
-@pytest.mark.parametrize(
-    ('words', 'answer'),
-    [
-        ('run --config pandaa', 'pandaa does not exist, did you mean panda?'),
-        ('run --config Ur5e.yml', 'Ur5e.yml does not exist, did you mean ur5e?'),
-        (
-            'run --config quadruped',
-            'quadruped does not exist: give a parameter file, o',
-        ),
-        ('run --config section.yaml', 'unknown node blf_dsc_controler, did you mean b'),
-        ('plot bgs', 'bgs cannot be read as a bag: there is none, did you mean bags?'),
-        ('report nothing', 'there is none: give the folder of a bag, such as out/'),
-        ('report no/where', 'there is none: give the folder of a bag, such as out/'),
-        ('report robot.urdf', 'a bag is a folder, or a file in .mcap, .db3 or .bag'),
-        ('recover notes.md', 'notes.md cannot be read as a bag: give its folder, or'),
-        ('export BAG --out bags', 'bags ends in neither .csv nor .parquet'),
-        ('export BAG --out a.csv --namespace left', "called '/left/joint_states'"),
-        ('plot BAG --out notes.md', 'notes.md is no folder: choose another path'),
-        ('report BAG --out bags --force', 'bags is a folder: choose the path of a fi'),
-        ('export BAG --out no/a.csv', 'there is no folder no: make it, or choose'),
-        ('arms --laws propsed', 'no such law or file, did you mean proposed?'),
-        ('excite e.yaml --config paper', 'such as ur5e'),
-        ('commission --config paper', 'needs an arm from a URDF'),
-        ('identify BAG --urdf ur5 --out c.urdf', 'no /CWD/ur5, nor'),
-        ('identify BAG --urdf ur5e --out c.urdf', 'did you mean ur5e.urdf?'),
-        ('identify no.csv --urdf robot.urdf --out c.urdf', 'No such file'),
-        ('identify no.csv --urdf robot.urdf', 'No such file'),
-        ('identify BAG --urdf ur5', 'no /CWD/ur5, nor'),
-        ('drive --robot can0 --config openarm', 'can0 is a CAN bus, but'),
-        ('drive --robot 192.0.2.1 --config yam', 'give its channel, such as can0'),
-    ],
-)
-def test_wrong_name_is_answered_with_what_may_be_meant(
-    words, answer, bag, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'bags').mkdir()
-    (tmp_path / 'notes.md').write_text('mine')
-    urdf = Path(__file__).parents[1] / 'config' / 'two_link.urdf'
-    (tmp_path / 'robot.urdf').symlink_to(urdf)
-    (tmp_path / 'section.yaml').write_text(
-        '/**/blf_dsc_controler: {ros__parameters: {law: blf_dsc}}\n'
-    )
-    before = {path.name for path in tmp_path.iterdir()}
-    given = [str(bag) if word == 'BAG' else word for word in words.split()]
-    assert main([*given, '--offline'] if given[0] == 'run' else given) == 1
-    error = capsys.readouterr().err
-    assert answer.replace('/CWD', str(tmp_path)) in error
-    assert 'Errno' not in error
-    assert error.count('warning') == 0
-    assert {path.name for path in tmp_path.iterdir()} == before
-    assert (tmp_path / 'notes.md').read_text() == 'mine'
-
-
-ARM = '/**: {ros__parameters: {robot: {urdf: ur5e.urdf, tip: tool0}}}\n'
-GIVEN = '/**/blf_dsc_controller: {ros__parameters: '
-
-
-@pytest.mark.parametrize(
-    ('text', 'answer'),
-    [
-        (
-            f'{GIVEN}{{kp: [9.0], kd: [1.0]}}}}',
-            'did you mean feedback.joint_stiffness?',
-        ),
-        (f'{GIVEN}{{gains.kd: [1.0]}}}}', 'did you mean feedback.joint_damping?'),
-        (f'{GIVEN}{{robot.end_effector: tool0}}}}', 'did you mean robot.tip?'),
-        (f'{GIVEN}{{update_rate: 500}}}}', 'did you mean sample_time?'),
-        (
-            f'{ARM}{GIVEN}{{feedback: {{joint_stiffness: 900.0}}}}}}',
-            'write a list, like [900.0], an entry for each',
-        ),
-        (
-            f'{ARM}{GIVEN}{{reference.waypoints: [[0.0, 0.0]]}}}}',
-            'which ROS rejects: write one list, row after row',
-        ),
-        (
-            '<robot name="arm">\n  <link name="base"/>\n</robot>',
-            'it is XML: give a parameter file that names it',
-        ),
-        (
-            '<?xml version="1.0"?>\n<robot name="a: b"/>',
-            'it is XML: give a parameter file that names',
-        ),
-    ],
-)
-def test_what_other_packages_call_it_is_answered_with_our_name(
-    text, answer, tmp_path, capsys
-):
-    path = tmp_path / 'my.yaml'
-    path.write_text(text)
-    out = tmp_path / 'out'
-    assert main(['run', '--offline', '--config', str(path), '--out', str(out)]) == 1
-    assert answer in capsys.readouterr().err
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ('table', 'urdf', 'answer'),
-    [
-        ('', 'two_link.urdf', 'run.csv is empty: it has neither names nor numbers'),
-        ('time,q1,tau1\n0,1,2\n1,1,2\n', 'fixed.urdf', 'no joint moves: '),
-        (
-            'time,q1,q2,tau1,tau2\n'
-            + ''.join(f'{k / 50},1,1,2,2\n' for k in range(99)),
-            'two_link.urdf',
-            'the recording lasts 1.96 s; record at least 5 s',
-        ),
-        (
-            'time,q1,q2,tau1,tau2\n0,1,1,2,2\n.1,2,2,3,3\n',
-            'two_link.urdf',
-            'there are 2 joint state(s) with a position, a torque and a unique stamp; ',
-        ),
-    ],
-)
-def test_recording_that_shows_nothing_is_told(
-    table, urdf, answer, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'run.csv').write_text(table)
-    (tmp_path / 'fixed.urdf').write_text('<robot name="a"><link name="b"/></robot>')
-    assert main(['identify', 'run.csv', '--urdf', urdf, '--out', 'new.urdf']) == 1
-    assert answer in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ('words', 'answer'),
-    [
-        ('run.csv --gains 0 1', 'got a gain of 0 for joint1: give its torque per '),
-        ('run.csv --gains 1 nan', 'got a gain of nan for joint2: give its torque per '),
-        (
-            'run.csv two.csv',
-            'there are 2 joint state(s) with a position, a torque and ',
-        ),
-        ('run.csv --payload two.csv', 'there are 2 joint state(s) with a position, a '),
-        (
-            'run.csv --foresee',
-            'only 0 windows of 0.2 s have no gaps: record at least 1 s',
-        ),
-        (
-            'gaps.csv --foresee',
-            'only 0 windows of 0.2 s have no gaps: record at least 1',
-        ),
-    ],
-)
-def test_recording_that_cannot_be_identified_is_told_in_one_line(
-    words, answer, tmp_path, monkeypatch, capsys
-):
-    """Of 0.19 s; of two states; of four states at a time, and pauses."""
-    monkeypatch.chdir(tmp_path)
-    times = 0.01 * np.arange(20), 0.01 * (np.arange(400) + 10 * (np.arange(400) // 4))
-    for name, time in zip(('run', 'gaps'), times, strict=True):
-        rows = np.column_stack((time, *(np.sin(k + time) for k in range(4))))
-        header = 'time,q1,q2,tau1,tau2'
-        np.savetxt(f'{name}.csv', rows, '%.9f', ',', header=header, comments='')
-    Path('two.csv').write_text('\n'.join(Path('run.csv').read_text().splitlines()[:3]))
-    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
-    Path('a.urdf').write_text(urdf)
-    main(['identify', *words.split(), '--urdf', 'a.urdf', '--out', 'new.urdf'])
-    *_, error = capsys.readouterr().err.splitlines()
-    assert answer in error
-
-
-def test_limit_of_a_urdf_that_is_no_number_is_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
-    Path('a.urdf').write_text(re.sub('velocity="[^"]*"', 'velocity="fast"', urdf))
-    rows = ''.join(f'{k / 50},{k / 99},1,2,{k}\n' for k in range(99))
-    Path('run.csv').write_text(f'time,q1,q2,tau1,tau2\n{rows}')
-    assert main(['identify', 'run.csv', '--urdf', 'a.urdf', '--out', 'new.urdf']) == 1
-    assert '<limit velocity="fast">: expected 1 finite' in capsys.readouterr().err
-
-
-def test_mapping_that_is_none_is_told_before_work_is_announced(capsys):
-    words = 'identify run.csv --urdf two_link.urdf --map q --out new.urdf'
-    assert main(words.split()) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert '--map q: one side is missing' in line
-
-
-@pytest.mark.parametrize(
     ('command', 'what'),
     [
         ('report', 'drawn'),
@@ -366,14 +116,6 @@ def test_work_on_a_large_bag_is_announced(tmp_path, monkeypatch, capsys, command
         told = capsys.readouterr().err.splitlines()
         assert len(told) == lines
     assert told[0] == f'long: 12 MB are {what}'
-
-
-def test_study_of_an_arm_that_is_none_leaves_no_folder(tmp_path, capsys):
-    out = tmp_path / 'arms'
-    for config, problem in (('nothing', 'does not exist'), ('paper', 'model two_link')):
-        assert main(['arms', '--config', config, '--out', str(out)]) == 1
-        assert problem in capsys.readouterr().err
-    assert not out.exists()
 
 
 def test_run_says_that_its_simulated_arm_is_ideal_and_that_nothing_moves(tmp_path):
@@ -427,34 +169,6 @@ def write_params(folder, plant='', controller=''):
         f'blf_dsc_controller:\n  ros__parameters: {{law: blf_dsc, {controller}}}\n'
     )
     return path
-
-
-def test_invalid_configuration_is_rejected_before_anything_starts(tmp_path, capsys):
-    out = tmp_path / 'out'
-    below = 'initial.position: [2.293, 0.1696]'
-    for plant, controller, expected in (
-        ('', 'barier.bound: [0.1, 0.1]', 'barier.bound: unknown parameter'),
-        ('', 'joints: [joint1, wrist]', 'joints: sim_plant has joint1, joint2'),
-        (below, 'approach.enabled: false', "joint 'joint2' starts -1.5265 rad"),
-    ):
-        run = here(
-            capsys, '--config', write_params(tmp_path, plant, controller), '--out', out
-        )
-        assert run.returncode == 1
-        assert run.stderr.startswith('blf_dsc run: ')
-        assert expected in run.stderr
-        assert run.stdout == ''
-        assert not out.exists()
-
-
-def test_results_are_never_overwritten(tmp_path, capsys):
-    kept = tmp_path / 'out' / 'kept.txt'
-    kept.parent.mkdir()
-    kept.write_text('mine')
-    run = here(capsys, '--offline', '--duration', 0.1, '--out', kept.parent)
-    assert run.returncode == 1
-    assert f'{kept.parent} exists already and is not overwritten' in run.stderr
-    assert [path.name for path in kept.parent.iterdir()] == ['kept.txt']
 
 
 def test_full_disk_is_reported(tmp_path, capsys):
@@ -522,13 +236,6 @@ def test_node_reports_what_is_wrong_with_its_arguments(tmp_path):
         assert 'Traceback' not in run.stderr
 
 
-def test_unknown_command_is_answered_with_the_closest_one(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(['rnu'])
-    assert ended.value.code == 2
-    assert 'no command rnu, did you mean run?' in capsys.readouterr().err
-
-
 def test_path_that_is_no_text_is_refused_before_anything_is_made(tmp_path, capsys):
     name = os.fsdecode(os.fsencode(tmp_path) + b'/\xff')
     with pytest.raises(SystemExit) as ended:
@@ -536,24 +243,6 @@ def test_path_that_is_no_text_is_refused_before_anything_is_made(tmp_path, capsy
     assert ended.value.code == 2
     assert 'is no text in UTF-8: rename' in capsys.readouterr().err
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize(
-    ('words', 'problem'),
-    [
-        (
-            ['--duration', '1e300'],
-            'duration: got 1.0e+300, but it must be at least 0 a',
-        ),
-        (['--seed', str(2**63)], 'seed: got 9223372036854775808, but it must be at l'),
-    ],
-)
-def test_numbers_that_no_stamp_or_file_holds_are_refused(
-    tmp_path, capsys, words, problem
-):
-    run = here(capsys, '--offline', *words, '--out', tmp_path / 'out')
-    assert run.returncode == 1
-    assert problem in run.stderr
 
 
 @pytest.mark.parametrize(
@@ -597,29 +286,6 @@ def test_name_that_the_shell_cannot_write_is_told_with_the_remedy(
     monkeypatch.setattr('blf_dsc_controller.cli.bags.plot', plot)
     assert main(['plot', str(tmp_path)]) == 1
     assert "'\\xfc' cannot be written" in capsys.readouterr().err
-
-
-def test_version_is_that_of_the_package(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(['--version'])
-    assert ended.value.code == 0
-    assert capsys.readouterr().out == f'blf_dsc_controller {__version__}\n'
-
-
-def test_duration_of_zero_is_no_limit_which_no_offline_run_can_have(tmp_path, capsys):
-    out = tmp_path / 'out'
-    run = here(capsys, '--offline', '--duration', 0, '--out', out)
-    assert run.returncode == 1
-    assert '--duration 0 is no limit' in run.stderr
-    assert not out.exists()
-
-
-def test_real_time_without_ros_is_refused_instead_of_ignored(capsys, tmp_path):
-    out = tmp_path / 'out'
-    run = here(capsys, '--offline', '--mode', 'realtime', '--out', out)
-    assert run.returncode == 1
-    assert '--mode realtime needs ROS' in run.stderr
-    assert not out.exists()
 
 
 def test_run_over_ros_without_a_limit_gets_a_plant_without_a_limit():
@@ -715,14 +381,3 @@ def test_old_ros_and_missing_middleware_are_answered_in_one_line(
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
     assert re.search(answer, line)
-
-
-@pytest.mark.parametrize(
-    ('words', 'name', 'value'),
-    [
-        (['commission', '--config', 'panda'], 'out', Path('commissioned.yaml')),
-        (['precompile'], 'config', 'recommended'),
-    ],
-)
-def test_what_is_not_given_is_as_the_pages_say(words, name, value):
-    assert getattr(make_parser().parse_args(words), name) == value
