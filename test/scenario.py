@@ -109,10 +109,21 @@ class Scenario:
         self.n = len(self.config.joints)
         self.restart(record=record)
 
-    def restart(self, given: Mapping[str, Any] | None = None, record: Any = None):
-        """Let another controller take over, which has learned nothing."""
+    def restart(
+        self,
+        given: Mapping[str, Any] | None = None,
+        *,
+        acting: np.ndarray | None = None,
+        record: Any = None,
+    ) -> None:
+        """Let another controller take over, which has learned nothing.
+
+        `acting` (n,) [N m] is the torque by which another node holds the arm meanwhile.
+        """
         self.config = blf.change(self.config, given or {})
         self.controller = blf.ArmController(self.config, record=record)
+        if acting is not None:
+            self.guard.starting.take_over_from(acting)
         self._applied = np.zeros(self.n)
         self._answer: np.ndarray | None = None
         self._arrived = np.full((3, self.n), np.nan)

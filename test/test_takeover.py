@@ -1,278 +1,206 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller that starts while another node, the watchdog, holds the arm with its load."""
+"""A controller that starts, or starts again, while something holds the arm with its load."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenario import Scenario, carrying, changed, frozen
 
 import blf_dsc_controller as blf
-from blf_dsc_controller import load_loop
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.errors import StartError
-from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
-from sim_plant.plant import plant_of
 
-LOADED = {
-    'duration': 0.0,
-    'events.begin': [0.0],
-    'events.duration': [1e6],
-    'events.payload': [2.0],
-}
+LOAD = carrying(2.0)  # of which nobody knows
 HOLD = {'reference.type': 'hold'}
+SLOW = 0.02  # rad/s
 
 
-class Arm:
-    """A simulated arm with 2 kg of which nobody knows, and one controller after another."""
-
-    def __init__(self, preset):
-        loop = load_loop(preset, {'sim_plant': LOADED, 'blf_dsc_controller': HOLD})
-        self.config = loop.controller
-        self.plant = plant_of(loop.plant)
-        self.stamp = 10**9
-        self.restart()
-
-    def restart(self, acting=None):
-        """Start another controller, which knows nothing but what it is told."""
-        self.guard = Guard(self.config, lambda: 0, lambda: 0)
-        self.guard.starting.activate()
-        if acting is not None:
-            self.guard.starting.take_over_from(acting)
-
-    def run(self, seconds):
-        """Return torques (k, n) and the largest speed [rad/s] of so many seconds."""
-        n = len(self.config.joints)
-        torques, fastest = [], 0.0
-        for _ in range(round(seconds / self.config.sample_time)):
-            torque = self.guard.update(self.stamp, self.plant.measure())
-            self.guard.perceive()
-            if torque is None:
-                break
-            torques.append(torque.copy())
-            self.plant.step(torque)
-            self.stamp += self.config.sample_time_ns
-            fastest = max(fastest, np.abs(self.plant.truth()[-n:]).max())
-        return np.array(torques), fastest
-
-    def holding(self):
-        """Return the torque (n,) [N m] that holds the arm, without what encoder steps add."""
-        return np.median(self.run(0.1)[0], axis=0)
-
-    def damping(self):
-        """Return the damping (n,) [N m] of the velocities that are measured: encoders step."""
-        _, dq, _ = self.plant.measure().reshape(3, -1)
-        return np.array(self.config.feedback.gain) * np.abs(dq)
+def arm_of(preset, given=None):
+    """Return an arm that its controller has held with its load for 3 s."""
+    arm = Scenario(preset, HOLD | (given or {}), plant=LOAD)
+    arm.run(3.0)
+    return arm
 
 
 @pytest.fixture(params=['fr3', 'panda', 'ur5e'])
 def arm(request):
-    held = Arm(request.param)
-    held.run(3.0)
-    return held
+    return arm_of(request.param)
+
+
+def holding(arm):
+    """Return the torque (n,) [N m] that holds an arm, without what encoder steps add."""
+    return np.median(arm.run(0.1).torque, axis=0)
+
+
+def damping(arm):
+    """Return the damping (n,) [N m] of the velocities that are measured: encoders step."""
+    _, dq, _ = arm.plant.measure().reshape(3, -1)
+    return np.array(arm.config.feedback.gain) * np.abs(dq)
+
+
+def carried(arm):
+    """Return the largest torque [N m] besides the model that the law has."""
+    return max(map(abs, arm.controller.disturbance.values()))
 
 
 def test_it_goes_on_from_the_torque_that_holds_the_arm(arm):
-    held = arm.holding()
-    arm.restart(held)
-    limit = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
-    limit = np.where(limit > 0.0, limit, 0.5 + arm.damping()) + 1e-9
-    torques, speed = arm.run(0.5)
-    assert (np.abs(torques[0] - held) <= limit).all()
-    assert speed < 0.02  # rad/s
-    types = [event.type for event in arm.guard.journal.pending]
-    assert types[-2:] == [EventType.TAKEOVER, EventType.START]
+    held = holding(arm)
+    arm.restart(acting=held)
+    limit = np.array(arm.config.torque.rate_limit) * arm.T
+    limit = np.where(limit > 0.0, limit, 0.5 + damping(arm)) + 1e-9
+    after = arm.run(0.5)
+    assert (np.abs(after.torque[0] - held) <= limit).all()
+    assert after.speed.max() < SLOW
 
 
-def test_a_reset_in_command_forgets_what_was_learned_and_goes_on_to_carry_the_load(arm):
-    """Elsewhere the arm sags, as the next test shows."""
-    held = arm.holding()
-    arm.guard.starting.reset()
-    state, settings = arm.guard.controller.state, arm.guard.controller.settings
-    np.testing.assert_array_equal(state.estimate, settings.initial_estimate)
-    limit = 0.5 + arm.damping()
-    torques, speed = arm.run(0.5)
-    assert speed < 0.02  # rad/s
-    assert (np.abs(torques[0] - held) <= limit).all()
-
-
-def test_a_reset_of_an_arm_that_has_stopped_goes_on_to_carry_its_load(arm):
+@pytest.mark.parametrize('is_stopped', [False, True])
+def test_a_reset_goes_on_to_carry_the_load(arm, is_stopped):
     """As the safe torque does: else the arm falls until the feedback catches it."""
-    arm.guard.fail('by hand')
-    torques, _ = arm.run(2.0)
-    arm.guard.starting.reset()
-    limit = 0.5 + arm.damping()
-    first, speed = arm.run(0.5)
-    assert arm.guard.supervisor.running, arm.guard.supervisor.text
-    assert speed < 0.02  # rad/s
-    assert (np.abs(first[0] - torques[-1]) <= limit).all()
+    if is_stopped:
+        arm.controller.fail('by hand')
+        held = arm.run(2.0).torque[-1]
+    else:
+        held = holding(arm)
+    arm.controller.reset()
+    limit = 0.5 + damping(arm)
+    after = arm.run(0.5)
+    assert arm.is_running, arm.text
+    assert after.speed.max() < SLOW
+    assert (np.abs(after.torque[0] - held) <= limit).all()
 
 
 def test_a_start_that_is_refused_after_a_reset_leaves_the_load_to_the_safe_torque(arm):
-    arm.guard.fail('by hand')
-    arm.run(2.0)
-    arm.guard.starting.reset()
-    arm.guard.starting.refuse(StartError('by hand'))
-    _, speed = arm.run(0.5)
-    assert arm.guard.supervisor.phase is Phase.SAFE_STOP
-    assert speed < 0.04  # rad/s; a Panda that is left alone has up to 0.03
+    arm.controller.fail('by hand')
+    elsewhere = arm.run(2.0).q[-1] + 0.2
+    lowest = np.array(arm.config.limits.position_lower)
+    lowest[0] = elsewhere[0]
+    arm.change({'limits.position_lower': lowest.tolist()})
+    arm.controller.reset()
+    after = arm.run(0.5)
+    assert arm.controller.phase is blf.Phase.SAFE_STOP
+    assert arm.reason == 'start rejected'
+    assert after.speed.max() < 2.0 * SLOW  # a Panda that is left alone has up to 0.03
 
 
 def test_an_invalid_state_after_a_reset_lets_no_load_fall(arm):
     """The law waits for another, and the safe torque carries the load meanwhile."""
-    arm.guard.starting.reset()
-    n = len(arm.config.joints)
-    for _ in range(round(0.2 / arm.config.sample_time)):
-        measurement = arm.plant.measure().copy()
-        measurement[n : 2 * n] = np.nan
-        arm.plant.step(arm.guard.update(arm.stamp, measurement))
-        arm.stamp += arm.config.sample_time_ns
-    assert arm.guard.starting.waiting_for
-    assert np.abs(arm.plant.truth()[-n:]).max() < 0.02  # rad/s
-    _, speed = arm.run(0.5)
-    assert arm.guard.supervisor.running, arm.guard.supervisor.text
-    assert speed < 0.02
+    arm.controller.reset()
+    waiting = arm.run(0.2, spoil=changed(dq=lambda dq: np.nan * dq))
+    assert arm.controller.phase is blf.Phase.STARTING
+    assert arm.text
+    after = arm.run(0.5)
+    assert arm.is_running, arm.text
+    assert max(waiting.speed.max(), after.speed.max()) < SLOW
 
 
 @pytest.mark.parametrize('torque', ['hold_gravity', 'damping'])
-@pytest.mark.parametrize('gap', [0.0, 0.1])
+@pytest.mark.parametrize('change', ['none', 'gap', 'jump'])
 @pytest.mark.parametrize('is_stopped', [True, False])
-def test_a_reset_begins_without_a_load_that_nothing_shows(torque, gap, is_stopped):
-    """After a gap, another may hold the arm; behind mere damping, something else does."""
-    arm = Arm('fr3')
-    arm.run(3.0)
-    carried = np.abs(arm.guard.controller.state.disturbance).max()
-    arm.guard.retune(change(arm.config, {'safety.torque': torque}))
+def test_a_reset_begins_without_a_load_that_nothing_shows(torque, change, is_stopped):
+    """After a gap, another may hold the arm; behind mere damping, something else does.
+
+    Where positions jump, the simulation of another episode begins.
+    """
+    arm = arm_of('fr3')
+    before = carried(arm)
+    arm.change({'safety.torque': torque})
     if is_stopped:
-        arm.guard.fail('by hand')
+        arm.controller.fail('by hand')
         arm.run(0.1)
-    arm.guard.starting.reset()
-    arm.stamp += round(1e9 * gap)
-    arm.run(arm.config.sample_time)
-    assert arm.guard.supervisor.running, arm.guard.supervisor.text
-    begins = np.abs(arm.guard.controller.state.disturbance).max()
-    is_shown = gap == 0.0 and not (is_stopped and torque == 'damping')
-    assert begins > 0.5 * carried if is_shown else begins < 0.01 * carried
+    arm.controller.reset()
+    if change == 'gap':
+        arm.run(0.1, spoil=lambda _: [])
+    far = 0.01 if change == 'jump' else 0.0  # rad, twice what a fast arm moves
+    arm.run(arm.T, spoil=changed(slice(3), q=lambda q: q + far))
+    assert arm.is_running, arm.text
+    is_shown = change == 'none' and not (is_stopped and torque == 'damping')
+    begins = carried(arm)
+    assert begins > 0.5 * before if is_shown else begins < 0.01 * before
 
 
-@pytest.mark.parametrize('reason', [Reason.SATURATED, Reason.OUTSIDE_BOUND])
-def test_a_reset_begins_without_a_load_if_commands_may_not_have_reached_the_arm(reason):
+def test_a_reset_begins_without_a_load_if_commands_may_not_have_reached_the_arm():
     """An arm at rest does not show it: brakes hold it as well."""
-    arm = Arm('fr3')
+    arm = Scenario('fr3', plant=LOAD)
     arm.run(3.0)
-    carried = np.abs(arm.guard.controller.state.disturbance).max()
-    arm.guard.stop(reason, 'by hand')
-    arm.run(arm.config.sample_time)
-    arm.guard.starting.reset()
-    arm.run(arm.config.sample_time)
-    assert np.abs(arm.guard.controller.state.disturbance).max() < 0.01 * carried
-
-
-@pytest.mark.parametrize(
-    ('elapsed', 'moved', 'leads'),
-    [
-        (0.001, 0.0029, True),
-        (0.001, -0.0031, False),  # as the simulation of another episode begins
-        (0.02, 0.05, True),
-        (0.031, 0.0, False),
-        (0.0, 0.0, False),
-    ],
-)
-def test_last_state_leads_to_one_that_an_arm_of_3_rad_s_can_reach(
-    elapsed, moved, leads
-):
-    last = LastState(1)
-    assert not last.leads_to(10**9, np.zeros(1), 3.0, 0.001)
-    last.take(10**9, np.array([0.5, 0.0, 0.0]), np.zeros(1))
-    stamp = 10**9 + round(elapsed * 1e9)
-    q = np.array([0.5 + moved])
-    assert last.leads_to(stamp, q, 3.0, 0.001) == leads
+    before = carried(arm)
+    brakes = frozen()
+    arm.run(1.0, spoil=brakes, until=lambda: not arm.is_running)
+    assert arm.reason in {'commands without effect', 'error past the bound'}
+    arm.run(arm.T, spoil=brakes)
+    arm.controller.reset()
+    arm.run(arm.T, spoil=brakes)
+    assert arm.is_running, arm.text
+    assert carried(arm) < 0.01 * before
 
 
 def test_two_resets_in_a_row_carry_the_load():
     """The second finds no sample, or too few to observe it."""
-    arm = Arm('fr3')
-    arm.run(3.0)
+    arm = arm_of('fr3')
     for seconds in (0.0, 0.05, 0.1):
-        arm.guard.starting.reset()
-        _, speed = arm.run(seconds)
-        assert speed < 0.02
+        arm.controller.reset()
+        if seconds > 0.0:
+            assert arm.run(seconds).speed.max() < SLOW
 
 
 @pytest.mark.parametrize('arm', ['fr3', 'panda'], indirect=True)
-def test_a_controller_that_is_told_nothing_lets_the_load_sag(arm):
-    """What the torque that is told saves; also after a reset, which forgets it."""
-    held = arm.guard.controller.state.torque.copy()
-    arm.restart(held)
-    arm.guard.starting.reset()
-    _, speed = arm.run(0.5)
-    assert speed > 0.05
+def test_a_controller_without_the_torque_that_acts_lets_the_load_sag(arm):
+    """Also after a reset, which forgets it."""
+    arm.restart(acting=holding(arm))
+    arm.controller.reset()
+    assert arm.run(0.5).speed.max() > 2.0 * SLOW
 
 
 def test_without_it_an_arm_that_rests_by_another_torque_is_not_taken_over():
     """Whenever it is asked: also while an encoder steps, which looks like motion."""
-    arm = Arm('ur5e')
-    arm.run(3.0)
-    holding, fastest = arm.guard, 0.0
+    arm = arm_of('ur5e')
+    holds, fastest = arm.controller, 0.0
     for _ in range(20):
+        arm.controller = holds
         arm.run(0.01)
         fastest = max(fastest, np.abs(arm.plant.measure()[6:12]).max())
         arm.restart()
-        assert not len(arm.run(0.001)[0])
-        assert 'gravity twice' in str(arm.guard.starting.error)
-        arm.guard = holding
+        assert np.isnan(arm.run(0.001).torque).all()
+        assert 'gravity twice' in arm.text
     assert fastest > 0.005  # rad/s
 
 
 def test_the_largest_first_step_is_one_from_there():
-    arm = Arm('fr3')
-    arm.run(3.0)
-    held = arm.guard.controller.state.torque.copy()
+    arm = arm_of('fr3')
+    held = holding(arm)
     assert np.abs(held).max() > 2.0 * max(arm.config.torque.first_step)
-    arm.restart(held)
-    torques, _ = arm.run(0.1)
-    assert len(torques) == 100
-    far = held + 50.0 * np.sign(held)
-    arm.restart(far)
-    assert not len(arm.run(0.1)[0])
-    assert isinstance(arm.guard.starting.error, StartError)
+    arm.restart(acting=held)
+    arm.run(0.1)
+    assert arm.is_running
+    arm.restart(acting=held + 50.0 * np.sign(held))
+    assert np.isnan(arm.run(0.1).torque).all()
+    assert arm.reason == 'start rejected'
 
 
 def test_torque_of_another_node_counts_and_not_the_last_own_one():
     """The controller has commanded before, and has been activated again."""
-    arm = Arm('fr3')
-    arm.run(3.0)
-    acting = arm.holding() + 3.0  # N m
-    arm.guard.starting.activate()
+    arm = arm_of('fr3')
+    acting = holding(arm) + 3.0  # N m
+    arm.controller.start()
     arm.guard.starting.take_over_from(acting)
-    (torque,), _ = arm.run(arm.config.sample_time)
-    assert arm.guard.starting._takeover.acting is None  # it holds the arm no more
-    step = np.array(arm.config.torque.rate_limit) * arm.config.sample_time
+    (torque,) = arm.run(arm.T).torque
+    step = np.array(arm.config.torque.rate_limit) * arm.T
     assert (np.abs(torque - acting) <= step + 1e-9).all()
 
 
 def test_load_is_left_out_where_no_integrator_could_ever_unlearn_it():
-    gain = [0.0, *[100.0] * 6]
-    arm = Arm('fr3')
-    arm.config = change(arm.config, {'disturbance.gain': gain})
-    arm.restart(np.full(7, 2.0))  # N m
-    arm.run(arm.config.sample_time)
-    assert (arm.guard.controller.state.disturbance != 0.0).tolist() == [
-        each > 0.0 for each in gain
-    ]
+    arm = arm_of('fr3')
+    gain = {'disturbance.gain': [0.0, *[100.0] * 6]}
+    arm.restart(gain, acting=np.full(7, 2.0))  # N m
+    arm.run(arm.T)
+    found = [value != 0.0 for value in arm.controller.disturbance.values()]
+    assert found[:7] == [False, *[True] * 6]
 
 
 def test_a_bag_of_it_replays_bit_for_bit(tmp_path):
-    arm = Arm('fr3')
-    arm.run(1.0)
-    held = arm.guard.controller.state.torque.copy()
-    with blf.ArmController(arm.config, record=tmp_path / 'bag') as controller:
-        controller.guard.starting.take_over_from(held)
-        for k in range(200):
-            q, dq, effort = arm.plant.measure().reshape(3, -1)
-            arm.plant.step(controller.update(1.0 + 0.001 * k, q, dq, effort))
+    arm = Scenario('fr3', HOLD, plant=LOAD)
+    held = arm.run(1.0).torque[-1]
+    arm.restart(acting=held, record=tmp_path / 'bag')
+    arm.run(0.2)
+    arm.controller.close()
     verified = blf.verify(tmp_path / 'bag')
     assert verified.difference is None
-    assert EventType.TAKEOVER in [event.type for event in verified.events]
+    assert 'takeover' in [str(event.type) for event in verified.events]
