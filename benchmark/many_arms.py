@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +30,10 @@ from benchmark.random_arms import (
     Kept,
     Key,
     Result,
-    arm_of,
     failures,
-    guessed_rotors,
     stops,
     study_of,
 )
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.studies.monte_carlo import Study
 
 
 def make(runs: int, robots: Sequence[str], draws: Sequence[str], kept: Kept) -> None:
@@ -85,57 +80,6 @@ def _errors(found: Sequence[Result]) -> list[str]:
     return [' / '.join(f'{value:.2g}' for value in each) for each in values]
 
 
-def named(kept: Kept) -> Iterator[list[str]]:
-    """Compute the rows: joints that are named first where this law does not hold."""
-    for robot, draw in _groups(kept):
-        found: dict[str, list[Result]] = {}
-        for each in _own(kept, robot, draw).values():
-            if not each.holds:
-                said = re.search(r"joint '(\w+)'", each.text)
-                found.setdefault(said[1] if said else 'none', []).append(each)
-        for joint, results in sorted(found.items(), key=lambda item: -len(item[1])):
-            told = [re.search(r'at (\S+) Hz', each.text) for each in results]
-            hertz = sorted(float(each[1]) for each in told if each)
-            stop = sum(not np.isnan(each.stopped) for each in results)
-            span = f'{hertz[0]:g} to {hertz[-1]:g}' if hertz else '-'
-            yield [robot, draw, joint, f'{len(results)}', f'{stop}', span]
-
-
-_QUARTERS = 4
-_Drawn = Callable[[PlantConfig, np.ndarray], float]
-DRAWN: Mapping[str, _Drawn] = {
-    'softest gear of all joints but the last three': lambda arm, _: min(
-        arm.joint.stiffness[:-3]
-    ),
-    'softest gear of the last three': lambda arm, _: min(arm.joint.stiffness[-3:]),
-    'damping of the springs': lambda arm, _: arm.joint.damping_ratio,
-    'lightest motor, of the guess': lambda arm, guess: float(
-        (np.array(arm.truth.rotor_inertia) / guess).min()
-    ),
-    'delay': lambda arm, _: arm.actuator.delay * 1.0,
-}
-
-
-def quarters(kept: Kept) -> Iterator[list[str]]:
-    """Compute the rows: of the quarters by what was drawn, how many arms do not hold."""
-    for robot, draw in _groups(kept):
-        study, results = study_of(robot, draw), _own(kept, robot, draw)
-        fails = np.array([not each.holds for each in results.values()])
-        if not fails.any():
-            continue
-        for label, values in _values(study, list(results)).items():
-            order = np.argsort(values, kind='stable')
-            parts = np.array_split(fails[order], _QUARTERS)
-            yield [robot, draw, label, *(f'{part.sum()}' for part in parts)]
-
-
-def _values(study: Study, keys: Sequence[Key]) -> dict[str, list[float]]:
-    """Return what was drawn for arms, by what it is."""
-    guess = guessed_rotors(study.controller)
-    plants = [arm_of(study, key.number) for key in keys]
-    return {label: [of(each, guess) for each in plants] for label, of in DRAWN.items()}
-
-
 def _groups(kept: Kept) -> list[tuple[str, str]]:
     """Return the robots and draws of the runs of this law."""
     return sorted({(key.robot, key.draw) for key in kept.results if key.law == THIS})
@@ -161,8 +105,6 @@ HEAD = (
     'not held, plausible',
     *(f'{each} [mrad]' for each in ('motion', 'pick-up', 'settled')),
 )
-NAMED = 'robot', 'draw', 'joint', 'arms that do not hold', 'stop', 'at [Hz]'
-BY_QUARTER = 'robot', 'draw', 'arms that do not hold, by', 'low', '', '', 'high'
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -178,11 +120,6 @@ def main(given: argparse.Namespace) -> None:
     kept = Kept(given.keep)
     make(given.runs, given.robots, given.draws, kept)
     print_table(HEAD, rows(kept))
-    for head, table in (
-        (HEADS['stops'], stops),
-        (HEADS['failures'], failures),
-        (NAMED, named),
-        (BY_QUARTER, quarters),
-    ):
+    for name, table in (('stops', stops), ('failures', failures)):
         print()
-        print_table(head, table(kept))
+        print_table(HEADS[name], table(kept))

@@ -18,8 +18,9 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from benchmark.harness import print_table
-from benchmark.load_observer import without_learning
+from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.studies.runs import cores
@@ -35,6 +36,13 @@ SPANS = {  # s
 }
 SECONDS = 60.0
 WEIGHED = 25.0  # s
+
+
+def without_learning(controller: ControllerConfig) -> ControllerConfig:
+    """Return a controller that keeps its estimate at first: a PID over the model of the URDF."""
+    count = len(controller.learning.initial_estimate)
+    still = {'learning.weight': 0.0, 'learning.adaptation_gain': [0.0] * count}
+    return change(controller, still)
 
 
 def weight_of(record: Record) -> str:

@@ -3,7 +3,6 @@
 
     python -m benchmark random-arms margins
     python -m benchmark random-arms arms [N] [--robots NAME...] [--draws DRAW...] [--keep FILE]
-    python -m benchmark random-arms rotors
 
 Arms are drawn independently of what the controller assumes: each pairs one draw with all
 laws, the same noise and the same torque limits.  It runs the motion of its preset under the
@@ -44,11 +43,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmark import elastic
-from benchmark.elastic import FREE
 from benchmark.harness import print_table
 from benchmark.kept import Results
-from benchmark.studies import load_study
+from benchmark.studies import FREE, load_study
 from blf_dsc_controller.arms.linear_loop import (
     Feedback,
     Joints,
@@ -58,7 +55,7 @@ from blf_dsc_controller.arms.linear_loop import (
 )
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import PLANT, LoopConfig, load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import change
@@ -96,21 +93,24 @@ class Robot(NamedTuple):
     gears: tuple[float, float]  # N m/rad, of the wide draw
 
 
+# Of the makers' position controllers: stiffness and damping of each joint.
+_FRANKA = (600.0,) * 4 + (250.0, 150.0, 50.0), (30.0,) * 4 + (10.0, 10.0, 5.0)
+_UR = (900.0,) * 3 + (500.0,) * 3, (60.0,) * 3 + (44.7,) * 3
 _LEROBOT = (  # config_openarm_follower.py of 27de2ca
     (240.0, 240.0, 240.0, 240.0, 24.0, 31.0, 25.0),
     (5.0, 5.0, 3.0, 5.0, 0.3, 0.3, 0.3),
 )
 ROBOTS = {
-    'panda': Robot('panda', 'monte_carlo_elastic_panda', *elastic.FRANKA, (5e3, 1e5)),
-    'fr3': Robot('fr3_direct', 'monte_carlo_elastic_fr3', *elastic.FRANKA, (5e3, 1e5)),
-    'ur5e': Robot('ur5e', 'monte_carlo_elastic_ur5e', *elastic.UR, (5e3, 1e5)),
+    'panda': Robot('panda', 'monte_carlo_elastic_panda', *_FRANKA, (5e3, 1e5)),
+    'fr3': Robot('fr3_direct', 'monte_carlo_elastic_fr3', *_FRANKA, (5e3, 1e5)),
+    'ur5e': Robot('ur5e', 'monte_carlo_elastic_ur5e', *_UR, (5e3, 1e5)),
     'openarm': Robot('openarm', 'monte_carlo_elastic_openarm', *_LEROBOT, (3e2, 2e4)),
 }
 
 DRAWS = 'study', 'wide'
 PERIOD = 5.0  # s, of the motions
 POSTURES = 6
-ROTORS = (0.2, 0.5, 1.0, 2.0, 7.0)
+ROTORS = 0.2, 7.0  # times the guess
 LOOP_GAIN, LOOP_DAMPING = 4.0, 0.008  # of a torque loop, s
 
 
@@ -534,39 +534,6 @@ def _kind(text: str) -> str:
     )
 
 
-def rotors() -> Iterator[list[str]]:
-    """Compute the rows: presets with motors of a multiple of the controller's guess."""
-    for name in ('panda', 'fr3', 'ur5e'):
-        loop = load_loop(ROBOTS[name].preset, {PLANT: picks_up(name)})
-        for law in (THIS, STOCK):
-            yield [name, law, *(_cell(loop, name, law, each) for each in ROTORS)]
-
-
-def picks_up(name: str) -> dict[str, object]:
-    """Return the plant's parameters for a pick-up of the rated payload of a robot."""
-    payload = load_loop(ROBOTS[name].preset).controller.robot.payload
-    return {
-        'duration': SECONDS,
-        'events.begin': [PICK_UP],
-        'events.duration': [0.0],
-        'events.payload': [payload],
-    }
-
-
-def _cell(loop: LoopConfig, name: str, law: str, factor: float) -> str:
-    """Return what motors of a multiple of the guess do."""
-    inertia = factor * guessed_rotors(loop.controller)
-    plant = change(loop.plant, {'truth.rotor_inertia': inertia.tolist()})
-    controller = law_of(loop.controller, name, law)
-    found = run(controller, plant, np.array(loop.controller.barrier.bound))
-    text = found.text.partition(': ')[0]
-    if not np.isnan(found.stopped):
-        return f'{_briefly(found)}: {text}'
-    spans = found.motion, found.pick_up, found.settled
-    errors = ', '.join(f'{1e3 * each:.2g}' for each in spans)
-    return f'{errors}; {text}' if text else errors
-
-
 def margins() -> Iterator[list[str]]:
     """Compute the rows of the modulus margins, and the gains that follow."""
     for name in ROBOTS:
@@ -582,7 +549,6 @@ def margins() -> Iterator[list[str]]:
 _ERRORS = tuple(f'{each} [mrad]' for each in ('motion', 'pick-up', 'settled'))
 HEADS = {
     'margins': ('robot', *LAWS, 'factor of PD', 'w of computed torque'),
-    'rotors': ('robot', 'law', *(f'{each:g}' for each in ROTORS)),
     'arms': (
         'robot',
         'arms',
@@ -608,7 +574,7 @@ HEADS = {
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument('table', choices=('margins', 'arms', 'rotors'))
+    parser.add_argument('table', choices=('margins', 'arms'))
     parser.add_argument('runs', type=int, nargs='?', default=1000, help='arms of each')
     parser.add_argument('--robots', nargs='+', choices=ROBOTS, default=list(ROBOTS))
     parser.add_argument('--draws', nargs='+', choices=DRAWS, default=list(DRAWS))
@@ -617,10 +583,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(given: argparse.Namespace) -> None:
     """Print the table that was asked for."""
-    if given.table != 'arms':
-        print_table(
-            HEADS[given.table], margins() if given.table == 'margins' else rotors()
-        )
+    if given.table == 'margins':
+        print_table(HEADS['margins'], margins())
         return
     kept = Kept(given.keep)
     print_table(HEADS['arms'], arms(given.runs, given.robots, given.draws, kept))

@@ -73,23 +73,6 @@ def test_simulators_of_the_peers_run_the_same_arm():
         )
 
 
-@pytest.mark.parametrize('arm', ['openarm', 'yam'])
-def test_feedback_in_motors_is_compared_with_the_hosts(monkeypatch, arm):
-    sizes = {'SECONDS': 0.2, 'PICK_UP': 0.1, 'SETTLED': 0.05, 'DEAD': 0.1}
-    motors = importlib.import_module('benchmark.motor_feedback')
-    for name, value in sizes.items():
-        monkeypatch.setattr(motors, name, value)
-    rows = motors.rows(arm, ['maker', 'whole'], ['rigid'])
-    table = {first: cells for first, *cells in rows}
-    assert list(table) == ['maker, motor', 'whole, host', 'whole, motor']
-    assert all(len(cells) == 2 and 'stops' not in cells[0] for cells in table.values())
-    finer, coarse = (
-        motors.run(arm, 'maker', 'motor', kind, 0.004) for kind in ('elastic', 'coarse')
-    )
-    assert finer.late != coarse.late
-    assert coarse.late == pytest.approx(finer.late, abs=1e-3)  # rad: steps of 0.38 mrad
-
-
 def test_node_compared_with_null_node(monkeypatch):
     nodes = tiny(monkeypatch, 'nodes', _STEPS=20, _WARM_UP=2, _SETTLING=0.05)
     monkeypatch.setattr(nodes, '_ARMS', {'recommended': 'node'})
@@ -111,11 +94,3 @@ def test_dead_or_silent_contestant_aborts_the_measurement(monkeypatch):
     with pytest.raises(BlfDscError, match=r'no sign of a torque after 0\.1 s'):
         silent.until(lambda: False, 'a torque')
     silent.close()
-
-
-def test_arms_are_identified_at_both_rates(capsys):
-    assert main(['identification', 'arms', '--runs', '1']) == 0
-    printed = capsys.readouterr().out
-    assert '1 arms, 0 results with unphysical bodies' in printed
-    assert '\n| 1000 Hz | ' in printed
-    assert '\n| 100 Hz | ' in printed

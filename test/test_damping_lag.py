@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmark import damping_lag, notches, random_arms
+from benchmark import random_arms
 from blf_dsc_controller.arms.linear_loop import law_responses
-from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.simulation.loop import simulate
@@ -138,26 +138,6 @@ def test_gains_that_change_leave_no_part_of_a_jump_behind(config):
     np.testing.assert_allclose(law.state.feedback.late, law.signals.xi2, atol=1e-5)
 
 
-def test_a_ur5e_gets_half_as_much_margin_again_unless_encoders_are_at_its_motors():
-    rows = {lag: map(float, sides) for lag, *sides in damping_lag.margins()}
-    own, own_motors = rows['0 ms']
-    late, late_motors = rows['3 ms']
-    assert 0.4 < own < 0.5
-    assert late > 1.35 * own
-    assert late_motors < 0.8 * own_motors
-
-
-def test_a_lag_of_shoulder_and_elbow_alone_leaves_light_wrists_their_margin():
-    """Motors as the controller guesses, with encoders at the links."""
-    loop = load_loop('ur5e', {PLANT: random_arms.picks_up('ur5e')})
-    motors = random_arms.guessed_rotors(loop.controller).tolist()
-    plant = change(loop.plant, {'truth.rotor_inertia': motors})
-    margins = damping_lag.margins_of(loop.controller, plant)
-    of = dict(zip(damping_lag.SETTINGS, margins, strict=True))
-    assert of['3 ms'] < 0.5 * of['none']
-    assert of['3 ms, first 3 joints'] > 0.95 * of['none']
-
-
 @pytest.mark.parametrize(('given', 'reports'), [({}, True), (LAG, False)])
 def test_an_arm_that_oscillates_with_the_published_gains_is_calm(given, reports):
     """Arm 442 of the study; it is reported 1.6 s after the pick-up, at 26 Hz."""
@@ -165,19 +145,3 @@ def test_an_arm_that_oscillates_with_the_published_gains_is_calm(given, reports)
     plant = replace(random_arms.arm_of(study, 442), duration=7.8)
     record = simulate(change(study.controller, given), plant)
     assert bool(record.run().oscillations) == reports
-
-
-def test_notch_that_is_compared_with_lags_passes_its_share_at_its_frequency():
-    filters = notches.Filters(lag=np.zeros(2), notch=np.array([20.0, 0.0]))
-    s = 2j * np.pi * np.array([1e-3, 20.0, 1e4])
-    passed = np.abs(filters.passed(s)[..., 0])
-    np.testing.assert_allclose(passed[:, 0], [1.0, notches.SHARE, 1.0], atol=1e-4)
-    np.testing.assert_array_equal(passed[:, 1], 1.0)
-    others = list(filters.others((0.002, 0.005), (30.0,)))
-    assert [(*each.lag, *each.notch) for each in others] == [
-        (0.002, 0.0, 20.0, 0.0),
-        (0.005, 0.0, 20.0, 0.0),
-        (0.0, 0.002, 20.0, 0.0),
-        (0.0, 0.005, 20.0, 0.0),
-        (0.0, 0.0, 20.0, 30.0),
-    ]

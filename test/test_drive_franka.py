@@ -170,7 +170,7 @@ robot.set_load(1.0, [0.0, 0.0, 0.1], [0.001, 0, 0, 0, 0.001, 0, 0, 0, 0.001])
 
 
 def test_load_that_is_declared_and_not_there_makes_no_step(wire, tmp_path):
-    """1 kg in Desk, of which nobody tells the law: `python -m benchmark wrong-load` has others.
+    """1 kg in Desk, of which nobody tells the law.
 
     It lifts the arm, which is taken over in motion, or refused if it is too fast for that.
     """

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-import importlib
 import os
 import re
 import tracemalloc
@@ -35,7 +34,6 @@ from random_arm import (
 from scipy.integrate import solve_ivp
 from test_analysis_report import amount, lightened, pixels
 
-from benchmark import __main__ as tables
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.friction import fading, fadings, sliding, slidings
@@ -559,34 +557,6 @@ def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, t
     found = identified(states)
     assert not found.parts.terms[3, :2].any()
     assert not found.parts.coupling.any()
-
-
-def test_league_has_a_row_in_each_table_for_a_folder_with_a_bag(
-    plain, tmp_path, capsys, monkeypatch
-):
-    league = importlib.import_module('benchmark.league')
-    monkeypatch.setattr(league.rivals, 'MISSING', ['figaroh', 'mujoco.sysid'])
-    write_states(tmp_path / 'bag', PANDA, measured(plain, 3))
-    (tmp_path / 'panda.urdf').write_text(PANDA_TEXT)
-    assert tables.main(['league', str(tmp_path), '--last-only']) == 0
-    lines = capsys.readouterr().out.splitlines()
-
-    def cells_of(first):
-        found = (line for line in lines if line.startswith(f'| {first}'))
-        return [[cell.strip(' *') for cell in line.split('|')[1:-1]] for line in found]
-
-    heads = cells_of('recording')
-    rows = cells_of('bag ')
-    torque, rollout, seconds = (
-        dict(zip(head, row, strict=True)) for head, row in zip(heads, rows, strict=True)
-    )
-    methods = ('least squares', 'semidefinite', 'identify')
-    for table, worst, best in ((torque, 10.0, 1.0), (rollout, 10.0, 5.0)):
-        assert float(table['URDF']) > worst
-        for method in methods:
-            assert table[method] == '-' or float(table[method]) < best
-    assert float(rollout['identify']) < 2.0
-    assert float(seconds['identify']) > 0.0
 
 
 UNIT = np.array([pseudo_inertia(e) for e in np.eye(10)])  # E_a of sum_a ten_a E_a

@@ -23,7 +23,6 @@ from random_arm import (
     truth_of,
 )
 
-from benchmark.intervals import KINDS, Arm
 from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.cli.main import main
@@ -233,13 +232,6 @@ def test_intervals_hold_where_the_arm_is_not_as_its_model_says(what):
     assert np.mean(held) >= 0.85
     words = {'gain': 'KNOWN UP TO THESE GAINS ONLY', 'elasticity': 'give way'}[what]
     assert mentions(found, words)
-
-
-def test_factor_that_all_gains_have_in_common_is_not_taken_for_known():
-    """Of a chain whose gains are 7 % high in the mean; if the prior chooses it, 26 of 40 hold."""
-    arm = Arm(2012)
-    found = arm.identified(KINDS['gains'])
-    assert is_covered(found, arm.truth)[:40].all()
 
 
 def test_mean_of_gains_is_as_uncertain_as_their_number_says():

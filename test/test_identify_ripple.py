@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from random_arm import reference_of
+from random_arm import recording_of, reference_of
 
-from benchmark.ripple import amplitudes_of, config_of, found_along, found_of
 from blf_dsc_controller.commissioning.slow_motion import slow_frequencies
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.identification.identify import ripples_left
+from blf_dsc_controller.identification.problem import problem_of
+from blf_dsc_controller.identification.recording import resampled
+from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.ripple import (
     NOTHING,
     Ripple,
@@ -22,20 +26,74 @@ from blf_dsc_controller.identification.ripple import (
 )
 from blf_dsc_controller.identification.summary import ripple_table
 from blf_dsc_controller.simulation.loop import simulate
+from sim_plant.plant import plant_of
 
 LOAD = {'begin': [10.0], 'duration': [100.0], 'payload': [3.0]}
+
+
+SECONDS = 20.0
+EVERY = 4  # samples of 1 ms
+SHARE = 0.008  # of the rated torque
+RAMP = 2.0  # s, in which the motion begins
+GAINS = 8.0, 0.48  # 1/rad and s/rad, times the effort
+
+
+def found_in_recording(recording, robot, load=None):
+    """Return what is found; a load comes at that time [s].
+
+    Friction is fitted as viscous and Coulomb friction: terms are not selected, which takes long.
+    """
+    problem = problem_of(recording, robot, 'torque', load, find_signs=False)
+    prior = problem.prior.only([])
+    fit = fitted(problem.rows, problem.windows.moving, problem.G, prior)
+    return ripples_left(problem, np.zeros(len(recording.joints)), fit)
+
+
+def amplitudes_of(config):
+    """Return the amplitude (n,) [N m] of each ripple."""
+    return SHARE * np.array(config.actuator.torque_limit)
+
+
+def moved(config, cycles, reference, pace):
+    """Return states (k, 3, n) of a PD on a motion, with ripples of N `cycles` at the motors."""
+    chain = config.robot.chain(config.joints)
+    T = config.sample_time
+    motion = reference.at(pace * np.arange(round(SECONDS / T)) * T)
+    start = motion[0, 0]
+    initial = replace(config.initial, position=tuple(start.tolist()))
+    plant = plant_of(replace(config, initial=initial))
+    efforts = np.array([min(joint.effort, 100.0) for joint in chain.joints])
+    states = np.zeros((len(motion), 3, efforts.size))
+    amplitudes = amplitudes_of(config)
+    ripple = np.zeros(efforts.size)
+    for k, (position, velocity, _) in enumerate(motion):
+        q, dq, effort = plant.measure().reshape(3, -1)
+        states[k] = q, dq, effort + ripple
+        waves = [
+            np.sin(np.multiply(own, at)) for own, at in zip(cycles, q, strict=True)
+        ]
+        ripple = amplitudes * [each.sum() for each in waves]
+        begun = min(1.0, k * T / RAMP)
+        error = start + begun * (position - start) - q
+        p, d = GAINS
+        plant.step(efforts * (p * error + d * (begun * pace * velocity - dq)) - ripple)
+    return states
 
 
 def found_in(
     cycles, preset='ur5e', *, seed=0, pace=1.0, reach=1.0, events=None, load=None
 ):
     """Return what is found of an arm with N of each joint, and the true amplitudes."""
-    config = config_of(preset, seed, **(events or {}))
+    plant = {'actuator.ripple': 0.0, 'truth.seed': seed}
+    for name in ('begin', 'duration', 'payload'):
+        plant[f'events.{name}'] = (events or {}).get(name, [])
+    config = load_loop(preset, {PLANT: plant}).plant
     reference = reference_of(config.robot.chain(config.joints), seed)
     reference = reference._replace(amplitude=reach * reference.amplitude)
-    n = len(config.joints)
-    true = [cycles[i % len(cycles)] for i in range(n)]
-    return found_of(config, true, reference, pace, load), amplitudes_of(config)
+    true = [cycles[i % len(cycles)] for i in range(len(config.joints))]
+    states = moved(config, true, reference, pace)[::EVERY]
+    recording = recording_of(states, config.joints, EVERY * config.sample_time)
+    return found_in_recording(recording, config.robot, load), amplitudes_of(config)
 
 
 def check(found, amplitudes, cycles):
@@ -92,7 +150,11 @@ def along_reference(preset, *, slow, ripple):
     if slow:
         rates = list(slow_frequencies(controller))
         controller = change(controller, {'reference.frequency': rates})
-    return found_along(simulate(controller, loop.plant).run(), controller)
+    run = simulate(controller, loop.plant).run()
+    states = run.stamp[::EVERY], run.position[::EVERY], run.torque[::EVERY]
+    turning = np.zeros(len(run.joints), dtype=bool)
+    recording = resampled(run.joints, *states, '', turning)
+    return found_in_recording(recording, controller.robot)
 
 
 def test_motion_that_repeats_is_told():

@@ -15,8 +15,6 @@ import pytest
 from paper_case import OFF, configured, instead, several
 from scipy.linalg import expm
 
-from benchmark.random_arms import THIS
-from benchmark.soft_arms import ALL, drawn, figures
 from benchmark.studies import load_study
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
@@ -473,15 +471,26 @@ def test_amplitude_of_the_ripple_is_learned():
     np.testing.assert_allclose(learned[3:6], amplitude[3:], rtol=0.15)
 
 
+def errors_of(preset, law, plant):
+    """Return times (N,) and errors (N, n) [mrad] of an arm that picks up 2 kg at 8 s."""
+    arm = event(8.0, 2.0) | {'truth.seed': 3, 'seed': 3} | plant
+    config = configured(preset, 16.0, law, arm)
+    run = simulate(config.controller, config.plant).run()
+    assert not run.stops
+    return run.time, 1e3 * np.asarray(run.error)
+
+
 def test_friction_that_grows_with_the_load_is_learned():
-    """Gears that lose 7 % of their torque; from 3.5 s after a pick-up on, 2.3 of 3.9 mrad."""
-    true = drawn(ALL['ur5e'], 3)
-    learned, without = (
-        figures('ur5e', THIS, 3, {'learning.load_friction': is_on}, true=true)
-        for is_on in (True, False)
-    )
-    assert learned.errors[2] < 0.7 * without.errors[2]
-    assert learned.rms < 0.85 * without.rms
+    """Gears that lose 7 % of their torque; from 3.5 s after the pick-up on."""
+    gears = {'disturbance.load_share': 0.07, 'disturbance.stribeck': 0.23}
+    largest, rms = [], []
+    for is_on in (True, False):
+        time, errors = errors_of('ur5e', {'learning.load_friction': is_on}, gears)
+        late = errors[time >= 11.5]
+        largest.append(np.abs(late).max())
+        rms.append(np.sqrt(np.mean(late**2)))
+    assert largest[0] < 0.7 * largest[1]
+    assert rms[0] < 0.85 * rms[1]
 
 
 def test_load_friction_needs_coulomb_friction():
@@ -496,12 +505,13 @@ def test_load_friction_needs_coulomb_friction():
 
 def test_weak_ripple_that_is_listed_costs_nothing():
     """Of 0.16 % of the rated torque, while little is learned yet; 1.38 times if doubted by 5 %."""
-    true = drawn(ALL['panda'], 3)
-    without, listed = (
-        figures('panda', THIS, 3, changes, true=true).errors[0]
-        for changes in ({}, RIPPLE)
-    )
-    assert listed < 1.05 * without
+    gears = {'joint.stiffness': [1e4] * 7, 'disturbance.stribeck': 0.14}
+    gears |= {'disturbance.stribeck_velocity': 0.12}
+    largest = []
+    for law in ({}, RIPPLE):
+        time, errors = errors_of('panda', law, gears)
+        largest.append(np.abs(errors[(time >= 4.0) & (time < 8.0)]).max())
+    assert largest[1] < 1.05 * largest[0]
 
 
 def test_geared_arm_learns_its_friction_at_breakaway():

@@ -31,8 +31,7 @@ from blf_dsc_controller.studies.monte_carlo import load_study
 
 ROOT = Path(__file__).resolve().parents[1]
 DOC = ROOT / 'doc'
-OUTSIDE = ('README.md', 'CONTRIBUTING.md', 'benchmark/STUDIES.md')
-SHOWN_ON = {'benchmark/STUDIES.md': ROOT / 'doc' / 'results.md'}  # of the site
+OUTSIDE = ('README.md', 'CONTRIBUTING.md')
 PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md'))]
 SAVED = re.compile(r'Save this as\s`(\w+\.py)`')
 MAKEFILE = (ROOT / 'Makefile').read_text()
@@ -311,7 +310,7 @@ def test_links_outside_the_site_are_valid(name, site):
     for link in re.findall(r'\]\(([^)\s]+)\)', page.read_text()):
         url = urlsplit(link)
         if not url.scheme:
-            target = page.parent / url.path if url.path else SHOWN_ON[name]
+            target = page.parent / url.path
             assert target.exists(), link
             assert not url.fragment or url.fragment in anchors[target.stem], link
 

@@ -8,9 +8,6 @@ import pytest
 
 pytest.importorskip('ruckig', reason='needs ruckig')
 
-from benchmark import scaling as table_of_scaling
-from benchmark import streams as table_of_streams
-from benchmark.__main__ import main as table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.reference.approach import hold
@@ -22,22 +19,6 @@ from blf_dsc_controller.reference.trajectory import TrajectoryError
 FASTEST = np.array([1.5, 1.5])
 SLOPE = np.array([0.3, -0.2])  # rad/s
 TIMEOUT = 1.0  # s
-
-
-@pytest.fixture
-def scaling(monkeypatch):
-    """Return the table `scaling` for a few motions."""
-    monkeypatch.setattr(table_of_scaling, 'MOTIONS', 8)
-    monkeypatch.setattr(table_of_scaling, 'SPACINGS', (0.1,))
-    return table_of_scaling
-
-
-@pytest.fixture
-def streams(monkeypatch):
-    """Return the table `streams` for short streams at 50 Hz."""
-    monkeypatch.setattr(table_of_streams, 'RATES', (50.0,))
-    monkeypatch.setattr(table_of_streams, '_DURATION', 4.6)
-    return table_of_streams
 
 
 def receive(stream, sent, late=0.0):
@@ -128,59 +109,6 @@ def test_messages_that_arrive_together_are_counted_once():
     # three arrivals of 64 are late by a mean of 0.01 s
     assert target.due == pytest.approx(sent[-1] + 0.01, abs=0.001)
     np.testing.assert_allclose(target.velocities, SLOPE, rtol=0.02)
-
-
-def test_lost_messages_cost_little_more_than_none(streams):
-    """A tenth is lost: at most the next interval on the line, then the way back to the stream.
-
-    In 20 ms on the line, the motion with 1.8 rad/s^2 leaves it by 0.4 mrad and
-    36 mrad/s. Its way back within 6 rad/s^2 and 120 rad/s^3 takes 35 ms, 0.6 mrad.
-    """
-    found = {}
-    for lost in (0.0, 0.1):
-        times, reference = streams.followed(streams.messages(0.01, 0.0, lost), 0.01)
-        found[lost] = streams.lag_of(times, reference[:, 0])
-    assert found[0.1][0] <= found[0.0][0] + 0.001
-    assert found[0.1][1] <= found[0.0][1] + 0.001
-
-
-@pytest.mark.usefixtures('streams')
-def test_tables_of_streams_and_chunks_are_printed(monkeypatch, capsys):
-    """A stream at 50 Hz is an interval behind, and what latency and planning take."""
-    monkeypatch.setattr(table_of_streams, '_SAMPLE', 2e-3)
-    assert table(['streams']) == 0
-    text = capsys.readouterr().out
-    rows = [line.split(' | ') for line in text.splitlines() if 'mrad |' in line]
-    assert [row[0].lstrip('| ') for row in rows] == [
-        *('positions', 'positions, late', 'positions, lost'),
-        *('with velocities', 'with velocities, late', 'with velocities, lost'),
-    ]
-    for row in rows:
-        lag, off = (float(each.split()[0]) for each in row[1].split(','))
-        assert 19.0 <= lag <= 30.0
-        assert off < 5.0
-    chunks = [line for line in text.splitlines() if 'this package' in line]
-    # 6 rad/s^2 is the limit
-    accelerations = [float(line.split(' | ')[4]) for line in chunks]
-    assert len(accelerations) == 3
-    assert max(accelerations) <= 6.0
-
-
-@pytest.mark.usefixtures('scaling')
-def test_motions_of_moveit_are_stretched_as_little_as_the_table_says(capsys):
-    """With all of the limits all are, with 0.9 of the velocity and 0.6 few and little."""
-    assert table(['scaling']) == 0
-    rows = [
-        line.strip('| ').split(' | ') for line in capsys.readouterr().out.splitlines()
-    ]
-    found = {tuple(row[:2]): row[2] for row in rows[2:]}
-    shares = [
-        [float(each.strip(' %|')) for each in found[scale].split(',')]
-        for scale in (('1', '1'), ('0.9', '0.6'))
-    ]
-    assert shares[0][0] == 100.0
-    assert shares[1][0] < 50.0
-    assert shares[1][1] <= 2.0
 
 
 @pytest.mark.parametrize('held', [True, False])

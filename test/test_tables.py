@@ -14,7 +14,6 @@ import pytest
 from benchmark.__main__ import listing, main, parser_of
 from benchmark.studies import load_study
 from benchmark.tables import BENCH, TABLES, module_of
-from blf_dsc_controller.cli.main import main as blf_dsc
 
 ROOT = Path(__file__).resolve().parents[1]
 NO_TABLES = {'__main__', 'null_node'}  # programs of their own
@@ -43,8 +42,6 @@ def test_every_module_that_makes_a_table_is_listed_with_one_line(capsys):
 
 @pytest.mark.parametrize('name', TABLES)
 def test_help_of_a_table_says_how_it_is_called(name):
-    if name == 'league':
-        pytest.importorskip('mujoco')
     text = parser_of(name).format_help()
     assert text.count(f'python -m benchmark {name}') >= 2  # the usage, and an example
 
@@ -69,7 +66,7 @@ def test_unknown_table_is_answered_by_the_list(capsys):
 
 def test_error_of_a_table_is_one_line_and_an_exit_code(tmp_path):
     run = subprocess.run(
-        [sys.executable, '-m', 'benchmark', 'contacts', '--out', str(tmp_path)],
+        [sys.executable, '-m', 'benchmark', 'paper', '--out', str(tmp_path)],
         check=False,
         capture_output=True,
         text=True,
@@ -77,7 +74,7 @@ def test_error_of_a_table_is_one_line_and_an_exit_code(tmp_path):
     )
     assert run.returncode == 1
     assert run.stderr == (
-        f'benchmark contacts: {tmp_path} exists already and is not overwritten: '
+        f'benchmark paper: {tmp_path} exists already and is not overwritten: '
         'choose another --out\n'
     )
 
@@ -92,16 +89,3 @@ def test_only_peers_have_the_threads_of_this_computer(monkeypatch, name, threads
     run = sys.modules['benchmark.__main__'].main
     assert run([name]) == 0
     assert os.environ.get('OPENBLAS_NUM_THREADS') == threads
-
-
-@pytest.mark.parametrize(
-    ('command', 'table'),
-    [('paper', 'paper'), ('tool', 'tool-bound'), ('contacts', 'contacts')],
-)
-def test_command_of_earlier_versions_says_where_its_table_is(command, table, capsys):
-    assert table in TABLES
-    with pytest.raises(SystemExit) as ended:
-        blf_dsc([command, '--out', 'nowhere'])
-    assert ended.value.code == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert f': in a checkout, call python -m benchmark {table}; see ' in last

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import product
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 from random_arm import chain_of
 from recorded_run import compared
 
-from benchmark.__main__ import main as table
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import panels
@@ -433,49 +431,3 @@ def test_without_a_bound_at_the_tool_nothing_of_it_is_shown():
     config = load_loop('panda_rigid').controller
     assert tool_of(config) is None
     assert flatten(config)['barrier.bound'] == (0.005,) * 7
-
-
-def test_study_tries_the_bound_by_one_command(tmp_path, capsys):
-    out = tmp_path / 'out'
-    words = [
-        'tool-bound',
-        '--config',
-        'ur5e_rigid',
-        '--bound',
-        '0.005',
-        '--runs',
-        '150',
-    ]
-    assert table([*words, '--truths', '1', '--out', str(out)]) == 0
-    header, row, wrote = capsys.readouterr().out.splitlines()
-    assert header.startswith('mm at the tool')
-    assert row.split()[:2] == ['ur5e_rigid', '5.00']
-    assert wrote.endswith('tool.json, tool.png')
-    assert (out / 'tool.png').stat().st_size > 10_000
-    figures = json.loads((out / 'tool.json').read_text())['ur5e_rigid']
-    assert figures['random runs'] == 150
-    assert figures['above the certified bound'] == 0
-    assert figures['above that of their posture'] == 0
-    assert figures['certified at a posture over its worst corner']['largest'] < 1.05
-    assert 1.0 < figures['along the reference']['ratio'] < 1.5
-    (loop,) = figures['closed loops']
-    assert loop['stops'] == []
-    assert 0.0 < loop['error'] < loop['bound'] < 0.005
-    # what is measured is really near what is certified: the study can find a violation
-    assert figures['certified over measured']['least'] < 1.5
-
-
-@pytest.mark.parametrize(
-    ('words', 'problem'),
-    [
-        (['--bound', '0'], '--bound: got 0 m, but it must be above 0'),
-        (['--bound', '1e-9'], 'finer than any encoder'),
-        (['--config', 'recommended'], 'model two_link has no tool'),
-        (['--config', 'nowhere'], 'nowhere does not exist'),
-    ],
-)
-def test_study_refuses_what_it_cannot_try(tmp_path, capsys, words, problem):
-    out = tmp_path / 'out'
-    assert table(['tool-bound', *words, '--out', str(out)]) == 1
-    assert problem in capsys.readouterr().err
-    assert not out.exists()

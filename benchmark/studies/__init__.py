@@ -7,6 +7,9 @@ from pathlib import Path
 
 from blf_dsc_controller.studies import monte_carlo
 
+FREE = 0.3
+"""Bound [rad] that no law leaves unless its arm oscillates."""
+
 
 def path_of(name: str) -> Path:
     """Return the file of a study."""

@@ -14,8 +14,6 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.commands import COMMANDS, Command
 
 _WIDTH = 88
-_MOVED = {'paper': 'paper', 'tool': 'tool-bound', 'contacts': 'contacts'}
-"""Commands of earlier versions, by their tables of `benchmark`."""
 _OTHERS = {'view': 'blf_dsc run --view shows a run, arm_view a running loop'}
 """What is meant by words that are no command."""
 
@@ -101,11 +99,6 @@ def _add(commands: argparse._SubParsersAction[_Parser], command: Command) -> Non
 def check_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
     """End with a suggestion if the first word is meant for a command, but is none."""
     known = parser.get_default('commands')
-    if words and words[0] in _MOVED:
-        parser.error(
-            f'{words[0]} makes a table of the project: in a checkout, call '
-            f'python -m benchmark {_MOVED[words[0]]}'
-        )
     if words and words[0] in _OTHERS:
         parser.error(f'no command {words[0]}: {_OTHERS[words[0]]}')
     if words and not words[0].startswith('-') and words[0] not in known:
