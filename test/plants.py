@@ -56,8 +56,13 @@ FULL = ROUGH | {
 """Every kind of imperfection."""
 
 
-def plant(*, start=START, velocity=QUIET, **changes):
-    """Return an arm at 1 kHz with parameters, named without sensor, actuator or disturbance."""
+def plant(**changes):
+    """Return the arm of a `configuration`."""
+    return plant_of(configuration(**changes))
+
+
+def configuration(*, start=START, velocity=QUIET, **changes):
+    """Return that of an arm at 1 kHz, named without sensor, actuator or disturbance."""
     given = IDEAL | {'initial.position': start, 'initial.velocity': velocity}
     given |= {NAMES.get(name, name): value for name, value in changes.items()}
     lists = (np.ndarray, tuple)
@@ -65,7 +70,7 @@ def plant(*, start=START, velocity=QUIET, **changes):
         k: [float(x) for x in v] if isinstance(v, lists) else v
         for k, v in given.items()
     }
-    return plant_of(build(PlantConfig, given))
+    return build(PlantConfig, given)
 
 
 def true_parameters(config, t=0.0):

@@ -13,12 +13,8 @@ from plants import PERIOD, QUIET, commands, plant, true_parameters
 from random_arm import CONFIG, GRAVITY
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.messages.codecs import JointStateDecoder
-from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
 from sim_plant.plant import plant_of
 from sim_plant.settings import plant_settings, true_inertias
 
@@ -85,34 +81,26 @@ def test_random_truth_deviates_as_configured_and_stays_physical():
     """A shift only moves the centre of mass: the inertia about it remains."""
     config = panda_config({'truth.mass_deviation': 0.3, 'truth.centre_deviation': 0.01})
     chain = config.robot.chain(config.joints)
+    urdf = chain.inertias
     bodies = np.array(
         [
             true_inertias(chain, change(config, {'truth.seed': seed}).truth)
             for seed in range(100)
         ]
     )
-    masses = bodies[:, :, 0] / chain.inertias[:, 0]
-    centres, original = (
-        rows[..., 1:4] / rows[..., :1] for rows in (bodies, chain.inertias)
-    )
-    for found, nearly, most in (
-        (masses - 1.0, 0.29, 0.3),
-        (centres - original, 0.0099, 0.01),
-    ):
-        assert nearly < found.max() < most
-        assert -most < found.min() < -nearly
-    assert abs(masses.mean() - 1.0) < 0.03
-    for true, urdf in zip(
-        bodies.reshape(-1, 10), np.tile(chain.inertias, (100, 1)), strict=True
-    ):
-        least, expected = (
-            np.linalg.eigvalsh(pseudo_inertia(phi))[0] for phi in (true, urdf)
-        )
-        assert least > -1e-12 * abs(expected)
-        about = [
-            pinocchio.Inertia.FromDynamicParameters(phi).inertia for phi in (true, urdf)
-        ]
-        np.testing.assert_allclose(about[0] / true[0], about[1] / urdf[0], atol=1e-12)
+    masses = bodies[:, :, 0] / urdf[:, 0] - 1.0
+    shifts = bodies[:, :, 1:4] / bodies[:, :, :1] - urdf[:, 1:4] / urdf[:, :1]
+    for found, most in ((masses, 0.3), (shifts, 0.01)):
+        assert 0.96 * most < found.max() < most
+        assert -most < found.min() < -0.96 * most
+    about = pinocchio.Inertia.FromDynamicParameters
+    for body in bodies:
+        for true, given in zip(body, urdf, strict=True):
+            np.testing.assert_allclose(
+                about(true).inertia / true[0],
+                about(given).inertia / given[0],
+                atol=1e-12,
+            )
     again = true_inertias(chain, change(config, {'truth.seed': 99}).truth)
     np.testing.assert_array_equal(again, bodies[-1])
 
@@ -144,21 +132,6 @@ def test_events_act_on_all_seven_joints_at_their_time():
     )
     np.testing.assert_allclose(load, expected, rtol=1e-12)
     np.testing.assert_allclose(arm.measure()[:7] - q, values[4], atol=1e-12)
-
-
-def test_two_plants_of_a_urdf_are_independent_and_repeatable():
-    first = plant_of(panda_config({}))
-    second = plant_of(panda_config({'load.payload': 1.0}))
-    rows = [], []
-    for torque in swinging_torques(50):
-        first.step(torque)
-        second.step(torque)
-        rows[0].append(first.measure().copy())
-    first.reset()
-    for torque in swinging_torques(50):
-        first.step(torque)
-        rows[1].append(first.measure().copy())
-    np.testing.assert_array_equal(*rows)
 
 
 def waited(plant, samples):
@@ -223,53 +196,6 @@ def test_reflex_stops_the_arm_after_a_jump_of_the_torque_until_a_reset(
     assert np.all(plant.measure()[:7] == before[:7]) == stops
     plant.reset()
     assert not plant.is_stopped
-
-
-def test_joint_states_may_have_another_order_and_other_joints():
-    joints = ('a', 'b')
-    names = ('finger', 'b', 'a')
-    measurement = np.arange(1.0, 7.0)
-    _, raw = PlantTelemetry(joints, (), names).joint_states(5, measurement)
-    ours = JointStateDecoder(joints)
-    others = JointStateDecoder(names)
-    assert ours.decode(raw) == others.decode(raw) == 5
-    np.testing.assert_array_equal(ours.values, measurement)
-    np.testing.assert_array_equal(others.position, [0.0, 2.0, 1.0])
-
-
-@pytest.mark.parametrize(
-    ('given', 'problem'),
-    [
-        (
-            {'robot.drive_payload': 1.5},
-            'robot.drive_payload: got 1.5 kg, but drive_compensates is',
-        ),
-        (
-            {'robot.urdf': '', 'robot.tip': ''} | HELD,
-            'drive_compensates: got gravity, which needs',
-        ),
-        (
-            {'robot.urdf': '', 'truth.mass_factor': 1.1},
-            'truth: it applies only to a URDF',
-        ),
-        (
-            {'robot.urdf': '', 'actuator.ripple': 0.1},
-            'actuator.ripple: .* give actuator.torque_',
-        ),
-        (
-            {'drive.mass_factor': 0.9},
-            'drive: without robot.drive_compensates the drives need no',
-        ),
-        (
-            {'sensor.published_joints': ['panda_joint1', 'gripper']},
-            'sensor.published_joints: panda_joint2, .* of `joints` is missing',
-        ),
-    ],
-)
-def test_mistakes_give_one_line(given, problem):
-    with pytest.raises(ConfigurationError, match=problem) as raised:
-        build(PlantConfig, PANDA | given)
-    assert len(raised.value.problems) == 1
 
 
 SAMPLES = 60
@@ -383,33 +309,3 @@ def test_readings_and_torques_are_those_of_encoders_and_drives_in_plain_numpy(se
     for state, torque in zip(true, moved, strict=True):
         np.testing.assert_allclose(ideal.truth()[5:], state, rtol=1e-11, atol=1e-12)
         ideal.step(torque)
-
-
-@pytest.mark.parametrize('read', [False, True])
-@pytest.mark.parametrize('repeat_every', [0, 3])
-@pytest.mark.parametrize('position_noise', [0.0, 1e-3])
-@pytest.mark.parametrize('torque_noise', [0.0, 0.01])
-def test_noise_of_a_span_is_that_of_its_readings(
-    read, repeat_every, position_noise, torque_noise
-):
-    """Also where the first sample has been read before."""
-    given = {
-        'repeat_every': repeat_every,
-        'position_noise': position_noise,
-        'torque_noise': torque_noise,
-    }
-    span, single = plant(seed=1, **given), plant(seed=1, **given)
-    if read:
-        span.measure()
-        single.measure()
-    noise = span.noise_of(20)
-    for k in range(20):
-        expected = np.zeros(8)
-        before = single.rng.bit_generator.state
-        single.measure()
-        if single.rng.bit_generator.state != before:
-            expected = single._noise
-        np.testing.assert_array_equal(noise[k], expected, err_msg=f'sample {k}')
-        single.step(np.zeros(2))
-    assert span.rng.bit_generator.state == single.rng.bit_generator.state
-    assert noise.any() == bool(position_noise or torque_noise)

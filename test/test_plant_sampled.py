@@ -6,66 +6,34 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from paper_case import NO_DISTURBANCE
-from plants import ARM, FULL, PERIOD, ROUGH, START, commands, energies, plant, run
+from plain_law import R, dynamics
+from plants import (
+    ARM,
+    FULL,
+    PERIOD,
+    ROUGH,
+    START,
+    commands,
+    configuration,
+    energies,
+    plant,
+    run,
+)
 from scipy.integrate import RK45
 from scipy.interpolate import CubicSpline
 
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build
-from sim_plant.kernels import plant_views
-from sim_plant.motion import (
-    disturbing_torque,
-    integrate,
-    state_derivative,
-    update_loads,
-)
 from sim_plant.plant import plant_of
-from sim_plant.settings import _steps_of, plant_settings
+from sim_plant.settings import plant_settings
 from sim_plant.torque_input import TorqueInput
 
-INITIAL = np.array([*START, 0.5, -1.0])
 TORQUE = np.array([-6.0, -2.0])
 
 
-def views(**changes):
-    """Settings and state of a plant."""
-    arm = plant(**changes)
-    found = plant_views(arm.arm, arm.settings, arm.state)
-    update_loads(*found)
-    return found
-
-
-def advanced(load, t, h, x=INITIAL, torque=TORQUE):
-    """State after a step of h seconds."""
-    arm, now = views(**load)
-    now.x[:4] = x
-    integrate(arm, now, t, h, torque)
-    return now.x[:4].copy()
-
-
-def rhs(load, torque):
-    """Right-hand side for scipy."""
-
-    def evaluate(t, x):
-        dx = np.empty(4)
-        state_derivative(*views(**load), t, x, torque, dx)
-        return dx
-
-    return evaluate
-
-
-def test_dopri5_step_matches_scipys_rk45():
-    """The disturbance is evaluated within the step, too."""
-    h = 0.05
-    rk45 = RK45(rhs(ROUGH, TORQUE), 0.3, INITIAL, 1.0, first_step=h, rtol=1e9, atol=1e9)
-    rk45.step()
-    assert rk45.t == 0.3 + h
-    assert advanced(ROUGH, 0.3, h) == pytest.approx(rk45.y, rel=1e-14)
-
-
-def torque_of(arm, t, q, dq):
+def torque_of(config, t, q, dq):
     """The disturbance in plain numpy: friction has the sign of the velocity, and more near rest."""
-    load = arm.disturbance
+    load = plant_settings(config).disturbance
     near_rest = 1.0 + load.stribeck * np.exp(-((dq / load.stribeck_velocity) ** 2))
     friction = load.viscous * dq + load.coulomb * near_rest * np.tanh(
         dq / load.coulomb_velocity
@@ -75,33 +43,42 @@ def torque_of(arm, t, q, dq):
     return load.constant + sine + friction + ripple
 
 
-def test_disturbances_of_every_kind_add_up_for_each_joint():
-    for changes in (
-        FULL,
-        {'coulomb': (0.3, 0.5)},
-        {'ripple': 0.1, 'torque_limit': (1.0, 2.0)},
-    ):
-        arm, now = views(**changes)
-        for q, dq in np.random.default_rng(0).normal(size=(10, 2, 2)) * [[1.0], [0.2]]:
-            found = np.empty(2)
-            disturbing_torque(arm, now, 1.7, np.concatenate((q, dq)), found)
-            np.testing.assert_allclose(found, torque_of(arm, 1.7, q, dq), rtol=1e-13)
+def test_dopri5_step_matches_scipys_rk45():
+    """Of the equations of motion in plain numpy; the disturbance is evaluated in the step, too."""
+    h = 0.05
+    arm = plant(velocity=(0.5, -1.0), sample_time=h, **ROUGH)
+
+    def slope(t, x):
+        q, dq = x.reshape(2, 2)
+        M, C, G = dynamics((1.0, 0.32, 0.4), R, q, dq)
+        load = torque_of(configuration(**ROUGH), t, q, dq)
+        return np.concatenate((dq, np.linalg.solve(M, TORQUE - C @ dq - G - load)))
+
+    start = np.array([*START, 0.5, -1.0])
+    rk45 = RK45(slope, 0.0, start, 1.0, first_step=h, rtol=1e9, atol=1e9)
+    rk45.step()
+    arm.step(TORQUE)
+    np.testing.assert_allclose(arm.truth()[5:], rk45.y, rtol=1e-13)
 
 
-def test_positive_disturbance_decelerates_the_joint_and_is_in_the_truth():
-    """In the equation of motion tau_dist is on the side of M ddq."""
-    undisturbed = plant()
-    disturbed = plant(constant=(0.0, 1.0))
+@pytest.mark.parametrize(
+    'changes',
+    [ROUGH, {'coulomb': (0.3, 0.5)}, {'ripple': 0.1, 'torque_limit': (1.0, 2.0)}],
+)
+def test_disturbances_of_every_kind_add_up_against_the_motion(changes):
+    """In the equation of motion they are on the side of M ddq."""
+    config = configuration(velocity=(0.3, -0.2), **changes)
+    arm = plant_of(config)
+    for k in range(100):
+        P, load, q, dq = np.split(arm.truth(), [3, 5, 7])
+        expected = torque_of(config, k * 1_000_000 * 1e-9, q, dq)
+        np.testing.assert_allclose(load, expected, rtol=1e-12, atol=1e-15)
+        arm.step(TORQUE)
+    assert pytest.approx([1.0, 0.32, 0.4]) == P
+    undisturbed, disturbed = plant(), plant(constant=(0.0, 1.0))
     undisturbed.step(np.zeros(2))
     disturbed.step(np.zeros(2))
     assert disturbed.truth()[-1] < undisturbed.truth()[-1]
-    arm = plant(velocity=(0.3, -0.2), **ROUGH)
-    for _ in range(100):
-        arm.step(TORQUE)
-    P, load, q, dq = np.split(arm.truth(), [3, 5, 7])
-    assert pytest.approx([1.0, 0.32, 0.4]) == P
-    expected = torque_of(views(**ROUGH)[0], 100_000_000 * 1e-9, q, dq)
-    np.testing.assert_allclose(load, expected, rtol=1e-13)
 
 
 def test_friction_grows_with_the_torque_of_the_drive():
@@ -171,17 +148,6 @@ def test_torque_is_stale_after_its_limit_and_each_such_step_counts():
     received.renew(10)
     assert not received.count_stale(13, 3)
     assert received.stale_steps == 2
-
-
-def test_sample_times_are_whole_nanoseconds():
-    """The disturbance is evaluated at t_k = (k T_ns) 1e-9 s, to the last bit."""
-    period_ns, x = 333_333, np.array([*START, 0.0, 0.0])
-    load = {'amplitude': (1.0, 1.0), 'frequency': (1e6, 1e6)}
-    arm = plant(sample_time=period_ns * 1e-9, **load)
-    for k, torque in enumerate(commands(100)):
-        arm.step(torque)
-        x = advanced(load, (k * period_ns) * 1e-9, period_ns * 1e-9, x, torque)
-    assert (arm.truth()[5:] == x).all()
 
 
 @pytest.mark.parametrize('source', ['measured', 'differenced'])
@@ -336,15 +302,3 @@ def test_sloshing_load_begins_at_rest_relative_to_the_tip_and_leaves_no_trace():
         assert np.abs(rate).max() <= (1e-15 if k == 20 else 2e-2)
     np.testing.assert_array_equal(x[:20, :4], sloshing(20, sloshing=[0.0])[:, :4])
     np.testing.assert_array_equal(x[41, 4:], x[59, 4:])  # frozen, and of no effect
-
-
-@pytest.mark.parametrize(('slope', 'steps'), [(0.0, 1), (5.0, 4), (1e6, 1000)])
-def test_integrator_takes_the_steps_that_friction_near_rest_needs(slope, steps):
-    """Of a joint of 1 g m^2 at 1 kHz: e^-1.5 is left after one at most, but for a limit."""
-
-    class Light:
-        def accelerate(self, _t, _q, _dq, torque, out):
-            out[:] = torque / 1e-3
-
-    config = build(PlantConfig, {'sample_time': 1e-3})
-    assert _steps_of(config, Light(), np.array([0.0, slope])) == steps

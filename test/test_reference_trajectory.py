@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 
 import hypothesis
 import numpy as np
@@ -13,12 +12,9 @@ import pytest
 from hypothesis import strategies as st
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.motion_groups import MotionLimits
-from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.reference import retargeting
 from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.approach import MotionError, worst_violation
 from blf_dsc_controller.reference.stream import TargetStream
 from blf_dsc_controller.reference.terms import (
     minimum_jerk,
@@ -28,7 +24,6 @@ from blf_dsc_controller.reference.terms import (
     sampled,
     sinusoids_term,
     spline_term,
-    turning_times,
     unpack,
 )
 from blf_dsc_controller.reference.trajectory import (
@@ -115,16 +110,6 @@ MOMENTS = np.array([0.5, 1.0, 1.2, 2.5, 4.0])
 POINTS = np.random.default_rng(3).normal(size=(5, 2))
 
 
-def test_minimum_jerk_passes_through_its_points_from_rest_to_rest():
-    motion = pack(2, [minimum_jerk(MOMENTS, POINTS)])
-    now = sampled(motion, MOMENTS)
-    np.testing.assert_allclose(now[:, 0], POINTS, atol=1e-12)
-    np.testing.assert_allclose(now[0, 1:], 0.0, atol=1e-12)
-    for t in (4.0, 9.0):
-        np.testing.assert_array_equal(at(motion, t), [POINTS[-1], (0, 0), (0, 0)])
-    np.testing.assert_allclose(at(motion, 4.0 - 1e-9)[1:], 0.0, atol=1e-6)
-
-
 def test_minimum_jerk_is_continuous_up_to_its_snap():
     """Only then no other velocity or acceleration at an inner point costs less jerk."""
     knots, pieces = pieces_of(minimum_jerk(MOMENTS, POINTS), 2)
@@ -192,25 +177,6 @@ def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last
     np.testing.assert_array_equal(plan(swapped).vector, motion.vector)
 
 
-def test_cubics_are_hermite_splines_with_a_smooth_lead_in():
-    """Halfway between two points, h apart: their mean plus h/8 times the decrease in velocity.
-
-    After braking, the lead-in is the quintic that set out from rest when the trajectory
-    began.
-    """
-    motion = plan(trajectory((GOALS, VELOCITIES)))
-    halfway = at(motion.vector, NOW + 1.5)[0]
-    expected = 0.5 * (GOALS[0] + GOALS[1]) + (VELOCITIES[0] - VELOCITIES[1]) / 8.0
-    np.testing.assert_allclose(halfway, expected, atol=1e-12)
-    before, after = (at(motion.vector, NOW + 1.0 + side)[2] for side in (-1e-9, 1e-9))
-    np.testing.assert_allclose(before, after, atol=1e-6)
-    assert np.abs(after).min() > 0.1
-    knots, pieces = pieces_of(unpack(motion.vector)[-1], 2)
-    lead_in = np.polynomial.Polynomial(pieces[1, 0])
-    at_begin = [lead_in.deriv(order)(NOW - knots[1]) for order in (1, 2)]
-    np.testing.assert_allclose(at_begin, 0.0, atol=1e-9)
-
-
 def test_trajectory_that_begins_now_at_another_position_is_blended_in():
     """A second one, planned while the blend is under way, is settled with that blend."""
     first = plan(trajectory((GOALS[::-1],), times=(0.0, 4.0, 8.0)))
@@ -219,17 +185,6 @@ def test_trajectory_that_begins_now_at_another_position_is_blended_in():
     np.testing.assert_allclose(at(first.vector, NOW + 4.0)[0], GOALS[1], atol=1e-12)
     later = plan(trajectory(begin=first.settled + 0.5), first.vector, NOW + 0.05)
     assert later.settled == first.settled
-
-
-def test_single_point_at_time_zero_is_reached_as_fast_as_the_limits_allow():
-    motion = plan(trajectory((GOALS[:1],), times=(0.0,)))
-    after = at(motion.vector, motion.settled)
-    np.testing.assert_allclose(after, [GOALS[0], (0, 0), (0, 0)], atol=1e-12)
-    _, dqr, ddqr = sampled(
-        motion.vector, np.linspace(NOW, motion.settled, 5001)
-    ).transpose(1, 0, 2)
-    used = max((np.abs(dqr) / 1.5).max(), (np.abs(ddqr) / 6.0).max())
-    assert used == pytest.approx(1.0, abs=0.05)
 
 
 def test_present_reference_continues_until_the_trajectory_begins_and_past_points_are_skipped():
@@ -256,58 +211,28 @@ def test_later_trajectory_replaces_running_and_waiting_ones():
         assert len(unpack(last)) == 1
 
 
-NAN = float('nan')
-
-
-def points_at(*times):
-    return Trajectory(
-        JOINTS, tuple(TrajectoryPoint(float(t), (1.0, 1.0)) for t in times)
-    )
-
-
-def one_point(*fields, **more):
-    return Trajectory(JOINTS, (TrajectoryPoint(1.0, *fields, **more),))
-
-
-MIXED = (TrajectoryPoint(1.0, (1.6, 1.2), (0.0, 0.0)), TrajectoryPoint(2.0, (1.6, 1.2)))
 REPEATED = trajectory((np.hstack((GOALS, GOALS[:, 1:])),), joints=(*JOINTS, 'elbow'))
-MOVING_ON = VELOCITIES + np.array([[0.0], [np.inf], [0.0]])
+NOT_FINITE = VELOCITIES + np.array([[0.0], [np.inf], [0.0]])
+MIXED = (TrajectoryPoint(1.0, (1.6, 1.2), (0.0, 0.0)), TrajectoryPoint(2.0, (1.6, 1.2)))
 BAD = (
     (
         trajectory(joints=('shoulder', 'wrist')),
         "'wrist', but each of 'shoulder', 'elbow' is",
     ),
-    (
-        trajectory((GOALS[:, :1],), joints=JOINTS[:1]),
-        "its joints are 'shoulder', but each of",
-    ),
     (REPEATED, "'shoulder', 'elbow' is needed once"),
-    (Trajectory((), ()), 'its joints are none, but'),
     (Trajectory(JOINTS, ()), 'it has no points'),
-    (one_point(()), 'point 1 has no positions'),
-    (one_point((1.0,)), 'point 1 has positions [1.0], but 2 finite'),
-    (
-        one_point((1.0, 1.0), (0.0, 0.0, 0.0)),
-        'point 1 has velocities [0.0, 0.0, 0.0], but',
-    ),
-    (one_point((1.0, 1.0), (), (0.0, 0.0)), 'accelerations, but no velocities'),
-    (one_point((1.0, 1.0), effort=(1.0, 1.0)), 'leave effort empty'),
+    (Trajectory(JOINTS, (TrajectoryPoint(1.0, (1.0,)),)), '[1.0], but 2 finite'),
     (Trajectory(JOINTS, MIXED), 'do not all give the same'),
-    (trajectory((GOALS * [[1.0, NAN]],)), 'point 1 has positions [1.6, nan], but 2'),
-    (trajectory((GOALS, MOVING_ON)), 'point 2 has velocities [inf, inf], but 2'),
-    (trajectory(times=(1.0, 1.0, 2.0)), 'point 2 is at 1 s, not after'),
+    (trajectory((GOALS, NOT_FINITE)), 'point 2 has velocities [inf, inf], but 2'),
     (trajectory(times=(1.0, 2.0, 1.5)), 'point 3 is at 1.5 s, not after'),
-    (trajectory(times=(-1.0, 1.0, 2.0)), 'point 1 is 1 s before the beginning'),
     (trajectory(begin=-0.5), 'it ended 0.3 s ago'),
     (
         trajectory((FAR,), times=(5.0, 10.0, 15.0)),
         "point 2 has joint 'elbow' at 3.5 rad, past its limit of 3 rad",
     ),
-    (trajectory((FAR,), times=(0.0, 5.0, 10.0)), 'limits.position_lower'),
-    (points_at(1.0, 3601.0), 'it takes 3601 s, longer than 3600 s: send it in pieces'),
     (
-        points_at(*range(1, 10_002)),
-        'it has 10001 points, more than 10000: send it in pieces',
+        trajectory((GOALS[:1],), times=(3601.0,)),
+        'it takes 3601 s, longer than 3600 s: send it in pieces',
     ),
 )
 
@@ -316,12 +241,11 @@ def test_invalid_trajectory_is_rejected_with_the_reason():
     for bad, reason in BAD:
         with pytest.raises(TrajectoryError) as rejection:
             plan(bad)
-        assert isinstance(rejection.value, MotionError)
         assert reason in str(rejection.value)
 
 
 def test_all_problems_are_reported_at_once():
-    points = TrajectoryPoint(1.0, (1.0,)), TrajectoryPoint(2.0, (NAN, 1.0))
+    points = TrajectoryPoint(1.0, (1.0,)), TrajectoryPoint(2.0, (np.nan, 1.0))
     with pytest.raises(TrajectoryError) as rejection:
         plan(Trajectory(('shoulder', 'wrist'), points))
     assert len(rejection.value.problems) == 3
@@ -364,37 +288,6 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
     np.testing.assert_array_equal(dqr[-1], (0.0, 0.0))
 
 
-@pytest.mark.parametrize(('speed', 'goal', 'time'), [(1.4, 0.3, 0.45), (0.6, 0.9, 1.0)])
-def test_point_that_needs_more_time_for_braking_is_still_reached(speed, goal, time):
-    """The gentle braking does not fit, or leaves too little time.
-
-    Up to all the time there is.
-    """
-    sent = trajectory((np.array([[goal, 0.0]]),), times=(time,))
-    motion = plan(sent, moving((speed, 0.0)), 0.0)
-    np.testing.assert_allclose(
-        at(motion.vector, time), [(goal, 0.0), (0, 0), (0, 0)], atol=1e-9
-    )
-
-
-@pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_jerk_free_of_zeros_or_not_the_acceleration_is_monotonic_between_turning_times(
-    sign,
-):
-    """With jerk zeros at 0.2 and 0.5 of a piece of 1 s, at 0.75 of one, none, and outside."""
-    derivative = np.polynomial.polynomial.polyfromroots
-    jerks = derivative([0.2, 0.5]), derivative([0.75]), (3.0,), derivative([-1.0, 2.0])
-    pieces = np.zeros((4, 1, 6))
-    for piece, jerk in zip(pieces, jerks, strict=True):
-        rise = sign * np.polynomial.Polynomial(jerk).integ(3).coef
-        piece[0, : rise.size] = rise
-    knots = np.arange(4.0)
-    found = turning_times(spline_term(knots, pieces), 1)
-    np.testing.assert_allclose(
-        np.unique(found.round(9)), [0.0, 0.2, 0.5, 1.0, 1.75, 2.0, 3.0], atol=1e-9
-    )
-
-
 MIDDLE = ControllerConfig(  # positions about -1.57 and 1, as of a Panda's elbow
     JOINTS, limits=MotionLimits((-3.07, -1.0), (-0.07, 3.0), (1.5, 1.5), (6.0, 6.0))
 )
@@ -415,21 +308,6 @@ def test_position_limits_about_a_middle_that_is_not_zero_are_kept(goal, limit):
 
 
 # Trajectories that the limits do not allow as they are sent.
-
-
-@pytest.mark.parametrize(
-    ('values', 'problem'),
-    [
-        (((1.0,), (0.0,)), 'it has 1 positions and 1 velocities for 2'),
-        (((1.0, 1.0), (0.0,)), 'it has 2 positions and 1 velocities for 2'),
-        (((1.0, np.inf), (0.0, 0.0)), 'its values are not all finite'),
-        (((1.0, 1.0), (0.0, np.nan)), 'its values are not all finite'),
-    ],
-)
-def test_invalid_target_is_rejected_with_the_reason(values, problem):
-    target = retargeting.Target(*values, NOW, NOW + 0.1, held=False)
-    with pytest.raises(TrajectoryError, match=problem):
-        retargeting.plan_target(target, PAPER, NOW, LIMITS)
 
 
 def limits_used(motion, begin, end):
@@ -453,22 +331,6 @@ def test_path_that_is_too_fast_is_stretched_and_passes_its_points_in_order():
     passed = [int(distance.argmin()) for distance in nearest]
     assert passed == sorted(passed)
     np.testing.assert_allclose(at(motion.vector, motion.end)[0], GOALS[-1], atol=1e-9)
-
-
-def test_path_is_stretched_no_more_than_the_limits_ask_for():
-    """From rest: its velocities are those that were sent, over the factor of its times."""
-    still = pack(2, [minimum_jerk(np.zeros(1), GOALS[:1])])
-    times = np.array([0.4, 0.8, 1.2])
-    rates = np.diff(GOALS, axis=0, prepend=GOALS[:1]) / 0.4
-    motion = plan(trajectory((GOALS, rates), times=times.tolist()), still, 0.0)
-    factor = motion.end / times[-1]
-    assert factor > 1.5
-    for k in (1, 2):
-        q, dq, _ = at(motion.vector, np.nextafter(factor * times[k], 0.0))
-        np.testing.assert_allclose(q, GOALS[k], atol=1e-6)
-        np.testing.assert_allclose(dq, rates[k] / factor, atol=1e-5)
-    # each try is 1 % slower than needed (`_MARGIN`)
-    assert max(limits_used(motion, 0.0, motion.end)) > 0.95
 
 
 def test_path_that_is_only_too_fast_is_stretched_by_the_ratio_of_its_velocity():
@@ -509,9 +371,8 @@ def test_chunk_whose_first_points_cannot_be_reached_in_time_keeps_the_later_ones
     assert max(limits_used(motion, NOW, motion.end)) <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize('fields', [2, 3])
-def test_trajectory_that_ends_in_motion_brakes_after_its_last_point(fields):
-    sent = trajectory((GOALS, VELOCITIES[::-1], ACCELERATIONS)[:fields])
+def test_trajectory_that_ends_in_motion_brakes_after_its_last_point():
+    sent = trajectory((GOALS, VELOCITIES[::-1]))
     motion = plan(sent)
     passed = at(motion.vector, NOW + 3.5)
     np.testing.assert_allclose(passed[:2], (GOALS[-1], VELOCITIES[0]), atol=1e-9)
@@ -522,12 +383,11 @@ def test_trajectory_that_ends_in_motion_brakes_after_its_last_point(fields):
     assert max(limits_used(motion, NOW, NOW + 4.0)) <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize('time', [0.1, 6.0])
-def test_points_past_position_limits_are_named_and_no_consequence_of_them(time):
+def test_points_past_position_limits_are_named_and_no_consequence_of_them():
     """Of the way to them only the velocity would be told, which a slower motion keeps."""
     at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
     path = np.array([[-1.5, 1.0], [-1.0, 3.5], [0.5, 3.5]])
-    sent = trajectory((path,), times=(time, 2 * time, 3 * time))
+    sent = trajectory((path,), times=(0.1, 0.2, 0.3))
     with pytest.raises(TrajectoryError) as rejection:
         plan_trajectory(sent, at_rest, 0.0, MIDDLE)
     (problem,) = rejection.value.problems
@@ -536,35 +396,6 @@ def test_points_past_position_limits_are_named_and_no_consequence_of_them(time):
         "point 2 has joint 'elbow' at 3.5 rad, past its limit of 3 rad; reduce the motion, or "
         'relax limits.position_lower and limits.position_upper'
     )
-
-
-def test_limits_of_a_joint_that_slides_are_told_in_metres():
-    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
-    first, second, *_ = re.findall('<joint name="[^"]*" type="[^"]*"', urdf)
-    slides = second.replace(second.split('type=')[1], '"prismatic"')
-    config = build(
-        ControllerConfig,
-        {
-            'joints': [each.split('"')[1] for each in (first, second)],
-            'robot.urdf': urdf.replace(second, slides),
-            'limits.position_lower': [-1.0, -1.0],
-            'limits.position_upper': [1.0, 1.0],
-        },
-    )
-    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
-    path = trajectory((np.array([[0.0, 2.0]]),), times=(9.0,))
-    with pytest.raises(TrajectoryError, match='at 2 m, past its limit of 1 m;'):
-        plan_trajectory(path._replace(joints=config.joints), at_rest, 0.0, config)
-    fast = pack(2, [minimum_jerk(np.array([0.0, 0.1]), np.array([[0, 0], [0, 0.9]]))])
-    found = worst_violation(fast, np.array([0.05]), config)
-    assert re.search(r'would be [\d.]+ m/s at', str(found))
-
-
-def test_three_thousand_points_are_planned():
-    times = 0.01 * np.arange(1, 3001)
-    path = 0.3 * np.sin(0.5 * times)[:, None] + at(PAPER, NOW)[0]
-    motion = plan(trajectory((path,), times=times))
-    np.testing.assert_allclose(at(motion.vector, NOW + 20.0)[0], path[1999], atol=1e-9)
 
 
 def test_without_ruckig_what_exceeds_the_limits_says_what_is_missing(monkeypatch):
