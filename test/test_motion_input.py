@@ -77,25 +77,6 @@ def test_sender_is_followed_again_once_it_has_paused_or_after_a_reset(rig):
     assert rig.inputs.targets == 15
 
 
-def test_sender_that_had_paused_before_a_stop_is_ignored_after_it_as_well(rig):
-    """The pause that ends that begins with the stop."""
-    stream(rig, 5)
-    rig.step(1500)
-    rig.inputs.take_stop()
-    rig.step(500)
-    stream(rig, 5)
-    assert rig.inputs.targets == 5
-
-
-def test_what_arrives_for_a_stopped_law_after_a_stop_is_told_that_the_law_is_stopped(
-    rig,
-):
-    rig.guard.fail('a test')
-    assert 'once it is, topics are ignored' in rig.inputs.take_stop()
-    rig.inputs.take_positions(Float64MultiArrayEncoder(2).encode(FIRST))
-    assert 'not in command: a test' in rig.inputs.reason
-
-
 def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig):
     """Of a busy computer: planning took longer than the lead."""
     inputs = MotionInput(2, lambda: rig.guard, lambda _: True, Quiet())

@@ -8,13 +8,11 @@ import pytest
 
 pytest.importorskip('ruckig', reason='needs ruckig')
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller import ControllerConfig, TrajectoryError, change
 from blf_dsc_controller.reference.approach import hold
 from blf_dsc_controller.reference.retargeting import Target, plan_target
 from blf_dsc_controller.reference.stream import TargetStream
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
-from blf_dsc_controller.reference.trajectory import TrajectoryError
 
 FASTEST = np.array([1.5, 1.5])
 SLOPE = np.array([0.3, -0.2])  # rad/s
