@@ -24,9 +24,9 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from ros_rig import RosRig, activate, deactivate
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.supervision.supervisor import Phase
 
 
 class Loop:
@@ -99,11 +99,11 @@ def soak(loop, samples):
         getattr(loop, fault)()
         loop.ros.spin(0.02)
         if (
-            loop.law.guard.supervisor.phase is Phase.SAFE_STOP
+            loop.law.guard.supervisor.phase is blf.Phase.SAFE_STOP
             or loop.arm.plant.sample == 0
         ):
             assert loop.ros.reset(loop.arm).success
-        loop.ros.until(lambda: loop.law.guard.supervisor.phase is Phase.TRACKING)
+        loop.ros.until(lambda: loop.law.guard.supervisor.phase is blf.Phase.TRACKING)
         gc.collect()
         pages = int(Path('/proc/self/statm').read_text().split()[1])
         used.append(

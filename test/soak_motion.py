@@ -40,12 +40,11 @@ os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
 import numpy as np
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from ros_rig import PatientClock, RosRig
+from ros_rig import PATIENCE, PatientClock, RosRig
 from std_srvs.srv import Trigger
 
-from blf_dsc_controller import load_loop
+import blf_dsc_controller as blf
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.configuration.files import share_folder
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
@@ -100,11 +99,11 @@ class Episodes:
         self.ros = RosRig()
         self.clock = PatientClock(USUAL)
         self.is_interrupted = False
-        self.file = share_folder() / 'config' / f'{preset}.yaml'
-        plant = flatten(load_loop(self.file).plant) | LOAD
+        self.file = blf.share_folder() / 'config' / f'{preset}.yaml'
+        plant = flatten(blf.load_loop(self.file).plant) | LOAD
         self.arm = self.ros.add(PlantNode, plant, clock=self.clock)
         self.joints = len(self.arm.config.joints)
-        self.load = Load(load_loop(self.file).controller)
+        self.load = Load(blf.load_loop(self.file).controller)
         self.velocities = deque(maxlen=100_000)  # (n,) of each sample
         self.braked = []  # samples from a silence on, and the posture (n,) [rad] there
         self._watch_speeds()
@@ -247,7 +246,7 @@ class Episodes:
             self.start_controller()
         self.ros.until(lambda: self.state and self.watchdog.watchdog is not None)
         try:
-            self.ros.until(self._tracks)
+            self.ros.until(self._tracks, PATIENCE)
         except AssertionError as error:
             raise AssertionError(f'never tracks again: {self.state[-1]}') from error
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from ros_rig import RosRig
 from trajectory_msgs.msg import JointTrajectory
 
-from blf_dsc_controller.configuration.files import share_folder
+import blf_dsc_controller as blf
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
@@ -38,7 +38,7 @@ ACTION_ACCESS = {
 }
 # parameters with which the controller has every topic
 ALL_TOPICS = {
-    'robot.urdf': str(share_folder() / 'config/two_link.urdf'),
+    'robot.urdf': str(blf.share_folder() / 'config/two_link.urdf'),
     'robot.tip': 'link2',
     'contact.enabled': True,
 }
