@@ -8,7 +8,6 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,31 +15,25 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import interfaces
-from rclpy._rclpy_pybind11 import RCLError
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from ros_rig import RosRig, activate, cleanup, configure, deactivate
 from std_srvs.srv import Trigger
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.configuration.schema import change, flatten
-from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.nodes import service_declaration
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
-from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.supervision.drive_load import DriveLoad
-from blf_dsc_controller.supervision.supervisor import Reason
 from sim_plant.settings import plant_settings
 
 PACKAGES = ('ur_msgs', 'franka_msgs')
 SERVICE = '/driver/set_load'
 TOLD = {'load.tell_drive': True, 'load.service': SERVICE}
 PICKED_UP = 6.0  # s; it is weighed about a second later
-FR3 = load_loop('fr3_direct')
+FR3 = blf.load_loop('fr3_direct')
 EVENT = {
     'events.begin': [PICKED_UP],
     'events.duration': [0.0],
@@ -139,7 +132,7 @@ def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tm
     events = [event for _, event in read_content(tmp_path / 'bag').events]
     loads = [event.content['mass'] for event in events if event.type == 'drive load']
     assert loads == pytest.approx(masses, abs=1e-6)
-    assert verify(tmp_path / 'bag').difference is None
+    assert blf.verify(tmp_path / 'bag').difference is None
 
 
 def test_driver_that_refuses_is_asked_once(services, ros):
@@ -172,17 +165,6 @@ def begins_again(ros, arm):
     assert guard.samples.ratio.max() < 0.1
 
 
-def test_law_that_begins_again_after_a_stop_leaves_the_load_to_the_drives(
-    services, ros
-):
-    """The safe torque carries what the law did, but not what the drives do."""
-    arm = told_two_kilograms(ros, services)
-    guard = arm.law.guard
-    guard.stop(Reason.FAILED, 'a test')
-    ros.until(lambda: guard.is_settled)
-    begins_again(ros, arm)
-
-
 def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     """After a reset it knows of no load: nor may its commands take away what the drives add."""
     arm = told_two_kilograms(ros, services)
@@ -207,8 +189,7 @@ def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
     assert guard.supervisor.running, (guard.supervisor.text, guard.starting.waiting_for)
 
 
-def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
-    """Of another type, and of a package that is not in this workspace."""
+def test_service_that_cannot_be_called_is_named(ros):
     given = flatten(FR3.controller) | TOLD | {'autostart': False}
     ros.tester.create_service(Trigger, SERVICE, lambda *_: None)
     law = ros.add(ControllerNode, given)
@@ -220,89 +201,12 @@ def test_service_that_cannot_be_called_is_named(ros, monkeypatch):
         'can be called',
         service.problem,
     )
-    service.problem = ''
-    types = [(SERVICE, ['nowhere_msgs/srv/SetLoad'])]
-    monkeypatch.setattr(law, 'get_service_names_and_types', lambda: types)
-    monkeypatch.setitem(service_declaration._FILLS, 'nowhere_msgs/srv/SetLoad', None)
-    service.look()
-    assert 'nowhere_msgs cannot be imported: source the workspace' in service.problem
-
-
-@pytest.mark.parametrize(
-    ('given', 'problem'),
-    [
-        ({'load.service': 3}, 'load.service: got 3'),
-        (
-            {'load.tell_drive': False},
-            'load.service: got /driver/set_load, but load.tell_drive is false',
-        ),
-        ({'load.frame': 'nowhere'}, 'load.frame: .*nowhere'),
-        (
-            {'load.frame': 'fr3_link2'},
-            'load.frame: the moving joints',
-        ),
-        ({'load.in_motion': 'yes'}, 'load.in_motion: got .yes.'),
-    ],
-)
-def test_bad_values_are_named_with_a_remedy(given, problem):
-    with pytest.raises(ConfigurationError, match=problem):
-        change(FR3.controller, TOLD | given)
-
-
-def unsent(_request):
-    raise RCLError('failed to send request')
-
-
-@pytest.mark.parametrize(
-    ('call', 'problem'),
-    [
-        (
-            unsent,
-            r'cannot be called \(failed to send request\): see whether its driver',
-        ),
-        (lambda _: answered(), 'its answer does not say whether 2.00 kg are accepted'),
-        (lambda _: answered(success=False), 'refused 2.00 kg: it does not say why'),
-        (lambda _: Future(), 'has not answered for 2001 states'),
-    ],
-)
-def test_call_that_fails_ends_the_declarations_and_not_the_law(ros, call, problem):
-    """An error in `follow` would be one of the law, which stops the arm."""
-    service = service_declaration.ServiceDeclaration(
-        ros.tester, change(FR3.controller, TOLD)
-    )
-    service._type = 'ur_msgs/srv/SetPayload'
-    request = SimpleNamespace(center_of_gravity=SimpleNamespace())
-    service.client = SimpleNamespace(
-        call_async=call,
-        service_is_ready=lambda: True,
-        srv_type=SimpleNamespace(Request=lambda: request),
-    )
-    law = SimpleNamespace(load_to_tell=lambda: DriveLoad(2.0, (0.0, 0.0, 0.1)))
-    for _ in range(20 + 2002):
-        service.follow(law, in_motion=True)
-    assert re.search(f'^{SERVICE}:? {problem}', service.problem)
-
-
-def answered(**fields):
-    future = Future()
-    future.set_result(SimpleNamespace(**fields))
-    return future
-
-
-def test_centre_is_in_the_frame_that_the_service_wants(ros):
-    """The flange, link 8, is 0.107 m beyond the frame of the last joint, link 7."""
-    given = TOLD | {'robot.tip': 'fr3_link7', 'load.frame': 'fr3_link8'}
-    service = service_declaration.ServiceDeclaration(
-        ros.tester, change(FR3.controller, given)
-    )
-    found = service.to_frame @ (0.01, 0.02, 0.03, 1.0)
-    np.testing.assert_allclose(found[:3], (0.01, 0.02, 0.03 - 0.107), atol=1e-12)
 
 
 @pytest.mark.parametrize('kind', ['ur', 'franka'])
 @pytest.mark.parametrize('mass', [2.0, 0.0])
 def test_load_that_is_put_down_has_no_centre(services, ros, kind, mass):
-    """Although the origin of the tip is 0.107 m from that of the frame."""
+    """The flange, link 8, is 0.107 m beyond the frame of the last joint, link 7."""
     given = TOLD | {'robot.tip': 'fr3_link7', 'load.frame': 'fr3_link8'}
     requests = []
 
@@ -311,12 +215,9 @@ def test_load_that_is_put_down_has_no_centre(services, ros, kind, mass):
         return response
 
     ros.tester.create_service(services[kind], SERVICE, take)
-    service = service_declaration.ServiceDeclaration(
-        ros.tester, change(FR3.controller, given)
-    )
-    ros.until(lambda: service.look() or service.client)
-    ros.until(service.client.service_is_ready)
-    service.declare(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
+    law = ros.add(ControllerNode, flatten(FR3.controller) | given)
+    ros.until(lambda: law.declaration.client)
+    law.declaration.declare(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
     ros.until(lambda: requests)
     (request,) = requests
     at = getattr(request, 'center_of_gravity', None)

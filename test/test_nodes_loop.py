@@ -15,8 +15,6 @@ from random_arm import random_urdf
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
-from rclpy.time import Time
 from ros_rig import (
     FakeClock,
     activate,
@@ -29,20 +27,15 @@ from ros_rig import (
     values,
 )
 from std_srvs.srv import Trigger
-from test_plant_sampled import ALL_KINDS
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.plant import PlantConfig
+import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.endpoints import RawSubscriptions, message_class
+from blf_dsc_controller.nodes.endpoints import message_class
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.reference import terms as reference
-from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.run import FIRST_STAMP
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Reason
 
 MILLISECOND = 1_000_000  # ns
@@ -50,7 +43,7 @@ PUSHED = {'load.payload': 0.2, 'load.torque': [0.4, -0.3], 'sensor.offset': [1e-
 OBSERVED = {'wait_for_subscribers': 1}
 ARM = {'robot.urdf': random_urdf(3, seed=5)[0], 'robot.tip': 'tip'}
 HELD = ARM | {'robot.drive_compensates': 'gravity'}
-JOINTS = build(PlantConfig, HELD).joints
+JOINTS = build(blf.PlantConfig, HELD).joints
 NOISY = {
     'sensor.position_noise': 1e-5,
     'sensor.velocity': 'differenced',
@@ -86,7 +79,7 @@ def run_lockstep(ros, plant, controller=None):
 
 
 CASES = {
-    'learning': ({'duration': 10.0}, {}),
+    'learning': ({'duration': 6.0}, {}),
     'noise, differenced velocity and delay': (
         {'duration': 2.0, 'seed': 5, **NOISY},
         {},
@@ -100,7 +93,6 @@ CASES = {
         },
         {'contact.enabled': True, 'contact.reaction': 'hold'},
     ),
-    'all kinds of events': ({'duration': 0.2, **ALL_KINDS}, {}),
     'three joints of a URDF with a truth of their own, and a payload': (
         ARM
         | {'duration': 3.0, 'truth.mass_deviation': 0.3, 'actuator.delay': 1}
@@ -131,13 +123,6 @@ CASES = {
     # over 1.4 and 1.2 rad
     'approach': ({'duration': 4.0, 'initial.position': [0.9, 2.9]}, {}),
     'error past the bound': (JITTER, WEAK),
-    'torque saturated': (
-        JITTER,
-        WEAK | {'safety.error_ratio': 0.0, 'safety.saturation_time': 0.01},
-    ),
-    'velocity not plausible': (JITTER, {'safety.velocity_limit': 0.25}),
-    'saturated for some samples': (JITTER, {'torque.limit': [10.5, 20.0]}),
-    'estimated velocity': (JITTER, {'safety.velocity': 'estimated'}),
 }
 
 
@@ -173,51 +158,15 @@ def test_motors_with_encoders_of_their_own_have_a_topic(ros):
     }
     motors = ros.listen(topics.MOTOR_STATES, raw=True)
     _, stamps = run_lockstep(ros, plant, ARM)
-    offline = simulate(build(ControllerConfig, ARM), build(PlantConfig, plant))
+    offline = blf.simulate(
+        build(blf.ControllerConfig, ARM), build(blf.PlantConfig, plant)
+    )
     ros.until(lambda: len(motors) == len(stamps))
     of_motors, read = states(motors, offline.config.joints)
     np.testing.assert_array_equal(of_motors, stamps)
     np.testing.assert_array_equal(read[:, :2], offline.motors)
     twist = offline.motors[:, 0] - offline.run().position
     assert (abs(twist).max(axis=0) > 1e-5).all()  # rad
-
-
-def test_two_arms_in_one_domain_do_not_interfere(ros):
-    """Each runs as if it were alone, bit for bit; they differ in their noise."""
-    noise = {'sensor__position_noise': 1e-5}
-    law = {'wait_for_subscribers': 1, 'telemetry__enabled': False}
-    arms, received = {}, {}
-    for seed, side in enumerate(('left', 'right')):
-        name = f'/{side}/blf_dsc_controller/commands'
-        received[side] = []
-        ros.tester.create_subscription(
-            message_class(topics.COMMANDS.type),
-            name,
-            received[side].append,
-            QoSProfile(depth=1000),
-        )
-        plant = {'seed': seed, 'duration': 0.2, **noise}
-        arms[side], _ = ros.loop(plant, law, namespace=side)
-    ros.until(lambda: all(len(messages) == 201 for messages in received.values()))
-    for seed, side in enumerate(received):
-        torques = np.array([message.data for message in received[side]])
-        alone = simulated(
-            {'seed': seed, 'duration': 0.2, 'sensor.position_noise': 1e-5}
-        )
-        np.testing.assert_array_equal(torques, alone.torque)
-    assert not np.array_equal(received['left'][-1].data, received['right'][-1].data)
-
-
-def test_external_torque_and_its_interval_are_published(ros):
-    received = ros.listen(topics.EXTERNAL_TORQUE, raw=True)
-    arm = ros.add(PlantNode, {'mode': 'lockstep'})
-    ros.add(ControllerNode, {'contact.enabled': True})
-    ros.until(lambda: received)
-    joints = arm.config.joints
-    names = (*joints, *(joint + topics.INTERVAL for joint in joints))
-    decoder = JointStateDecoder(names, required=('effort',))
-    decoder.decode(received[-1])
-    assert (decoder.effort[2:] > np.abs(decoder.effort[:2])).all()
 
 
 @pytest.mark.parametrize(
@@ -227,7 +176,9 @@ def test_external_torque_and_its_interval_are_published(ros):
         ('sinusoids', False, 'tare: the arm moves, or has just come to rest'),
     ],
 )
-def test_external_torque_is_tared_at_rest(ros, kind, success, message):
+def test_external_torque_and_its_interval_are_published_and_tared_at_rest(
+    ros, kind, success, message
+):
     """Once the arm has been held for half a second, and not in motion."""
     received = ros.listen(topics.EXTERNAL_TORQUE, raw=True)
     ros.add(PlantNode, {'mode': 'lockstep'})
@@ -238,21 +189,16 @@ def test_external_torque_is_tared_at_rest(ros, kind, success, message):
     }
     node = ros.add(ControllerNode, given)
     ros.until(lambda: len(received) > 500)
+    joints = node.config.joints
+    names = (*joints, *(joint + topics.INTERVAL for joint in joints))
+    decoder = JointStateDecoder(names, required=('effort',))
+    decoder.decode(received[-1])
+    assert (decoder.effort[2:] > np.abs(decoder.effort[:2])).all()
     response = ros.call(Trigger, f'{node.get_name()}/tare', Trigger.Request())
     assert response.success is success
     assert response.message.startswith(message)
     ros.until(lambda: len(received) > 520)
     assert node.guard.controller.is_tared is success
-
-
-def test_nodes_on_simulated_time_follow_the_clock_of_the_plant(ros):
-    clock = ros.listen(topics.CLOCK)
-    plant = {'duration': 0.5, 'publish_clock': True}
-    over_ros, _ = run_lockstep(ros, plant, {'use_sim_time': True})
-    ros.until(lambda: len(clock) == 501)
-    now = Time(nanoseconds=FIRST_STAMP + 500 * MILLISECOND)
-    ros.until(lambda: ros.nodes[-1].get_clock().now().nanoseconds == now.nanoseconds)
-    np.testing.assert_array_equal(over_ros, simulated({'duration': 0.5}).torque)
 
 
 def test_plant_counts_real_time_in_whole_samples(ros):
@@ -292,11 +238,10 @@ def test_plant_counts_real_time_in_whole_samples(ros):
     # time.
     reference_stamps, values = states(received[topics.REFERENCE])
     assert set(reference_stamps) <= set(stamps)
-    vector = reference_of(ControllerConfig())
-    qr, dqr, ddqr = np.zeros((3, 2))
+    reference_at = controller.guard.controller.reference_at
     for stamp, value in zip(reference_stamps, values, strict=True):
-        reference.evaluate(vector, (stamp - stamps[0]) * 1e-9, qr, dqr, ddqr)
-        np.testing.assert_array_equal(value[0], qr)
+        q, _, _ = reference_at((stamp - stamps[0]) * 1e-9)
+        np.testing.assert_array_equal(value[0], q)
 
     stamps_of_steps, timing = states(
         received[topics.TIMING], ('latency', 'lateness', 'late_steps')
@@ -361,22 +306,6 @@ def assert_runs(ros, arm, law, samples=60):
     assert law.guard.samples.ratio.max() < 1.0
 
 
-def test_nodes_without_autostart_do_nothing_until_a_manager_starts_them(ros):
-    commands = ros.listen(topics.COMMANDS)
-    arm, law = ros.loop({'autostart': False}, {'autostart': False})
-    for node in (arm, law):
-        assert node.state_label == 'unconfigured'
-        assert 'unconfigured: activate it first' in ros.reset(node).message
-        assert configure(ros, node)
-    ros.spin(0.4)  # longer than the plant waits for its peers to settle
-    assert not commands
-    assert activate(ros, arm)
-    ros.spin(0.4)
-    assert not commands
-    assert activate(ros, law)
-    assert_runs(ros, arm, law)
-
-
 def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
     waiting = {'wait_for_subscribers': 1}
     arm, _ = ros.loop(waiting, waiting | {'telemetry__enabled': False})
@@ -390,20 +319,6 @@ def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
     for topic in outputs:
         ros.listen(topic)
     ros.until(lambda: arm.plant.sample > 0)
-
-
-def test_plant_does_not_take_the_page_for_the_controller(ros):
-    """It is there before the loop: see `blf_dsc run --view`."""
-    arm = ros.add(PlantNode, {'wait_for_subscribers': 1, 'mode': 'lockstep'})
-    recorded = [ros.listen(each) for each in (topics.JOINT_STATES, topics.TRUTH)]
-    page = ros.add(partial(Node, 'view'))
-    beside = RawSubscriptions(page)
-    beside.follow(topics.JOINT_STATES, topics.JOINT_STATES.requested)
-    states = next(iter(arm._outputs.values()))
-    ros.until(lambda: states.get_subscription_count() == 2)
-    assert not arm._is_observed()
-    assert not any(recorded)
-    beside.close()
 
 
 def test_transitions_pause_and_restart_the_loop_and_impossible_ones_are_rejected(ros):
@@ -428,7 +343,7 @@ def test_transitions_pause_and_restart_the_loop_and_impossible_ones_are_rejected
     assert_runs(ros, arm, law)
 
 
-@pytest.mark.parametrize('order', ['p', 'c', 'pc', 'ccp', 'pcpc'])
+@pytest.mark.parametrize('order', ['c', 'pc', 'ccp'])
 def test_loop_runs_after_resets_in_any_order(ros, order):
     arm, law = ros.loop()
     ros.run(arm, 300)
@@ -499,10 +414,6 @@ def test_stale_torque_is_not_applied_in_real_time(ros):
             for status in array.status
         )
     )
-    # A restarted controller gets the arm moving once the arm is reset.
-    restarted = ros.add(ControllerNode, clock=clock)
-    ros.reset(arm)
-    ros.until(lambda: clock.advance(0.01) or is_running(restarted))
 
 
 def test_state_is_latched_and_gives_the_reason(ros):
@@ -518,9 +429,5 @@ def test_state_is_latched_and_gives_the_reason(ros):
     assert msgs[-1].message.startswith(
         'stopped: the stamp of a joint state is 0.999 s before'
     )
-    assert values(msgs[-1]) | {
-        'phase': 'safe stop',
-        'reason': 'stamp backward',
-    } == values(msgs[-1])
-    assert msgs[-1].name == 'blf_dsc_controller/state'
-    assert msgs[-1].hardware_id == 'joint1 joint2'
+    assert values(msgs[-1])['phase'] == 'safe stop'
+    assert values(msgs[-1])['reason'] == 'stamp backward'
