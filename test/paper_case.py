@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.configuration.earlier_names import chosen_by
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.controller import Controller
@@ -26,13 +25,21 @@ EXACT = {
     'truth.amplitude': [0.1, 0.1],
 }
 
+CHOICES = {
+    'gains.prediction': 'filtered',
+    'gains.update': 'newton',
+    'gains.compensation': 'reference',
+    'gains.bumpless': True,
+}
+"""What `blf_dsc` does, as gains of the law `paper`."""
+
 
 def instead(*, known_rate: bool = False, **choices: object) -> dict[str, object]:
     """Return what `blf_dsc` does for two links, but for these choices, as the law `paper`.
 
     For an arm from a URDF give `known_rate=True`.
     """
-    usual = chosen_by('paper', {}) | {'gains.known_rate': known_rate}
+    usual = {**CHOICES, 'gains.known_rate': known_rate}
     given = {f'gains.{name}': choice for name, choice in choices.items()}
     return {'law': 'paper', **usual, **given}
 

@@ -17,11 +17,11 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from paper_case import instead
 
 from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration import files
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.earlier_names import chosen_by
 from blf_dsc_controller.configuration.files import parse, share_folder
 from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
@@ -422,45 +422,6 @@ def test_switches_of_ros_are_checked_as_a_node_would(file, name):
     assert load_plant(file(others)).seed == 2
 
 
-def test_a_damping_that_damps_nothing_is_told_apart_from_those_that_do(file):
-    """The name of d2 was taken for the damping of a joint."""
-    path = file(section('blf_dsc_controller', 'feedback.damping: [5.0, 5.0]'))
-    with pytest.raises(ConfigurationError) as caught:
-        load(path, 'blf_dsc_controller', ControllerConfig)
-    (problem,) = caught.value.problems
-    assert 'feedback.damping: is called feedback.robust_gain (d2)' in problem
-    assert 'feedback.joint_damping, or feedback.gain (K_p)' in problem
-
-
-def test_load_of_an_older_file_is_told_its_group(file):
-    text = (
-        'learning: {tell_drive: true, load_service: /load, load_frame: tool0, '
-        'load_in_motion: true}'
-    )
-    with pytest.raises(ConfigurationError) as caught:
-        load(
-            file(section('blf_dsc_controller', text)),
-            'blf_dsc_controller',
-            ControllerConfig,
-        )
-    assert caught.value.problems == [
-        'line 2: learning.tell_drive: is called load.tell_drive',
-        'line 2: learning.load_service: is called load.service',
-        'line 2: learning.load_frame: is called load.frame',
-        'line 2: learning.load_in_motion: is called load.in_motion',
-    ]
-
-
-def test_model_of_an_older_file_follows_from_its_urdf(file):
-    path = file(section('blf_dsc_controller', 'model: urdf'))
-    with pytest.raises(
-        ConfigurationError, match=r'line 2: model: follows from robot\.urdf'
-    ):
-        load(path, 'blf_dsc_controller', ControllerConfig)
-    assert ControllerConfig().model == 'two_link'
-    assert load_loop('panda').controller.model == 'urdf'
-
-
 def test_known_data_of_the_arm_is_there_if_it_is_given_or_needed(file):
     path = file(section('/**', 'truth: {parameters: [1.0, 0.32, 0.4]}, seed: 4'))
     assert load_plant(path).seed == 4
@@ -474,71 +435,11 @@ def test_known_data_of_the_arm_is_there_if_it_is_given_or_needed(file):
         load(file(text), 'blf_dsc_controller', ControllerConfig)
 
 
-@pytest.mark.parametrize(
-    ('law', 'surface', 'leakage'),
-    [
-        ('blf_dsc', 'it has no effect on', 'it has no effect on'),
-        ('backstepping', 'is called gains.surface_gain', 'is called gains.leakage'),
-        ('slotine_li', 'is called gains.surface_gain', 'it has no effect on'),
-    ],
-)
-def test_gains_of_the_compared_laws_are_told_the_law_that_has_them(
-    file, law, surface, leakage
-):
-    text = f'law: {law}, comparison: {{surface_gain: [9.0, 9.0], leakage: 0.1}}'
-    with pytest.raises(ConfigurationError) as caught:
-        load(
-            file(section('blf_dsc_controller', text)),
-            'blf_dsc_controller',
-            ControllerConfig,
-        )
-    first, second = caught.value.problems
-    assert f'line 2: comparison.surface_gain: {surface}' in first
-    assert f'line 2: comparison.leakage: {leakage}' in second
-    assert all(f'the law {law}' in problem for problem in (first, second))
-
-
-@pytest.mark.parametrize(
-    ('law', 'update', 'bumpless'),
-    [
-        (
-            'blf_dsc',
-            (
-                'is a choice of the law paper: write law: paper, gains.prediction: "filtered", '
-                'gains.update: "gradient", gains.compensation: "reference", '
-                'gains.bumpless: true, gains.known_rate: false'
-            ),
-            'the law blf_dsc has no such choice: leave it out',
-        ),
-        ('paper', 'is called gains.update', 'is called gains.bumpless'),
-        (
-            'slotine_li',
-            'is called gains.update',
-            'the law slotine_li has no such choice',
-        ),
-        ('model_based', 'the law model_based has no', 'the law model_based has no'),
-    ],
-)
-def test_choices_between_the_law_and_the_paper_are_told_the_law_that_has_them(
-    file, law, update, bumpless
-):
-    text = f'law: {law}, learning: {{update: gradient, bumpless: true}}'
-    with pytest.raises(ConfigurationError) as caught:
-        load(
-            file(section('blf_dsc_controller', text)),
-            'blf_dsc_controller',
-            ControllerConfig,
-        )
-    first, second, *_ = caught.value.problems
-    assert f'line 2: learning.update: {update}' in first
-    assert f'line 2: learning.bumpless: {bumpless}' in second
-
-
 @pytest.mark.parametrize('preset', ['recommended', 'panda'])
 def test_the_law_paper_with_all_choices_of_blf_dsc_is_that_law(preset):
     ours = load_loop(preset).controller
-    choices = chosen_by('paper', flatten(ours))
-    theirs = build(ControllerConfig, flatten(ours) | {'law': 'paper', **choices})
+    choices = instead(known_rate=preset == 'panda')
+    theirs = build(ControllerConfig, flatten(ours) | choices)
     np.testing.assert_array_equal(
         *(pack(settings_of_config(each)) for each in (ours, theirs))
     )
@@ -556,10 +457,7 @@ def test_the_law_paper_with_all_choices_of_blf_dsc_is_that_law(preset):
 )
 def test_each_choice_of_the_law_paper_is_as_printed_unless_it_is_given(name, printed):
     """On an arm from a URDF, for which `blf_dsc` knows the rate."""
-    ours = load_loop('panda').controller
-    usual = {'law': 'paper', 'learning.weighing': False} | chosen_by(
-        'paper', flatten(ours)
-    )
+    usual = {'learning.weighing': False, **instead(known_rate=True)}
     for gains, as_printed in ((usual, False), (without(usual, f'gains.{name}'), True)):
         changes = {CONTROLLER: gains | {'disturbance.observer_bandwidth': 0.0}}
         settings = settings_of_config(load_loop('panda', changes).controller)

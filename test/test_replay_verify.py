@@ -8,22 +8,18 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import recorded_run
 from command import OLDER, finished
-from paper_case import instead
 from random_arm import random_urdf
 from recorded_run import MILLISECOND, START, compared, of
 
-from blf_dsc_controller.bags import older_parameters
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL, speed_text
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.earlier_names import RENAMED, chosen_by
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import JointStateEncoder
@@ -309,7 +305,6 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
 
     def change(content):
         del content['parameters']['learning.anchor_weight']
-        content['parameters'].pop('insist', None)
 
     configured(entries, change)
     of(entries, MONITOR)[7][3] = None
@@ -317,212 +312,10 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
     missed, newer = verify(path).remarks
     assert missed == f'the recorder missed messages of {MONITOR.resolved}: 1 missed'
     assert 'before the law had learning.anchor_weight' in newer
-    assert 'insist' not in newer
+
     monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
     (remark,) = verify(bag).remarks
     assert 'recorded by version 0.1.0 and replayed by 9.9.9' in remark
-
-
-def test_bag_of_an_earlier_version_is_read_and_its_replay_is_refused(capsys):
-    """Recorded at 31c6ec4, whose law had parameters that are gone."""
-    bag = Path(__file__).with_name('earlier_version.mcap')
-    run = read_run(bag)
-    assert run.stamp.size == 21
-    assert np.isfinite([run.position, run.error, run.torque, run.bound]).all()
-    assert main(['replay', str(bag)]) == 1
-    error = capsys.readouterr().err
-    assert 'robot.learn: unknown parameter' in error
-    assert 'this version cannot do without it' in error
-
-
-def test_bag_of_the_first_release_is_replayed_with_every_number_compared():
-    """20 samples of the Panda; a parameter that goes away needs its rule."""
-    replayed = verify(Path(__file__).with_name('first_release.mcap'))
-    assert replayed.samples == 20
-    assert replayed.compared == 1.0
-    assert replayed.events[-1].type is EventType.RELEASE
-
-
-@pytest.mark.parametrize(
-    ('value', 'code', 'words'),
-    [
-        ([1, 2.0], 0, 'bit-equal: all'),
-        ([1.0, 3.0], 1, 'old.gain: recorded with [1.0, 3.0], but this version only'),
-    ],
-)
-def test_removed_parameter_leaves_a_rule(
-    entries, tmp_path, capsys, monkeypatch, value, code, words
-):
-    monkeypatch.setitem(older_parameters.REMOVED, 'old.gain', (1.0, 2.0))
-
-    def change(content):
-        content['parameters']['old.gain'] = value
-
-    configured(entries, change)
-    path = recorded_run.write(tmp_path / 'bag', entries)
-    assert main(['replay', str(path)]) == code
-    assert words in ''.join(capsys.readouterr())
-
-
-def test_added_parameter_has_its_rule_for_older_bags(entries, tmp_path, monkeypatch):
-    name = 'disturbance.leakage'
-
-    def change(content):
-        del content['parameters'][name]
-
-    configured(entries, change)
-    path = recorded_run.write(tmp_path / 'bag', entries)
-    found = []
-    for value in (0.25, 0.5):
-        monkeypatch.setitem(older_parameters.ADDED, name, value)
-        config = read_content(path).exact_config('')
-        found.append(config.disturbance.leakage)
-    assert found == [0.25, 0.5]
-
-
-def test_arm_of_an_older_bag_learned_no_load_friction():
-    recorded = {'robot.urdf': 'arm.urdf', 'learning.viscous': True}
-    assert older_parameters.completed(recorded)['learning.load_friction'] is False
-
-
-def test_values_of_an_older_bag_need_no_word_to_insist(tmp_path):
-    """It has been recorded with what is refused now."""
-    given = {'barrier.bound': [2.0, 2.0], 'insist': ['barrier.bound']}
-    entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
-    configured(entries, lambda content: content['parameters'].pop('insist'))
-    result = verify(recorded_run.write(tmp_path / 'old', entries))
-    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
-
-
-def test_waypoints_of_an_older_bag_stand_joint_by_joint(tmp_path):
-    """They have another name since they stand point by point."""
-    times = {'reference.type': 'waypoints', 'reference.times': [0.0, 0.5]}
-    start, end = [2.293, 1.696], [2.3, 1.7]
-    given = times | {'reference.waypoints': start + end}
-    entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
-
-    def change(content):
-        parameters = content['parameters']
-        assert parameters.pop('reference.waypoints') == start + end
-        parameters['reference.points'] = [start[0], end[0], start[1], end[1]]
-
-    configured(entries, change)
-    bag = recorded_run.write(tmp_path / 'old', entries)
-    result = verify(bag)
-    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
-    assert read_content(bag).unknown_parameters == []
-
-
-def test_parameters_of_an_older_bag_are_read_by_their_earlier_names(tmp_path):
-    given = {'feedback.robust_gain': [3.0, 2.0]}
-    entries = recorded_run.messages(recorded_run.record(tmp_path / 'new', 0.3, **given))
-
-    def change(content):
-        parameters = content['parameters']
-        for earlier, name in RENAMED.items():
-            parameters[earlier] = parameters.pop(name)
-        parameters['model'] = 'two_link'
-
-    configured(entries, change)
-    bag = recorded_run.write(tmp_path / 'old', entries)
-    result = verify(bag)
-    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
-    assert read_content(bag).unknown_parameters == []
-
-
-def test_model_of_an_older_bag_must_be_that_of_its_urdf(entries, tmp_path, capsys):
-    configured(entries, lambda content: content['parameters'].update(model='urdf'))
-    path = recorded_run.write(tmp_path / 'bag', entries)
-    assert main(['replay', str(path)]) == 1
-    assert 'model: unknown parameter' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('law', ['blf_dsc', 'backstepping', 'slotine_li'])
-def test_gains_of_the_compared_laws_were_those_of_all_laws(tmp_path, law):
-    folder = recorded_run.record(tmp_path / 'new', 0.3, law=law)
-    entries = recorded_run.messages(folder)
-    earlier = {
-        'surface_gain': [71.0, 72.0],
-        'position_gain': [2.0, 3.0],
-        'robust_gain': [0.0, 0.0],
-        'integral_gain': [],
-        'leakage': 0.5,
-        'learning_weight': 0.0,
-    }
-
-    def change(content):
-        parameters = content['parameters']
-        for name, value in earlier.items():
-            parameters[f'comparison.{name}'] = parameters.pop(f'gains.{name}', value)
-
-    configured(entries, change)
-    bag = recorded_run.write(tmp_path / 'old', entries)
-    result = verify(bag)
-    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
-    assert read_content(bag).unknown_parameters == []
-
-
-CHOICES = {
-    'learning.prediction': 'lambda',
-    'learning.update': 'gradient',
-    'learning.compensation': 'state',
-    'learning.bumpless': False,
-    'surface.known_rate': False,
-}
-
-
-@pytest.mark.parametrize(
-    ('law', 'given'),
-    [
-        ('blf_dsc', {}),
-        ('paper', {}),
-        ('paper', instead(compensation='state')),
-        ('slotine_li', {'gains.update': 'gradient', 'gains.learning_weight': 1.0}),
-    ],
-)
-def test_choices_between_the_law_and_the_paper_were_those_of_all_laws(
-    tmp_path, law, given
-):
-    folder = recorded_run.record(tmp_path / 'new', 0.3, **{'law': law, **given})
-    entries = recorded_run.messages(folder)
-
-    def change(content):
-        parameters = content['parameters']
-        if law == 'paper':
-            parameters['law'] = 'blf_dsc'
-        for name, choice in CHOICES.items():
-            gain = f'gains.{name.rpartition(".")[2]}'
-            parameters[name] = parameters.pop(gain, chosen_by('paper', {})[gain])
-            assert law != 'paper' or given or parameters[name] == choice
-
-    configured(entries, change)
-    bag = recorded_run.write(tmp_path / 'old', entries)
-    result = verify(bag)
-    assert (result.difference, result.remarks, result.incomplete) == (None, (), ())
-    assert read_content(bag).unknown_parameters == []
-    assert read_content(bag).exact_config('').law == law
-
-
-def test_arm_of_a_urdf_in_a_bag_from_before_the_known_rate_had_none():
-    recorded = {'robot.urdf': 'arm.urdf', 'learning.update': 'newton'}
-    found = older_parameters.renamed(recorded)
-    assert (found['law'], found['gains.known_rate']) == ('paper', False)
-    assert found['gains.update'] == 'newton'
-    recorded['surface.known_rate'] = True
-    assert older_parameters.renamed(recorded) == {'robot.urdf': 'arm.urdf'}
-
-
-def test_choice_that_a_law_has_not_is_not_left_out_of_a_bag():
-    assert older_parameters.current({'learning.bumpless': True}, '', 'blf_dsc') == {}
-    for law in ('blf_dsc', 'model_based'):
-        with pytest.raises(BlfDscError, match=r'learning\.bumpless: unknown'):
-            older_parameters.current({'learning.bumpless': False}, '', law)
-    assert older_parameters.current({'learning.bumpless': False}, '', 'paper') == {
-        'gains.bumpless': False
-    }
-    assert (
-        older_parameters.current({'learning.bumpless': False}, '', 'slotine_li') == {}
-    )
 
 
 def test_journal_of_a_later_format_is_refused(entries, tmp_path):

@@ -13,12 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.bags.older_parameters import (
-    completed,
-    current,
-    known_names,
-    renamed,
-)
 from blf_dsc_controller.bags.sources import BagError, OpenBag, open_bag
 from blf_dsc_controller.bags.topic_messages import TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -28,7 +22,7 @@ from blf_dsc_controller.configuration.received import (
     without_files,
     without_law,
 )
-from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.configuration.schema import build, parameters, variant_of
 from blf_dsc_controller.errors import BlfDscError, check_type
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
@@ -207,8 +201,7 @@ class Content:
         found: dict[str, Mapping[str, Any]] = {}
         for _, event in self.events:
             if event.type is EventType.CONFIGURE:
-                recorded = renamed(event.content['parameters'])
-                found.setdefault(CONTROLLER, recorded)
+                found.setdefault(CONTROLLER, event.content['parameters'])
         for change in self.changes:
             if change.configured:
                 found[PLANT] = change.parameters
@@ -218,7 +211,9 @@ class Content:
     def unknown_parameters(self) -> list[str]:
         """Recorded parameters of the controller that this version does not have."""
         recorded = without_law(self.configurations.get(CONTROLLER, {}))
-        known = known_names(recorded)
+        known = {
+            each.name for each in parameters(variant_of(ControllerConfig, recorded))
+        }
         return [name for name in recorded if name not in known]
 
     def controller_config(self) -> ControllerConfig:
@@ -237,16 +232,15 @@ class Content:
             for name, value in without_files(values).items()
             if name not in left_out
         }
-        return build(ControllerConfig, completed(given), source)
+        return build(ControllerConfig, given, source)
 
     def exact_config(self, law: str) -> ControllerConfig:
         """Return the configuration exactly as recorded, but with the law of this file.
 
-        `law` is FILE@DIGEST, or empty for a law of the package. Only parameters that
-        had no effect are left out.
+        `law` is FILE@DIGEST, or empty for a law of the package.
 
         Raises:
-            BagError: the bag holds none, or a parameter without which the law may act differently.
+            BagError: the bag holds none.
             BlfDscError: the recorded law is a file and `law` is none, or the other way round.
             ConfigurationError: this version of the package cannot run the configuration.
         """
@@ -257,7 +251,7 @@ class Content:
             given = with_law(values, law, digest)
         except BlfDscError as error:
             raise BagError(f'{self.path}: {error}') from error
-        return build(ControllerConfig, completed(current(given, source)), source)
+        return build(ControllerConfig, given, source)
 
     def _recorded(self) -> tuple[Mapping[str, Any], str]:
         """Return the parameters of the controller, and where they are from."""

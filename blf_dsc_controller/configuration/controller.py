@@ -13,7 +13,6 @@ from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration import (
-    earlier_names,
     known_arm,
     law_file,
     plausibility,
@@ -96,11 +95,6 @@ class ControllerConfig(ArmConfig):
         law = given.get('law', LAWS[0])
         gains = gains_of(law) if isinstance(law, str) else None
         return _with_groups(gains, knows=known_arm.is_asked_for(given))
-
-    @classmethod
-    def replaced(cls, given: Mapping[str, Any]) -> Mapping[str, str]:
-        """Return what to write instead of given parameters of earlier versions."""
-        return earlier_names.remedies(given)
 
     @property
     def model(self) -> Literal['two_link', 'urdf']:

@@ -318,7 +318,7 @@ def _unknown_in_wildcards(sections: Iterable[Section]) -> Iterator[str]:
             for name, entry in section.entries.items()
             if not (is_builtin(name) or is_gain_of_law(name))
         }
-        for problem in unknown_names(ControllerConfig, given, known):
+        for problem in unknown_names(given, known):
             yield _located(problem, section.entries, {})
 
 

@@ -5,8 +5,7 @@ Each field is declared with `parameter`, or is itself such a dataclass: a group,
 parameters have dotted names (`arm.l1`). The method `problems()` of a configuration, if
 it has one, checks parameters against each other; its class method `defaults(given)`
 returns the defaults that follow from the given parameters, `variant(given)` a class
-with further parameters, `replaced(given)` what to write instead of those of earlier
-versions.
+with further parameters.
 """
 
 from __future__ import annotations
@@ -266,7 +265,7 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
     except BlfDscError as error:
         raise ConfigurationError([str(error)], source) from error
     known = {param.name: param for param in parameters(cls)}
-    problems = list(unknown_names(cls, given, known))
+    problems = list(unknown_names(given, known))
     valid, invalid = _checked(known, given)
     problems += invalid
     if invalid:
@@ -351,18 +350,11 @@ def change(config: Config, given: Mapping[str, object], source: str = '') -> Con
     return build(type(config), {**flatten(config), **given}, source)
 
 
-def unknown_names(
-    cls: Any, given: Mapping[str, Any], known: Collection[str]
-) -> Iterator[str]:
-    """Yield the problem of each name that is unknown, with the remedy of `cls`."""
-    replaced: Mapping[str, str] = getattr(cls, 'replaced', lambda _: {})(given)
+def unknown_names(given: Iterable[str], known: Collection[str]) -> Iterator[str]:
+    """Yield the problem of each name that is unknown."""
     for name in given:
         if name not in known:
-            yield (
-                f'{name}: {replaced[name]}'
-                if name in replaced
-                else unknown(name, known)
-            )
+            yield unknown(name, known)
 
 
 _ELSEWHERE = {

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.bags.older_parameters import current
 from blf_dsc_controller.bags.sources import BagMessage
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -339,7 +338,7 @@ class Rerun:
         """Change parameters, and publish the bound by the new ones as the node does."""
         guard = self._guard
         where = f'event {event.number} of the journal'
-        given = current(event.content['parameters'], where, guard.config.law)
+        given = event.content['parameters']
         message = self._loop.retune(change(guard.config, given, where))
         if message is not None:
             self._add(guard.journal.stamp, message)

@@ -150,7 +150,7 @@ def _rerun(
 def _newer_parameters(content: Content, config: ControllerConfig) -> list[str]:
     """Return the parameters that the recorded configuration does not have, by name."""
     recorded = content.configurations[CONTROLLER]
-    return sorted(flatten(config).keys() - recorded.keys() - {'insist'})
+    return sorted(flatten(config).keys() - recorded.keys())
 
 
 def _names_of_others(content: Content) -> tuple[str, ...]:
