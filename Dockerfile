@@ -17,4 +17,4 @@ RUN pip install --no-cache-dir --ignore-installed --constraint /constraints.txt 
     && pip uninstall --yes blf_dsc_controller && rm -rf build *.egg-info
 # Compiled kernels become part of what colcon installs: the first start takes seconds, not half a minute.
 RUN for preset in recommended panda; do \
-    python3 -m blf_dsc_controller precompile --package --config $preset || exit 1; done
+    python3 -m blf_dsc_controller doctor --compile package --config $preset || exit 1; done

@@ -106,7 +106,7 @@ docs: $(READY)-docs ## Build the documentation site, into out/docs; dead links a
 release: $(READY)-release ## Check versions and metadata, and build sdist and wheel into out/dist
 	@$(MAKE) test TESTS=test/test_package.py
 	@rm -rf blf_dsc_controller/compiled/kernels; for arm in recommended panda; do \
-	    $(RUN) -m blf_dsc_controller precompile --package --config $$arm || exit 1; done
+	    $(RUN) -m blf_dsc_controller doctor --compile package --config $$arm || exit 1; done
 	@rm -rf out/dist && $(VENV)/bin/python -m build --outdir out/dist . && \
 	$(VENV)/bin/python -m twine check --strict out/dist/*
 	@! grep -q '@users[.]noreply' package.xml || echo 'package.xml has no maintainer that can be' \

@@ -412,12 +412,12 @@ def test_absurd_numbers_and_characters_missing_from_the_font_cause_no_warning(
     bag = str(
         recorded_run.write_made(tmp_path / 'bag', made.messages(with_timing=True))
     )
-    for command, out in (
-        ('report', 'page.html'),
-        ('plot', 'plots'),
-        ('export', 'table.csv'),
+    for command, option, out in (
+        ('report', '--out', 'page.html'),
+        ('report', '--png', 'plots'),
+        ('export', '--out', 'table.csv'),
     ):
-        assert main([command, bag, '--out', str(tmp_path / out)]) == 0
+        assert main([command, bag, option, str(tmp_path / out)]) == 0
     out, errors = capfd.readouterr()
     assert errors == ''
     assert ('VIOLATED, first by elbow at 0.100 s' in out) is not np.isnan(value)

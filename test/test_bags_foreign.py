@@ -257,7 +257,7 @@ def test_gripper_on_the_same_topic_is_told_from_the_arm_under_any_name(
     assert tables[0] == tables[1] == tables[2]
     assert '/arm/torque: 604 values bit-equal' in capsys.readouterr().out
     # Without the mapping, the joint states are not found.
-    assert main(['plot', str(renamed), '--out', str(tmp_path / 'none')]) == 1
+    assert main(['export', str(renamed), '--out', str(tmp_path / 'none.csv')]) == 1
 
 
 # Unusable bags.
@@ -268,7 +268,6 @@ TOOLS = {
     'replay': (),
     'report': ('--out', 'page.html'),
     'export': ('--out', 'table.csv'),
-    'plot': ('--out', 'plots'),
     'identify': ('--urdf', 'two_link.urdf', '--out', 'new.urdf'),
 }
 
@@ -398,7 +397,7 @@ def test_missing_definition_of_another_topic_loses_no_other_message(
             schema if name == ODD[1] else ('ros2msg', definition(name)[0].encode())
         ),
     )
-    for command in ('replay', 'report', 'export', 'plot'):
+    for command in ('replay', 'report', 'export'):
         assert run(command, file)[0] == 0
     code, output, _ = run('recover', file, '--out', 'clean')
     assert code == 0
@@ -615,7 +614,7 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
     for name, *words in (
         ('out', 'report', bag, '--out', tmp_path / 'out'),
         ('out.csv', 'export', bag, '--out', tmp_path / 'out.csv'),
-        ('tracking.png', 'plot', bag, '--out', tmp_path),
+        ('tracking.png', 'report', bag, '--png', tmp_path),
         (
             *('new.urdf', 'identify', bag, '--urdf', 'panda.urdf'),
             *('--out', tmp_path / 'new.urdf'),
@@ -629,7 +628,7 @@ def test_nothing_is_overwritten_without_force(bag, tmp_path, capsys):
         out.symlink_to(kept)
         assert main(command) == 1
         assert f'{out} exists already' in capsys.readouterr().err
-        if command[0] in ('report', 'export', 'plot'):
+        if command[0] in ('report', 'export'):
             assert main([*command, '--force']) == 0
             assert not out.is_symlink()
             assert main([*command, '--force']) == 0

@@ -51,7 +51,7 @@ COMMANDS = {
     'recover': 'recover bag --out clean',
     'export': 'export bag --out table.csv',
     'export to parquet': 'export bag --out table.parquet',
-    'plot': 'plot bag --out pictures',
+    'report as pictures': 'report bag --png pictures',
     'commission': 'commission --config arm.yaml --write motions.yaml',
     'excite': 'excite motion.yaml --config arm.yaml --starts 1 --harmonics 1',
     'identify': 'identify run.csv --urdf pendulum.urdf --out new.urdf --report i.html',
@@ -70,7 +70,7 @@ BEFORE_THEIR_LOOP = {
     'run over ROS': 'run --config arm.yaml --mode lockstep --duration 0.1 --out out',
 }
 """Commands that need processes or real time: they end here before these begin."""
-ELSEWHERE = {'arms', 'precompile'}  # which has processes of its own
+ELSEWHERE = {'arms'}  # which has processes of its own
 
 
 @pytest.fixture(scope='module')
@@ -257,10 +257,10 @@ def is_interrupted(ended, name):
 
 
 @pytest.mark.parametrize('moment', ['importing', 'compiling'])
-def test_ctrl_c_ends_the_processes_that_precompile_in_one_line(tmp_path, moment):
+def test_ctrl_c_ends_the_processes_that_compile_ahead_in_one_line(tmp_path, moment):
     """A terminal sends it to all of them. What they have left in the cache is whole."""
     place = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
-    words = ['-m', 'blf_dsc_controller', 'precompile', '--config', 'recommended']
+    words = ['-m', 'blf_dsc_controller', 'doctor', '--compile']
     started = subprocess.Popen(
         [sys.executable, *words],
         stderr=subprocess.PIPE,
@@ -281,7 +281,7 @@ def test_ctrl_c_ends_the_processes_that_precompile_in_one_line(tmp_path, moment)
     lines += started.communicate()[1].splitlines()
     assert started.returncode == 130, lines
     said = [line for line in lines if COMPILING not in line]
-    assert said == ['blf_dsc precompile: interrupted']
+    assert said == ['blf_dsc doctor: interrupted']
     wait_for(lambda: not any(Path(f'/proc/{each}').exists() for each in children))
     assert not [*tmp_path.rglob('*.tmp.*')]
 

@@ -31,13 +31,13 @@ class Finalizer:
         os.kill(os.getpid(), signal.SIGTERM)
         sum(range(1000))
 
-def plot(options):
+def report(options):
     with global_compiler_lock:
         Finalizer()
         print('compiled on')
 
-blf_dsc_controller.cli.bags.plot = plot
-sys.exit(main(['plot', 'bag']))
+blf_dsc_controller.cli.bags.report = report
+sys.exit(main(['report', 'bag']))
 """
 
 
@@ -47,7 +47,7 @@ def bag(tmp_path_factory):
     return recorded_run.write_made(path, Synthetic(100).messages())
 
 
-COMMANDS = 'run --offline, report, plot, recover, export, excite, arms, monte-carlo'
+COMMANDS = 'run --offline, report, recover, export, excite, arms, monte-carlo'
 
 
 @pytest.mark.parametrize('place', ['file/below', '/proc/none', '/dev/full'])
@@ -61,7 +61,7 @@ def test_unwritable_output_path_is_reported(
     if suffix:
         (tmp_path / f'full{suffix}').symlink_to('/dev/full')
         place = {'/dev/full': f'full{suffix}'}.get(place, f'{place}{suffix}')
-    words = [str(bag)] if command in ('report', 'plot', 'recover', 'export') else []
+    words = [str(bag)] if command in ('report', 'recover', 'export') else []
     options = [place, '--config', 'panda'] if command == 'excite' else ['--out', place]
     assert main([*command.split(), *words, *options]) == 1
     lines = capfd.readouterr().err.splitlines()
@@ -134,7 +134,7 @@ def test_run_says_that_its_simulated_arm_is_ideal_and_that_nothing_moves(tmp_pat
 def test_interrupt_during_kernel_compilation_ends_the_command():
     run = finished(sys.executable, '-c', INTERRUPTED_WHILE_COMPILING)
     assert (run.returncode, run.stdout) == (130, '')
-    assert run.stderr == 'blf_dsc plot: interrupted\n'
+    assert run.stderr == 'blf_dsc report: interrupted\n'
 
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
@@ -280,11 +280,11 @@ def test_output_that_nobody_takes_ends_in_a_sentence_or_silently(
 def test_name_that_the_shell_cannot_write_is_told_with_the_remedy(
     tmp_path, monkeypatch, capsys
 ):
-    def plot(_):
+    def report(_):
         'ü'.encode('ascii')
 
-    monkeypatch.setattr('blf_dsc_controller.cli.bags.plot', plot)
-    assert main(['plot', str(tmp_path)]) == 1
+    monkeypatch.setattr('blf_dsc_controller.cli.bags.report', report)
+    assert main(['report', str(tmp_path)]) == 1
     assert "'\\xfc' cannot be written" in capsys.readouterr().err
 
 

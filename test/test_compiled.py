@@ -521,7 +521,7 @@ def test_generated_view_can_be_read():
 SHOW = """
 import sys
 from pathlib import Path
-from blf_dsc_controller.cli import run
+from blf_dsc_controller.cli import compilation as run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.configuration.nodes import load_loop
@@ -536,9 +536,9 @@ if __name__ == '__main__':  # the command has processes of its own
     for kernel in (update, run_plant, named['_read'], named['_sample']):
         print(kernel.__name__, len(kernel.signatures))
     kernel_cache.SHIPPED = Path(sys.argv[1])
-    assert main(['precompile', '--config', 'recommended', '--package']) == 0
+    assert main(['doctor', '--compile', 'package']) == 0
     run._compile_side_by_side = lambda *_: None  # it was seen to work
-    assert main(['precompile', '--config', 'recommended']) == 0
+    assert main(['doctor', '--compile', '--config', 'recommended']) == 0
     for kernel in (update, run_plant):
         assert list(kernel_cache.SHIPPED.glob(f'*/*.{kernel.__name__}-*.nbc')), kernel
 """
@@ -548,7 +548,7 @@ ANY_ARM = """
 import sys
 import numpy as np
 import blf_dsc_controller as blf
-from blf_dsc_controller.cli import run
+from blf_dsc_controller.cli import compilation as run
 from blf_dsc_controller.compiled import kernel_cache
 from sim_plant.kernels import run_plant
 

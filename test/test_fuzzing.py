@@ -188,7 +188,7 @@ def secret():
 
 
 READ = ('export', 'replay', 'recover', 'part', 'identify')
-DRAW = ('report', 'plot')
+DRAW = ('report', 'pictures')
 WAYS = st.sampled_from((*READ * 5, *DRAW))
 
 
@@ -202,6 +202,8 @@ def read(bag, way):
         command('replay', bag)
     elif way == 'report':
         command('report', bag, '--out', out / 'page.html')
+    elif way == 'pictures':
+        command('report', bag, '--png', out)
     elif way == 'identify':
         urdf = share_folder() / 'config' / 'two_link.urdf'
         command('identify', bag, '--urdf', urdf, '--out', bag.parent / 'out.urdf')

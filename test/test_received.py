@@ -120,7 +120,7 @@ def test_law_that_a_bag_names_does_not_run_where_a_bag_is_read(bag, law, tmp_pat
     bag, out = str(bag), tmp_path / 'out'
     assert main(['report', bag, '--out', str(out.with_suffix('.html'))]) == 0
     assert main(['export', bag, '--out', str(out.with_suffix('.csv'))]) == 0
-    assert main(['plot', bag, '--out', str(out)]) == 0
+    assert main(['report', bag, '--png', str(out)]) == 0
     assert not law.has_run
 
 

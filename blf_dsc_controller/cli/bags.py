@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc report`, `plot`, `export`, `recover`, `replay`: what is made from bags."""
+"""`blf_dsc report`, `export`, `recover`, `replay`: what is made from bags."""
 
 from __future__ import annotations
 
 import time
 from argparse import Namespace
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from blf_dsc_controller.bags import reader, recovery, table
@@ -31,7 +32,10 @@ _DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 
 def report(options: Namespace) -> None:
-    """Write the HTML page of one or several bags."""
+    """Write the HTML page of one or several bags, or the pictures of one."""
+    if options.png:
+        _draw(options)
+        return
     from blf_dsc_controller.analysis.report import read_bag, write_report
 
     if options.out.suffix not in _PAGES:
@@ -44,10 +48,32 @@ def report(options: Namespace) -> None:
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 
 
-def _run(options: Namespace) -> Run:
+def _draw(options: Namespace) -> None:
+    """Draw the pictures of a bag and summarise it."""
+    from blf_dsc_controller.analysis import figures
+    from blf_dsc_controller.analysis.metrics import measure
+    from blf_dsc_controller.analysis.metrics_table import format_table
+    from blf_dsc_controller.analysis.output import write_json
+
+    if len(options.bags) > 1:
+        raise BlfDscError('--png draws one bag: give one, or leave out --png')
+    folder = options.png
+    paths = [folder / name for name in ('summary.json', *figures.NAMES)]
+    make_room(*paths, force=options.force, try_out=False)
+    announce_reading(options.bags, 'drawn')
+    run = _run(options, options.bags[0])
+    metrics = measure(run)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(metrics, paths[0])
+    written = [paths[0], *figures.draw(run, folder, metrics)]
+    print(format_table(metrics))
+    print('wrote', ', '.join(str(path) for path in written))
+
+
+def _run(options: Namespace, bag: Path) -> Run:
     """Read the run of a bag, and print what is left out."""
     names = NameMap.parse(options.map)
-    run = reader.recorded_run(read_content(options.bag, options.namespace, names))
+    run = reader.recorded_run(read_content(bag, options.namespace, names))
     for note in run.notes:
         print(f'note: {note}')
     return run
@@ -58,30 +84,9 @@ def export(options: Namespace) -> None:
     table.check_format(options.out)  # before a large bag is read
     make_room(options.out, force=options.force)
     announce_reading([options.bag], 'written as a table')
-    run = _run(options)
+    run = _run(options, options.bag)
     columns = table.export(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
-
-
-def plot(options: Namespace) -> None:
-    """Plot and summarise a bag."""
-    from blf_dsc_controller.analysis import figures
-    from blf_dsc_controller.analysis.metrics import measure
-    from blf_dsc_controller.analysis.metrics_table import format_table
-    from blf_dsc_controller.analysis.output import write_json
-
-    names = ('summary.json', *figures.NAMES)
-    make_room(
-        *(options.out / name for name in names), force=options.force, try_out=False
-    )
-    announce_reading([options.bag], 'drawn')
-    run = _run(options)
-    metrics = measure(run)
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_json(metrics, options.out / 'summary.json')
-    written = [options.out / 'summary.json', *figures.draw(run, options.out, metrics)]
-    print(format_table(metrics))
-    print('wrote', ', '.join(str(path) for path in written))
 
 
 def recover(options: Namespace) -> int:

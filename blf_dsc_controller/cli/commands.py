@@ -124,23 +124,6 @@ _RUN = Command(
         option('--view', 'show the run on a page in the browser', action='store_true'),
     ),
 )
-_PRECOMPILE = Command(
-    name='precompile',
-    module='run',
-    about='Compile the kernels of a configuration before its first start. Controller and '
-    'simulated arm then start within seconds. Use it after an installation, or when you build an '
-    'image. The kernels go into the cache of the user (NUMBA_CACHE_DIR, or '
-    '~/.cache/blf_dsc_controller).',
-    example='--config my.yaml',
-    options=(
-        option('--config', _CONFIG, default='recommended'),
-        option(
-            '--package',
-            'also copy them into the package, for wheels, workspaces and images made from it',
-            action='store_true',
-        ),
-    ),
-)
 _DRIVE = Command(
     name='drive',
     module='drive',
@@ -196,13 +179,21 @@ _REPORT = Command(
     name='report',
     module='bags',
     about='Show one or several bags on one HTML page. It has zoomable plots, events and the '
-    'configuration, and needs no network.',
-    example='run1/bag run2/bag --out comparison.html',
+    'configuration, and needs no network. With --png, draw pictures of one bag instead.',
+    example='run1/bag run2/bag --out comparison.html\n'
+    '  blf_dsc report run1/bag --png pictures',
     options=(
         *_NAMES,
         _FORCE,
         option('bags', _BAG, type=Path, nargs='+', metavar='BAG'),
         option('--out', 'file (report.html)', type=Path, default=Path('report.html')),
+        option(
+            '--png',
+            'write no page, but the pictures (tracking.png, ...) and summary.json of a bag into '
+            'this folder, and print the summary',
+            type=Path,
+            metavar='FOLDER',
+        ),
     ),
 )
 _RECOVER = Command(
@@ -226,18 +217,6 @@ _EXPORT = Command(
         _FORCE,
         option('bag', _BAG, type=Path),
         option('--out', 'FILE.csv or FILE.parquet', type=Path, required=True),
-    ),
-)
-_PLOT = Command(
-    name='plot',
-    module='bags',
-    about='Draw the pictures of a bag (tracking.png, ...) and write summary.json.',
-    example='run1/bag --out pictures',
-    options=(
-        *_NAMES,
-        _FORCE,
-        option('bag', _BAG, type=Path),
-        option('--out', 'folder to write into (.)', type=Path, default=Path()),
     ),
 )
 _COMMISSION = Command(
@@ -526,8 +505,10 @@ _DOCTOR = Command(
     module='doctor',
     about='Say what is installed, what this computer is like for a control loop, and what to '
     'mend. It takes some seconds and changes nothing. Paste what it prints into a report of a '
-    'bug. Exit code: 0 no problem, 1 a problem.',
-    example='--config my.yaml --robot 172.16.0.2',
+    'bug. With --compile, compile the kernels of a configuration instead, so that controller and '
+    'simulated arm start within seconds. Exit code: 0 no problem, 1 a problem.',
+    example='--config my.yaml --robot 172.16.0.2\n'
+    '  blf_dsc doctor --compile --config my.yaml',
     options=(
         option(
             '--config', 'parameter file or preset, to hear what is said at its start'
@@ -536,18 +517,25 @@ _DOCTOR = Command(
             '--robot',
             'IP address or name of a robot, to ask how fast it answers (ping)',
         ),
+        option(
+            '--compile',
+            'only compile the kernels of --config (recommended), into the cache of the user '
+            '(NUMBA_CACHE_DIR, or ~/.cache/blf_dsc_controller); package: also into the package, '
+            'for wheels, workspaces and images made from it',
+            nargs='?',
+            const='user',
+            choices=('user', 'package'),
+        ),
     ),
 )
 
 COMMANDS = (
     _RUN,
-    _PRECOMPILE,
     _DRIVE,
     _REPLAY,
     _REPORT,
     _RECOVER,
     _EXPORT,
-    _PLOT,
     _COMMISSION,
     _EXCITE,
     _IDENTIFY,

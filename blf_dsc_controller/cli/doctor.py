@@ -57,6 +57,12 @@ _SLOW = 0.3  # ms: more leaves too little of a sample of 1 ms to the law and the
 
 def doctor(options: Namespace) -> int:
     """Print what was found; return 1 if there is a problem."""
+    if options.compile:
+        from blf_dsc_controller.cli.compilation import compile_ahead  # slow
+
+        into_package = options.compile == 'package'
+        compile_ahead(options.config or 'recommended', into_package=into_package)
+        return 0
     found: list[Finding] = []
     every = chain(_software(), _ros(), computer.examine())
     if options.config:

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc run` and `precompile`: a closed loop with its bag and pictures."""
+"""`blf_dsc run`: a closed loop with its bag and pictures."""
 
 from __future__ import annotations
 
-import signal
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
-from contextlib import contextmanager
-from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +17,6 @@ from blf_dsc_controller.cli.domains import check_network
 from blf_dsc_controller.cli.result_folder import BAG, make_folder, refuse_existing
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.compiled.kernel_cache import ship
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -37,22 +32,17 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.configuration.plant import PlantConfig, Truth
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.messages.codecs import JointStateDecoder
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints, plan_start
 from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.simulation.loop import simulate_into_bag
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
-from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Reason
-from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
-from sim_plant.plant import plant_of
 
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
 
-_ANY_TIMEOUT = 1.0  # s
 _DURATION = 60.0  # s, if neither the file nor an option sets it
 
 
@@ -236,68 +226,3 @@ def _report(out: Path) -> bool:
         stop.stamp < last or stop.reason != Reason.STATE_TIMEOUT
         for stop in recorded.stops
     )
-
-
-def precompile(options: Namespace) -> None:
-    """Compile the kernels of controller, watchdog and plant, in two parallel processes."""
-    config = load_loop(options.config)
-    _compile_side_by_side(config.controller, config.plant)
-    if options.package:
-        print(
-            f'{options.config}: the kernels are in {ship()}, for all who use this copy'
-        )
-        return
-    print(
-        f'{options.config}: the kernels are compiled; the nodes of this user now start at once'
-    )
-
-
-def _compile_side_by_side(*configs: ControllerConfig | PlantConfig) -> None:
-    """Compile the kernels of each configuration in a process of its own.
-
-    The terminal sends Ctrl-C to all of them: only this process acts on it, and ends the others.
-    """
-    context = get_context('spawn')
-    processes = [
-        context.Process(target=_compile_aloud, args=(each,)) for each in configs
-    ]
-    resource_tracker.ensure_running()  # its start would unblock the signal again
-    try:
-        with _sigint_blocked():  # as long as they import, too: a mask is inherited
-            for process in processes:
-                process.start()
-        for process in processes:
-            process.join()
-    finally:
-        for process in processes:
-            if process.is_alive():
-                process.kill()
-                process.join()
-    if any(process.exitcode for process in processes):
-        raise BlfDscError('the kernels were not compiled: the lines above say why')
-
-
-@contextmanager
-def _sigint_blocked() -> Iterator[None]:
-    """Delay Ctrl-C for this process; processes that it starts meanwhile never get it."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _compile_aloud(config: ControllerConfig | PlantConfig) -> None:
-    """Compile as `compile_kernels` does, and name each kernel."""
-    with announced_compilation(print_notice):
-        compile_kernels(config)
-
-
-def compile_kernels(config: ControllerConfig | PlantConfig) -> None:
-    """Compile what the nodes call: those of controller and watchdog, or that of the plant."""
-    if isinstance(config, ControllerConfig):
-        Guard(config)
-        JointStateDecoder(config.joints)
-        TorqueWatchdog(config, _ANY_TIMEOUT)  # rehearses
-    else:
-        plant_of(config).compile()

@@ -59,9 +59,7 @@ def monte_carlo(options: Namespace) -> None:
         chosen = make_folder(options.out or Path(f'{store.folder.name}-run-{run}'))
         reproduce(store, run, chosen)
         print(f'the same figures as in {folder}, bit for bit')
-        print(
-            f'wrote       {chosen}: config.yaml and bag, which blf_dsc plot and report draw'
-        )
+        print(f'wrote       {chosen}: config.yaml and bag, which blf_dsc report draws')
     elif options.report:
         folder = options.out or Path('changes')
         folder.mkdir(parents=True, exist_ok=True)
