@@ -71,13 +71,12 @@ class Contact(NamedTuple):
 
 
 class Oscillation(NamedTuple):
-    """An oscillation of the arm, or a step of softening that it caused."""
+    """An oscillation of the arm that it was warned of."""
 
     stamp: int  #: ns, of the joint state that showed it
     joint: str  #: that showed it most
     frequency: float  #: Hz
     torque: float  #: N m, amplitude
-    share: float  #: of the configured rates that the feedback has since then
     text: str  #: sentence with the numbers
 
 

@@ -1570,7 +1570,7 @@ def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
     assert any('a smaller feedback.stiffness' in each for each in sentences(result))
     # friction and coarse encoders look alike, but for what the controller reports
     assert commissioning.plan_repeat(first, run.run).share == 1.0
-    reported = Oscillation(FIRST_STAMP, 'joint2', 25.0, 8.0, 1.0, 'it oscillates')
+    reported = Oscillation(FIRST_STAMP, 'joint2', 25.0, 8.0, 'it oscillates')
     again = commissioning.plan_repeat(first, replace(run.run, oscillations=(reported,)))
     assert (first.share, again.share) == (1.0, 0.5)
     assert again.config.feedback.gain == tuple(0.5 * stiff.damping)

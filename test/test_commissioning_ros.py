@@ -41,7 +41,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
-from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
 
@@ -219,14 +219,14 @@ def test_log_has_oscillations_of_moves_but_not_of_motions_which_shake_the_arm(
     silent = SimpleNamespace(warning=said.append, info=str, fatal=str)
     monkeypatch.setattr(rig.node.log, '_log', silent)
     monkeypatch.setattr(
-        Calming, 'text', property(lambda found: f'{found.count} so far')
+        OscillationCheck, 'text', property(lambda found: f'{found.count} so far')
     )
 
     during = []
 
     def oscillate():
         during.append(rig.node.guard.config.reference.type)
-        rig.node.guard.calming.count += 2
+        rig.node.guard.oscillation.count += 2
         rig.node.log.warn_of_findings(rig.node.guard)
         if len(during) == 1:
             rig.during('motion', oscillate)

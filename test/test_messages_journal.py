@@ -56,7 +56,6 @@ EXAMPLES = {
         'joint': 'joint1',
         'frequency': 31.0,
         'torque': 14.0,
-        'share': 0.5,
         'text': 'joint1 oscillates',
     },
     'torque sensors': {'joint': 'joint1', 'text': 'the efforts are commands'},

@@ -155,7 +155,7 @@ def test_findings_of_a_running_law_are_warned_of_once_each():
     contacts = SimpleNamespace(count=0, last=None)
     guard = SimpleNamespace(
         findings=SimpleNamespace(contacts=contacts, untrusted=''),
-        calming=SimpleNamespace(count=0, text='softer'),
+        oscillation=SimpleNamespace(count=0, text='oscillates'),
     )
 
     def warned():
@@ -167,8 +167,8 @@ def test_findings_of_a_running_law_are_warned_of_once_each():
     assert warned() == []
     contacts.count, contacts.last = 1, SimpleNamespace(text='a contact')
     assert warned() == ['a contact']
-    guard.calming.count = 1
-    assert warned() == ['softer']
+    guard.oscillation.count = 1
+    assert warned() == ['oscillates']
     guard.findings.untrusted = 'no sensors'
     assert warned() == ['no sensors']
     guard.findings.untrusted = ''

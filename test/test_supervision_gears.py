@@ -213,7 +213,6 @@ def test_gains_of_the_presets_hold_on_elastic_joints(preset, changes, moving, pi
 
 
 def test_gains_of_rigid_gears_shake_an_elastic_arm():
-    """It is stopped, or its feedback is softened."""
     given = {'duration': 2.0, 'joint.stiffness': [1e4] * 7}
     rigid = {
         'feedback.inertia': 'whole',
@@ -222,4 +221,4 @@ def test_gains_of_rigid_gears_shake_an_elastic_arm():
     }
     loop = load_loop('fr3_direct', {'sim_plant': given, 'blf_dsc_controller': rigid})
     run = simulate(loop.controller, loop.plant).run()
-    assert run.stops or run.oscillations
+    assert run.stops

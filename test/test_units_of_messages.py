@@ -33,13 +33,13 @@ from blf_dsc_controller.reference.terms import minimum_jerk, pack
 from blf_dsc_controller.run import SLIDING, TURNING, Series
 from blf_dsc_controller.supervision import first_torque, gain_limits, retuning
 from blf_dsc_controller.supervision.bound_warnings import width_warnings
-from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.contact import contact_of
 from blf_dsc_controller.supervision.digits import largest_error
 from blf_dsc_controller.supervision.expected_errors import expectation
 from blf_dsc_controller.supervision.gear_warnings import gear_warnings
 from blf_dsc_controller.supervision.not_sensors import text_of
+from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 from blf_dsc_controller.supervision.state_check import StateCheck
 from blf_dsc_controller.supervision.stop_cause import chatter_of
 from blf_dsc_controller.view import texts
@@ -227,7 +227,7 @@ def test_force_that_chatters(noise, why):
 def test_force_that_oscillates():
     waves = SimpleNamespace(amplitude=np.array([0.0, 25.0]), half=np.full(2, 0.05))
     controller = law(checks=SimpleNamespace(oscillation=waves))
-    shaking = Calming(arm(), controller)._find(np.array([False, True]))
+    shaking = OscillationCheck(arm(), controller)._find(np.array([False, True]))
     assert shaking.text == "joint 'sliding' oscillates at 10 Hz with +-25 N"
 
 

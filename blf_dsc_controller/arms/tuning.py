@@ -248,7 +248,6 @@ def _limits_of(arm: Design) -> dict[str, Value]:
         'limits.acceleration': _listed(
             np.minimum(4.0 * _SLOW * velocity, acceleration)
         ),
-        'safety.oscillation': 'soften',
         'safety.torque': 'hold_gravity',
         'safety.damping': _listed(
             _BRAKING * arm.over_postures().free_inertia * fastest

@@ -33,7 +33,7 @@ def shaking_parameters(
             'learning.weight': 0.0,
             'learning.adaptation_gain': [0.0] * count,
             'limits.acceleration': limit.tolist(),
-            'safety.oscillation': 'warn',  # with softer gains another arm would be measured
+            'safety.oscillation': 'warn',  # it is measured again with half of the gains
         }
     )
 

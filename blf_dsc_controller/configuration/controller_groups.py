@@ -88,10 +88,10 @@ class Safety:
         'check',
         'refuse a first torque that an arm at rest contradicts, or send it unchecked',
     )
-    oscillation: Literal['soften', 'stop', 'warn', 'ignore'] = parameter(
-        'warn',
-        'what is done about an arm that oscillates; soften: halve the rates of the feedback, '
-        'twice at most, then stop',
+    oscillation: Literal['stop', 'warn', 'ignore'] = parameter(
+        'stop',
+        'what is done about an arm that oscillates; warn: stop only if torques reach half of '
+        'their limit',
     )
     torque: Literal['zero', 'damping', 'hold_gravity'] = parameter(
         'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'

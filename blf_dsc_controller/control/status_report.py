@@ -104,7 +104,7 @@ class StatusReport:
 
     def _loop_values(self, guard: Guard) -> dict[str, Any]:
         """Return counts of states and samples, cuts of the torque, and oscillations."""
-        states, samples, calming = guard.states, guard.samples, guard.calming
+        states, samples, last = guard.states, guard.samples, guard.oscillation.last
         cuts = guard.controller.state.saturation
         off = f'off: {guard.watchdog.why_off}'.removesuffix(': ')
         return {
@@ -119,8 +119,7 @@ class StatusReport:
             'watchdog on the steady clock': 'on' if guard.watchdog.on else off,
             'samples cut by the torque limit': _by_joint(guard, cuts.level_cuts),
             'samples cut by the torque rate limit': _by_joint(guard, cuts.rate_cuts),
-            'share of the rates of the feedback': f'{calming.share:g}',
-            'last oscillation': calming.last.text if calming.last else 'none',
+            'last oscillation': last.text if last else 'none',
             'torque sensors': guard.findings.untrusted or 'none or as configured',
             **(self.trajectories.values if self.trajectories else {}),
         }
@@ -152,8 +151,8 @@ def _unusual(guard: Guard) -> str:
     samples = guard.samples
     if samples.outside:
         return 'the error has left its bound'
-    if guard.calming.is_due(guard.reference.time):
-        return guard.calming.text
+    if guard.oscillation.is_due(guard.reference.time):
+        return guard.oscillation.text
     if guard.findings.untrusted:
         return guard.findings.untrusted
     limited = ''

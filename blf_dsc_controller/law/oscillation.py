@@ -158,6 +158,16 @@ def grows(now: State, i: int) -> bool:
 
 
 @inner
+def is_violent(now: State, limit: Array) -> bool:
+    """Whether a joint oscillates with much of its torque, of a `limit` (n,) [N m]."""
+    found = False
+    for i in range(limit.size):
+        is_strong = now.amplitude[i] > VIOLENT * limit[i]
+        found = found or (is_strong and oscillates(now, i))
+    return found
+
+
+@inner
 def count_down(now: State, limit: Array, dt: float) -> bool:
     """Count down to the next report; return whether an oscillation is to be reported now.
 
@@ -165,12 +175,10 @@ def count_down(now: State, limit: Array, dt: float) -> bool:
     torques.
     """
     now.wait[0] = max(0.0, now.wait[0] - dt)
-    is_any = is_violent = False
+    is_any = False
     for i in range(limit.size):
-        if oscillates(now, i):
-            is_any = True
-            is_violent = is_violent or now.amplitude[i] > VIOLENT * limit[i]
-    if not is_any or (now.wait[0] > 0.0 and not is_violent):
+        is_any = is_any or oscillates(now, i)
+    if not is_any or (now.wait[0] > 0.0 and not is_violent(now, limit)):
         return False
     now.wait[0] = PATIENCE
     return True

@@ -212,9 +212,12 @@ def step(
         return 0
     flags = check_sample(settings, checks, state, signals, sample)
     if state.sensors.noted[0] != noted:
+        flags |= NOT_SENSORS
+    if oscillation.is_violent(checks.oscillation, settings.torque.limit):
+        return flags | OSCILLATES
+    if state.sensors.noted[0] != noted:
         oscillation.forget_all(checks.oscillation)  # r may have been the cause
-        return flags | NOT_SENSORS
-    if oscillates:
+    elif oscillates:
         flags |= blame_oscillation(settings, checks, state)
     return flags
 

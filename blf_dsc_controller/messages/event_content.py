@@ -157,9 +157,6 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         'joint': Field(TEXT),  # that shows it most
         'frequency': Field(NUMBER),  # Hz
         'torque': Field(NUMBER),  # N m, amplitude
-        'share': Field(
-            NUMBER
-        ),  # of its configured rates that the feedback has from now on
         'text': Field(TEXT),
     },
     'torque sensors': {

@@ -107,10 +107,10 @@ class ControllerLog:
         if contacts.last is not None and contacts.count != self._contacts:
             self._contacts = contacts.count
             self._log.warning(contacts.last.text)
-        if guard.calming.count != self._oscillations:
-            self._oscillations = guard.calming.count
+        if guard.oscillation.count != self._oscillations:
+            self._oscillations = guard.oscillation.count
             if self.warns_of_oscillations:
-                self._log.warning(guard.calming.text)
+                self._log.warning(guard.oscillation.text)
         if guard.findings.untrusted != self._untrusted:
             self._untrusted = guard.findings.untrusted
             if self._untrusted:

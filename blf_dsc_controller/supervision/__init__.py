@@ -27,7 +27,7 @@ Checks, and what follows:
     readings          turns and velocities of states: `wraps`, `velocity`
     sample_check      what the law computed, before its torque is sent; `stop_cause` says why
     findings          what the law detects: contacts, wrong sensors (`not_sensors`), oscillations
-    calming           softer feedback for an arm that oscillates
+    oscillation_check what follows from an oscillation: a stop, or a warning
     contact           contacts in words, and whether the arm holds after one
 
 The torque without the law:

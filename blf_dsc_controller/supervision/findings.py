@@ -49,21 +49,17 @@ class Findings:
         command.samples.compare_efforts()
         command.note(EventType.TORQUE_SENSORS, joint=joint, text=self.untrusted)
 
-    def calm(self) -> Fault | None:
-        """Soften the feedback of an arm that oscillates; a fault if that has not helped."""
-        command, calming = self._command, self._command.calming
+    def check_oscillation(self) -> Fault | None:
+        """Return the fault of an arm that oscillates, or record what it is warned of."""
+        command, check = self._command, self._command.oscillation
         if not command.controller.flags & OSCILLATES:
             return None
-        before = calming.count
-        if not calming.react(command.reference.time):
-            return Fault(Reason.OSCILLATION, calming.cause)
-        if calming.last is not None and calming.count > before:
-            command.note(
-                EventType.OSCILLATION,
-                **calming.last._asdict(),
-                share=calming.share,
-                text=calming.text,
-            )
+        before = check.count
+        if check.must_stop(command.reference.time):
+            return Fault(Reason.OSCILLATION, check.cause)
+        if check.last is not None and check.count > before:
+            content = check.last._asdict()
+            command.note(EventType.OSCILLATION, **content, text=check.text)
         return None
 
     def react_to_contact(self) -> None:
@@ -118,7 +114,7 @@ class Findings:
             return
         invalid = command.states.invalid(command.config.safety, measurement)
         # of an arm that is too fast, why if it oscillates
-        cause = command.calming.cause if invalid.reason is Reason.VELOCITY else ''
+        cause = command.oscillation.cause if invalid.reason is Reason.VELOCITY else ''
         command.stop(invalid.reason, '; '.join(filter(None, (cause, invalid.text))))
 
     def compare_velocities(self, stamp: int, measurement: Vector) -> None:
@@ -133,7 +129,7 @@ class Findings:
         sensor = checks.sensor
         fault = command.states.contradicted(sensor.derived, sensor.measured)
         worst = int(np.argmax(sensor.mismatch / (sensor.speed + SLOW**2)))
-        cause = command.calming.cause if command.supervisor.running else ''
+        cause = command.oscillation.cause if command.supervisor.running else ''
         if cause and is_late(sensor, worst):
             fault = Fault(Reason.OSCILLATION, cause)
         if command.supervisor.uses_states:

@@ -161,7 +161,7 @@ class Guard(InCommand):
         self._take((stamp,), measurement)
         self._advance_to(stamp)
         self.findings.check_efforts()
-        fault = self.samples.check(dt) or self.findings.calm()
+        fault = self.samples.check(dt) or self.findings.check_oscillation()
         if fault is not None:
             self.stop(*fault)
             return self.safe(self.config.sample_time)
@@ -313,7 +313,7 @@ class Guard(InCommand):
             retuning.apply(self.controller, config)
         self.loads.subtract_again()
         self.config = config
-        self.calming.configure(config)
+        self.oscillation.configure(config)
         self.samples.set_limits(config.safety)
 
     def problems(self, config: ControllerConfig) -> list[str]:

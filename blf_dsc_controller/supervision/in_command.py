@@ -22,9 +22,9 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.retargeting import TrajectoryError
-from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
+from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 from blf_dsc_controller.supervision.readings import Readings
 from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_stop import WINDING_UP, SafeStop
@@ -49,7 +49,7 @@ class InCommand:
         estimates: those that count for the torque without the law, and for its next start.
         watchdog: the check for missing states.
         journal: events, and counts of what has been processed so far.
-        calming: the last oscillation, and by how much it has softened the feedback.
+        oscillation: what follows from an oscillation, and the last one that is warned of.
         readings: stamps, turns and velocities of the joint states.
         reference: the reference in force, and the time of the law.
         safe_torque: the ramp to the safe torque, and the last usable joint state.
@@ -72,10 +72,10 @@ class InCommand:
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
         self.states = StateCheck(config.joints, config.units, config.sample_time)
-        self.calming = Calming(config, self.controller)
+        self.oscillation = OscillationCheck(config, self.controller)
         self.estimates = KeptEstimates(self.controller)
         self.samples = SampleCheck(
-            config, self.controller, self.calming, self.estimates
+            config, self.controller, self.oscillation, self.estimates
         )
         self.watchdog = Watchdog(steady, wall)
         self.journal = Journal()
@@ -147,7 +147,7 @@ class InCommand:
     def start_over(self) -> None:
         """Wait for a state to start from, without the faults so far."""
         self.supervisor.enter(Phase.STARTING)
-        self.calming.restart()
+        self.oscillation.restart()
         self.states.restart()
         self.samples.restart()
         self.silenced = self.has_sample = False
@@ -175,7 +175,7 @@ class InCommand:
             reason,
             self.readings.speed,
             was_running=was_running,
-            oscillates=was_running and bool(self.calming.cause),
+            oscillates=was_running and bool(self.oscillation.cause),
         )
 
     def deactivate(self) -> None:

@@ -13,10 +13,10 @@ from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.law.check_state import NO_EFFECT, OUTSIDE, SUSPECT
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.supervision.calming import Calming
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.not_sensors import is_off
+from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 from blf_dsc_controller.supervision.stop_cause import StopCause
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 from blf_dsc_controller.tool.errors import in_words
@@ -45,7 +45,7 @@ class SampleCheck:
         self,
         config: ControllerConfig,
         controller: Controller,
-        calming: Calming,
+        oscillation: OscillationCheck,
         estimates: KeptEstimates,
     ) -> None:
         """Enable the checks of the controller; `estimates` are the kept ones of its law."""
@@ -55,7 +55,7 @@ class SampleCheck:
         self._units = config.units
         self._tool = tool_of(config)
         self._controller = controller
-        self._cause = StopCause(config, controller, calming)
+        self._cause = StopCause(config, controller, oscillation)
         self.ratio = controller.checks.ratio
         self._estimates = estimates
         self._saturation = 0  # ns, times _RELIEF

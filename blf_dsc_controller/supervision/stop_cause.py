@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cause of a stop, where an arm left its bound or did not follow its commands.
 
-It may be an oscillation, a torque that only repeats the noise of a sensor, a torque at its
-limit, or feedback that has been softened.  Each has a remedy of its own, which is not that of
-the check that stops the arm.
+It may be an oscillation, a torque that only repeats the noise of a sensor, or a torque at its
+limit.  Each has a remedy of its own, which is not that of the check that stops the arm.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque import RATE_CUT
-from blf_dsc_controller.supervision.calming import Calming
+from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 
 _CHATTER = 0.11  # of the torque limit; 20 bits leave a Panda 0.01, 16 bits 0.13
 # of the sensor's noise: a step that is larger makes it, a sum of others hides one
@@ -49,11 +48,14 @@ class StopCause:
     """Finds why an arm may be about to stop."""
 
     def __init__(
-        self, config: ControllerConfig, controller: Controller, calming: Calming
+        self,
+        config: ControllerConfig,
+        controller: Controller,
+        oscillation: OscillationCheck,
     ) -> None:
         self._config = config
         self._controller = controller
-        self._calming = calming
+        self._oscillation = oscillation
         self._limited = 0  # number of the joint that was last at its limit
 
     def take_limited(self, joint: int) -> None:
@@ -63,7 +65,7 @@ class StopCause:
     @property
     def oscillation(self) -> str:
         """What oscillates, and the remedy; empty if nothing does."""
-        return self._calming.cause
+        return self._oscillation.cause
 
     @property
     def shaking(self) -> str:
@@ -75,8 +77,7 @@ class StopCause:
 
         A torque has been at its limit for `saturated_time` [s].
         """
-        softness = self._calming.softness
-        return self.shaking or self.saturation(saturated_time) or softness
+        return self.shaking or self.saturation(saturated_time)
 
     def saturation(self, time: float) -> str:
         """Return which joint has lacked torque for long, `time` [s]; empty if none has."""

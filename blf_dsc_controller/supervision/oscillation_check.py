@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reaction to an arm that oscillates: it stops, or is warned of.
+
+An oscillation whose torques reach half of their limits stops the arm in any case, unless
+oscillations are ignored.
+"""
+
+from __future__ import annotations
+
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.oscillation import PATIENCE, is_violent, oscillates
+from blf_dsc_controller.supervision.digits import two_digits
+
+_LOWER = 0.5  # of the present stiffness, which is advised
+_LATELY = 0.1  # s
+
+
+class Shaking(NamedTuple):
+    """The oscillation of the joint that shows it most."""
+
+    joint: str
+    frequency: float  # Hz
+    torque: float  # N m or N, amplitude
+    unit: str  # of the torque
+
+    @property
+    def text(self) -> str:
+        """A sentence with the numbers, without its end."""
+        return (
+            f'joint {self.joint!r} oscillates at {two_digits(self.frequency)} Hz with '
+            f'+-{two_digits(self.torque)} {self.unit}'
+        )
+
+
+class OscillationCheck:
+    """Decides what follows from an oscillation of a law's arm.
+
+    Attributes:
+        last: the last oscillation that is warned of; None: none so far.
+        count: of those so far.
+    """
+
+    def __init__(self, config: ControllerConfig, controller: Controller) -> None:
+        self._controller = controller
+        self._state = controller.checks.oscillation
+        self.last: Shaking | None = None
+        self.count = 0
+        self.configure(config)
+
+    def configure(self, config: ControllerConfig) -> None:
+        """React as a configuration says from now on."""
+        self._config = config
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again at t = 0."""
+        self._reported = -inf  # s
+
+    def must_stop(self, t: float) -> bool:
+        """Whether the arm has to stop for an oscillation that the law reports at t [s].
+
+        If it does not, `last` and `count` change once an oscillation is warned of.
+        """
+        reaction = self._config.safety.oscillation
+        joints = range(self._state.waves.size)
+        found = self._find(np.array([oscillates(self._state, i) for i in joints]))
+        if found is None or reaction == 'ignore':
+            return False
+        limit = self._controller.settings.torque.limit
+        if reaction == 'stop' or is_violent(self._state, limit):
+            return True
+        if not self.is_due(t):
+            self.last = found
+            self.count += 1
+        self._reported = t
+        return False
+
+    def _find(self, shakes: NDArray[np.bool_]) -> Shaking | None:
+        """Return the oscillation of the worst of the joints that do (n,); None: none does."""
+        now = self._state
+        limit = self._controller.settings.torque.limit
+        torque = now.amplitude
+        if not shakes.any() or not np.isfinite(torque).all():
+            return None
+        worst = int(np.argmax(np.where(shakes, torque / limit, -1.0)))
+        frequency = 0.5 / float(now.half[worst])
+        config = self._config
+        unit = config.units[worst].torque
+        return Shaking(config.joints[worst], frequency, float(torque[worst]), unit)
+
+    def is_due(self, t: float) -> bool:
+        """Whether the arm oscillates at t [s], which has been warned of."""
+        return t - self._reported < 2.0 * PATIENCE
+
+    @property
+    def text(self) -> str:
+        """The last oscillation that is warned of; empty without one."""
+        return '' if self.last is None else self.last.text
+
+    @property
+    def cause(self) -> str:
+        """What an arm that stops now was doing, and the remedy; empty if not oscillating."""
+        state = self._state
+        found = self._find((state.calm < _LATELY) & (state.half > 0.0))
+        if found is None:
+            return ''
+        return f'{found.text}: {self._remedy}'
+
+    @property
+    def _remedy(self) -> str:
+        config = self._config
+        too_stiff = 'the gains are too high for this arm or its base'
+        if config.model != 'urdf':
+            return f'{too_stiff}; lower surface.mu, surface.gain and feedback.gain'
+        stiffness = _LOWER * config.feedback.stiffness
+        return (
+            f'{too_stiff}; commission it (`blf_dsc commission`), or give a feedback.stiffness of '
+            f'{stiffness:.2g}, and lower gains of feedback, surface and barrier that are given'
+        )
