@@ -79,7 +79,7 @@ def run_lockstep(ros, plant, controller=None):
 
 
 CASES = {
-    'learning': ({'duration': 6.0}, {}),
+    'learning': ({'duration': 4.0}, {}),
     'noise, differenced velocity and delay': (
         {'duration': 2.0, 'seed': 5, **NOISY},
         {},
@@ -121,7 +121,7 @@ CASES = {
         ARM | {'learning.window': 0.2},
     ),
     # over 1.4 and 1.2 rad
-    'approach': ({'duration': 4.0, 'initial.position': [0.9, 2.9]}, {}),
+    'approach': ({'duration': 2.0, 'initial.position': [0.9, 2.9]}, {}),
     'error past the bound': (JITTER, WEAK),
 }
 

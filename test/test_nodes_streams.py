@@ -18,8 +18,8 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.supervision.supervisor import Phase
 
 PATIENT = {
     'safety__state_timeout': 60.0,
@@ -110,7 +110,7 @@ def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send)
     # the acceleration, 0.4 rad/s^2, over an interval each way: 0.2 mrad
     assert np.abs(found - wanted).max() < 0.5e-3
     assert law.guard.samples.ratio.max() < 1.0
-    assert law.guard.supervisor.phase is Phase.TRACKING
+    assert law.guard.supervisor.phase is blf.Phase.TRACKING
 
 
 @pytest.mark.parametrize('send', [positions_of, points_of])
@@ -125,7 +125,7 @@ def test_reference_brakes_when_a_stream_ends(ros, send):
     np.testing.assert_array_equal(reference[1:], 0.0)
     if send is points_of:  # the last point of a trajectory is held
         np.testing.assert_allclose(reference[0], sway(0.38), atol=1e-7)
-    assert law.guard.supervisor.phase is Phase.TRACKING
+    assert law.guard.supervisor.phase is blf.Phase.TRACKING
 
 
 def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
@@ -157,20 +157,6 @@ def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
         np.abs(law.guard.controller.reference_at(law.guard.reference.time)[1]).min()
         > 0.1
     )
-
-
-def test_stop_and_a_trajectory_without_points_are_always_accepted(ros):
-    arm, law = ros.loop(None, PATIENT)
-    response = call_stop(ros)
-    assert (response.success, 'nothing to stop' in response.message) == (True, True)
-    ros.run(arm, 1100)
-    inputs(law).take_trajectory(trajectory(point((1.0, 0.5), 1.0)))
-    ros.run(arm, 300)
-    inputs(law).take_trajectory(trajectory())
-    ros.run(arm, 800)
-    reference = law.guard.controller.reference_at(law.guard.reference.time)
-    np.testing.assert_array_equal(reference[1:], 0.0)
-    assert inputs(law).rejected == 0
 
 
 WRONG = {

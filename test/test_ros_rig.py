@@ -10,9 +10,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from own_domain import own_domain
-from ros_rig import RosRig
 
-from blf_dsc_controller.cli.domains import bound_ports
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 
 
@@ -31,15 +29,3 @@ def test_killed_node_is_called_no_more_however_late_the_executor_is(ros):
 def test_domain_in_which_a_node_is_left_is_not_taken_again(ros):
     """A subscription in it would be taken for that of the next test's node."""
     assert ros.context.get_domain_id() not in {own_domain() for _ in range(20)}
-
-
-def test_nodes_that_something_holds_beyond_their_test_are_gone_before_the_next_one():
-    """As a fixture holds them; those of the hidden node of the watchdog are subscribed."""
-    rig = RosRig()
-    domain = rig.context.get_domain_id()
-    rig.held = rig.add(WatchdogNode)
-    rig.close()
-    assert bound_ports(domain)
-    del rig
-    RosRig().close()
-    assert not bound_ports(domain)
