@@ -164,21 +164,6 @@ def test_single_live_state_is_started_from_as_its_sender_waits_for_a_torque(ros)
     ros.until(lambda: arm.send(stamp, START) or arm.commands)
 
 
-def test_pause_among_the_first_states_begins_the_measurement_anew(ros):
-    """Their sender does not wait for a torque, and its rate is none for the law."""
-    node = ros.add(ControllerNode)
-    arm = Arm(ros)
-    stamp = time.time_ns()
-    for count in (5, 11):
-        for k in range(count):
-            arm.send(stamp + k * 10**7, START)
-        ros.until(lambda: node.starting.count > 0 or node.finished)
-        ros.until(lambda: node.starting.count == 0 or node.finished)
-        assert not arm.commands
-        stamp += 10**9
-    assert 'joint states come every 0.01 s' in str(node.failure)
-
-
 @pytest.mark.parametrize(
     ('name', 'value', 'begin', 'end'),
     [
