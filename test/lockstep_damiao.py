@@ -15,16 +15,18 @@ from typing import ClassVar
 import can
 from motor_arm import RIGID
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.motor_options import limits_of, mounting_of
-from blf_dsc_controller.configuration.nodes import DRIVE, load, load_loop, locate
+from blf_dsc_controller.configuration.nodes import DRIVE, load, locate
 from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.ticks import Ticks
 from sim_plant.damiao import DamiaoArm
 
 PATIENCE = 20.0  # s, for an answer of a thread
 _CLOSED = 0.05  # s, after which it is seen that the bus is closed
-LIMITS = limits_of(load(locate('openarm'), DRIVE, DriveConfig), 7)
+OPENARM = load(locate('openarm'), DRIVE, DriveConfig)
+LIMITS, MODELS = limits_of(OPENARM, 7), OPENARM.motor_models
 YAM = 6  # joints
 
 
@@ -86,7 +88,7 @@ class LockstepDriver(DamiaoDriver):
         n = len(self.controller.joints)
         name, gears = ('yam', {}) if n == YAM else ('openarm', RIGID)
         given = {'blf_dsc_controller': period, 'sim_plant': period | gears}
-        plant = load_loop(name, given).plant
+        plant = blf.load_loop(name, given).plant
         limits = limits_of(self.config, n) if n == YAM else LIMITS
         mounting = mounting_of(self.config, n)
         self.motors = LockstepArm(self.bus, plant, limits, 2000.0, mounting)

@@ -13,7 +13,7 @@ from math import inf
 
 import numpy as np
 
-from blf_dsc_controller.configuration.nodes import load_loop
+import blf_dsc_controller as blf
 from blf_dsc_controller.drive.driver import (
     ConnectionLostError,
     Driver,
@@ -36,7 +36,7 @@ class PlantDriver(Driver):
         self.what, self.at = what, int(at or -1)
         if what == 'absent':
             raise DriverError('there is no robot: switch it on')
-        self.plant = plant_of(load_loop(self.arm).plant)
+        self.plant = plant_of(blf.load_loop(self.arm).plant)
         self.calls = ['connect']
         self.count = 0
         self.late = 0

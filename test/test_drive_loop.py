@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 import signal
-import sys
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -17,34 +16,24 @@ from plants import rigid_gears
 from recorded_run import limited_files
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.analysis.metrics import tool_errors
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli import drive as cli_drive
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER
-from blf_dsc_controller.configuration.schema import build, change
 from blf_dsc_controller.drive.driver import (
-    ConnectionLostError,
     DriverError,
     Facts,
-    ReflexError,
     disagreements,
 )
 from blf_dsc_controller.drive.driver_declaration import DriverDeclaration
-from blf_dsc_controller.drive.drivers import driver_of, find_driver, is_nearly_simulated
-from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.supervision.drive_load import DriveLoad
-from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.plant import plant_of
 from sim_plant.settings import plant_settings
 
 HERE = Path(__file__).parent
 HOLD = {'safety.torque': 'hold_gravity'}
-CONFIG = change(blf.load_loop('recommended').controller, HOLD)
+CONFIG = blf.change(blf.load_loop('recommended').controller, HOLD)
 LONG = 0.6  # s: the arm is on its reference, and moves
 
 
@@ -82,7 +71,6 @@ def assert_replays(folder):
     ('address', 'end'),
     [
         ('plant', End.DURATION),
-        ('interrupt@300', End.REQUESTED),
         ('terminate@300', End.REQUESTED),
         ('late@300', End.STOPPED),
     ],
@@ -97,7 +85,7 @@ def test_it_ends_at_rest_and_the_bag_replays_bit_equal(address, end, tmp_path):
         outcome.states < 3000
     )  # it does not wait for settle_time, 3 s, if it rests before
     assert controller.phase is (
-        Phase.SAFE_STOP if end is End.STOPPED else Phase.INACTIVE
+        blf.Phase.SAFE_STOP if end is End.STOPPED else blf.Phase.INACTIVE
     )
     assert ('is 0.061 s after the last one' in outcome.text) is (end is End.STOPPED)
     events = assert_replays(tmp_path / 'bag')
@@ -106,23 +94,6 @@ def test_it_ends_at_rest_and_the_bag_replays_bit_equal(address, end, tmp_path):
     np.testing.assert_array_equal(
         recorded.torque, driver.torques[: len(recorded.torque)]
     )
-
-
-def test_other_threads_yield_to_the_loop_until_it_ends(monkeypatch, tmp_path):
-    seen = []
-    read = PlantDriver.read
-
-    def observed(self):
-        seen.append(sys.getswitchinterval())
-        return read(self)
-
-    monkeypatch.setattr(PlantDriver, 'read', observed)
-    before = sys.getswitchinterval()
-    drive('plant', tmp_path, duration=0.01)
-    # a tenth of a sample time of 1 ms
-    assert max(seen) == pytest.approx(1e-4)
-    assert before > 1e-3  # as Python has it: 5 ms
-    assert sys.getswitchinterval() == before
 
 
 def test_arm_that_does_not_come_to_rest_is_left_after_settle_time(monkeypatch):
@@ -172,32 +143,8 @@ def test_a_reflex_while_the_arm_is_brought_to_rest_is_what_ended_the_run():
         loop = DriveLoop(driver, controller, duration=0.3)
         outcome = loop.run()
     assert outcome.end is End.REFLEX
-    assert controller.phase is Phase.INACTIVE  # it was on its way to rest
+    assert controller.phase is blf.Phase.INACTIVE  # it was on its way to rest
     assert driver.calls[-1] == 'recover'
-
-
-@pytest.mark.parametrize(
-    ('error', 'end'), [(ReflexError, End.REFLEX), (ConnectionLostError, End.LOST)]
-)
-def test_what_the_robot_says_to_a_torque_is_no_error_of_the_controller(
-    error, end, monkeypatch
-):
-    driver = PlantDriver('plant', CONFIG, DriveConfig())
-    driver.connect()
-    write = driver.write
-
-    def refusing(torque):
-        write(torque)
-        if driver.count == 300:
-            raise error('what it says')
-
-    monkeypatch.setattr(driver, 'write', refusing)
-    with blf.ArmController(CONFIG) as controller:
-        outcome = DriveLoop(driver, controller).run()
-    assert outcome.end is end
-    assert outcome.text.startswith('what it says')
-    assert outcome.states == 300
-    assert 'finish' not in driver.calls  # it takes no torque any more
 
 
 def test_a_mistake_of_the_driver_ends_the_motion_and_is_shown(tmp_path):
@@ -230,35 +177,6 @@ def test_an_error_of_the_controller_brings_the_arm_to_rest_before_it_is_shown(
     assert len(driver.torques) == len(
         states
     )  # the state of the error has its torque, too
-
-
-def test_a_second_error_of_the_controller_ends_the_motion_at_once(monkeypatch):
-    driver = PlantDriver('plant', CONFIG, DriveConfig())
-    driver.connect()
-    controller = blf.ArmController(CONFIG)
-
-    update = controller.update
-
-    def failing(*state, send):
-        if driver.count >= 300:  # the arm moves
-            raise OSError(f'the disk is full at state {driver.count}')
-        return update(*state, send=send)
-
-    monkeypatch.setattr(controller, 'update', failing)
-    with pytest.raises(OSError, match=r'at state 300$'):
-        DriveLoop(driver, controller).run()
-    assert driver.count == 301
-    assert driver.calls[-1] == 'finish'
-
-
-def test_torques_are_sent_before_weighing_and_recording(tmp_path):
-    with blf.ArmController(CONFIG, record=tmp_path / 'bag') as controller:
-        driver = PlantDriver('plant', CONFIG, DriveConfig())
-        driver.connect()
-        order = []
-        controller._loop.guard.perceive = lambda: order.append('weighed')
-        controller.update(*driver.read(), send=lambda _torque: order.append('sent'))
-    assert order == ['sent', 'weighed']
 
 
 # s; the load is known about a second later
@@ -295,7 +213,7 @@ class LoadedDriver(PlantDriver):
         }
         loop = blf.load_loop('fr3_direct', RIGID)
         self.what, self.at = '', -1
-        self.config = change(loop.plant, changes)
+        self.config = blf.change(loop.plant, changes)
         self.plant = plant_of(self.config)
         self.told = []
         self.efforts = []
@@ -345,7 +263,7 @@ def all_of_it(tmp_path_factory):
     """Run with learning, a bound at the tool, a load that is told, and a contact."""
     bag = tmp_path_factory.mktemp('all_of_it') / 'bag'
     made = run_with_load(LoadedDriver, 10.0, ALL, bag)
-    return *made, read_run(bag), blf.verify(bag)
+    return *made, blf.read_run(bag), blf.verify(bag)
 
 
 def test_weighed_load_is_told_to_the_drives_without_a_step_of_any_torque(all_of_it):
@@ -429,10 +347,7 @@ class ReportingDriver(PlantDriver):
         return self.in_force
 
 
-@pytest.mark.parametrize('reports', [True, False])
-def test_load_is_taken_over_when_it_is_in_force_not_when_it_is_accepted(
-    reports, monkeypatch
-):
+def test_load_is_taken_over_when_it_is_in_force_not_when_it_is_accepted(monkeypatch):
     """A robot that reports its load may add it some states after its answer."""
     config = blf.load_loop('fr3_direct', {CONTROLLER: TOLD}).controller
     controller = blf.ArmController(config)
@@ -441,30 +356,16 @@ def test_load_is_taken_over_when_it_is_in_force_not_when_it_is_accepted(
     monkeypatch.setattr(controller, 'load_to_tell', lambda: load)
     monkeypatch.setattr(controller, 'take_over', taken.append)
     driver = ReportingDriver('', config, DriveConfig())
-    driver.in_force = 0.0 if reports else None
+    driver.in_force = 0.0
     declaration = DriverDeclaration(driver)
     for _ in range(20):  # from one step to the next
         declaration.follow(controller, in_motion=True)
     declaration.close()  # it has answered
     declaration.follow(controller, in_motion=True)
-    assert taken == ([] if reports else [load])
-    driver.in_force = np.float32(1.0 + 5e-6) if reports else None
+    assert taken == []
+    driver.in_force = np.float32(1.0 + 5e-6)
     declaration.follow(controller, in_motion=True)
     assert taken == [load]
-
-
-def test_load_is_not_taken_over_from_drives_that_add_no_weight():
-    controller = blf.ArmController(CONFIG)
-    assert controller.load_to_tell() is None
-    with pytest.raises(BlfDscError, match=r'robot\.drive_compensates: got none'):
-        controller.take_over(DriveLoad(1.0, (0.0, 0.0, 0.0)))
-
-
-def test_tell_drive_needs_a_weighed_load_and_drives_that_compensate():
-    with pytest.raises(ConfigurationError, match=r'robot\.drive_compensates none, but'):
-        change(blf.load_loop('panda').controller, {'load.tell_drive': True})
-    with pytest.raises(ConfigurationError, match='got 1, but a bool'):
-        change(CONFIG, {'load.tell_drive': 1})
 
 
 FACTS = Facts(2, 0.001, 'none', 'unknown', (20.0, 20.0), (inf, inf))
@@ -485,32 +386,6 @@ def test_a_configuration_that_contradicts_its_robot_is_refused(facts, problem):
     assert disagreements(FACTS, CONFIG) == []
     (found,) = disagreements(FACTS._replace(**facts), CONFIG)
     assert re.match(problem, found)
-
-
-@pytest.mark.parametrize(
-    ('given', 'problem'),
-    [
-        ({'collision_torque': [1.0]}, 'give both, or neither'),
-        (
-            {'collision_torque': [1.0], 'collision_force': [1.0] * 5},
-            'collision_force: got 5 entries',
-        ),
-    ],
-)
-def test_thresholds_are_checked(given, problem):
-    with pytest.raises(ConfigurationError, match=problem):
-        build(DriveConfig, given)
-
-
-def test_latency_has_the_quantiles_of_numpy():
-    durations = np.random.default_rng(1).gamma(4.0, 3e-5, 2000)
-    latency = Latency()
-    assert latency.quantile(0.5) == 0.0
-    for duration in durations:
-        latency.add(duration)
-    for share in (0.5, 0.99, 1.0):
-        expected = np.quantile(durations, share, method='inverted_cdf')
-        assert latency.quantile(share) == pytest.approx(expected, abs=1e-6)  # a bin
 
 
 def command(tmp_path, address, **options):
@@ -556,73 +431,3 @@ def test_the_command_says_that_the_recording_is_not_whole(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'the duration is over' in printed
     assert f'only a part: {disk / "bag"} cannot be written any further' in printed
-
-
-def test_recording_that_another_command_has_begun_meanwhile_stays(
-    tmp_path, monkeypatch, capsys
-):
-    out = tmp_path / 'bag'
-
-    def made(config, record, stamps):
-        out.mkdir()
-        (out / 'bag_0.mcap').touch()
-        return blf.ArmController(config, record=record, stamps=stamps)
-
-    monkeypatch.setattr(cli_drive, 'ArmController', made)
-    words = ['drive', '--robot', 'simulated', '--config', 'panda', '--out', str(out)]
-    assert main(words) == 1
-    assert 'bag exists already and is not overwritten' in capsys.readouterr().err
-    assert (out / 'bag_0.mcap').exists()
-
-
-def test_the_command_says_how_far_the_tool_was_off(tmp_path, capsys):
-    urdf = (blf.share_folder() / 'config/two_link.urdf').as_posix()
-    driver = (HERE / 'plant_driver.py').as_posix()
-    (tmp_path / 'my.yaml').write_text(
-        f'/**:\n  ros__parameters:\n    driver: {driver}\n'
-        f'    robot: {{urdf: {urdf}, tip: link2}}\n    barrier.tool_bound: 0.02\n'
-        '    feedback.inertia: whole\n'
-        '    torque.limit: [20.0, 20.0]\n',
-        encoding='utf-8',
-    )
-    files = ['--config', str(tmp_path / 'my.yaml'), '--out', str(tmp_path / 'bag')]
-    assert main(['drive', '--robot', 'plant', *files, '--duration', '0.3']) == 0
-    printed = capsys.readouterr()
-    assert printed.err.count('nobody has measured whether this arm bears') == 1
-    (error,) = re.findall('tool          largest error (.*) mm', printed.out)
-    recorded = tool_errors(blf.read_run(tmp_path / 'bag'))
-    assert float(error) == pytest.approx(1e3 * np.nanmax(recorded[:, 0]), rel=1e-2)
-
-
-@pytest.mark.parametrize('duration', ['-1', 'nan', 'inf'])
-def test_the_command_refuses_a_duration_that_is_none(duration, tmp_path, capsys):
-    assert command(tmp_path, 'plant', duration=duration) == 1
-    assert '--duration' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ('content', 'problem'),
-    [
-        (None, 'there is no file'),
-        ('DRIVER = 3', 'expected a class DRIVER'),
-        ('1 / 0', 'cannot be imported: ZeroDivisionError'),
-    ],
-)
-def test_a_driver_is_a_file_with_a_class(content, problem, tmp_path):
-    path = tmp_path / 'mine.py'
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(BlfDscError, match=problem):
-        find_driver(str(path))
-    with pytest.raises(BlfDscError, match='expected franka, damiao, or a Python file'):
-        find_driver('kuka')
-
-
-def test_simulated_misspelt_is_no_host():
-    path = blf.share_folder() / 'config' / 'fr3_direct.yaml'
-    config = blf.load_loop('fr3_direct').controller
-    for word in ('simulatd', 'simulation', 'Simulated', 'sim'):
-        message = f'no robot {word}, did you mean simulated'
-        with pytest.raises(BlfDscError, match=message):
-            driver_of(word, path, config)
-    assert not any(map(is_nearly_simulated, ('localhost', 'can0', 's', '172.16.0.2')))
