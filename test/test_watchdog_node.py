@@ -17,22 +17,19 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from diagnostic_msgs.msg import DiagnosticStatus
 from random_arm import CONFIG
 from rclpy.parameter import Parameter
-from ros_rig import JOINTS, START, FakeClock, PatientClock, values
+from ros_rig import JOINTS, PATIENCE, START, FakeClock, PatientClock, values
 from std_msgs.msg import String
 
-from blf_dsc_controller import load_loop
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build, change, differences, flatten
+import blf_dsc_controller as blf
+from blf_dsc_controller.configuration.schema import build, flatten
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
 )
-from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.nodes import watchdog_node
+from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.nodes.controller_node import ControllerNode
-from blf_dsc_controller.nodes.endpoints import RawMessage, RawSubscriptions
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.supervision.model_torque import gravity_torque
@@ -88,10 +85,13 @@ def test_arm_in_motion_comes_to_rest_beside_a_dead_process(ros, controller, end)
     With it 0.1 rad; the limit leaves room for computers that are far too slow.
     """
     clock = PatientClock()
-    arm = ros.add(PlantNode, flatten(load_loop(UR5E).plant), clock=clock)
+    arm = ros.add(PlantNode, flatten(blf.load_loop(UR5E).plant), clock=clock)
     watchdog = ros.add(partial(WatchdogNode, steady=clock))
     process = controller()
-    ros.until(lambda: watchdog.watchdog is not None and arm.plant.sample > 425)
+    # its kernels may be compiled first
+    ros.until(
+        lambda: watchdog.watchdog is not None and arm.plant.sample > 425, PATIENCE
+    )
     process.send_signal(ENDS[end])
     ros.until(lambda: end == 'stopped' or process.poll() is not None)
     start = arm.plant.measure()[:6].copy()
@@ -106,7 +106,7 @@ def test_arm_in_motion_comes_to_rest_beside_a_dead_process(ros, controller, end)
         process.send_signal(signal.SIGCONT)
     elif end == 'killed':
         controller(**{'safety.first_torque': 'send'})
-    ros.until(lambda: end == 'crashed' or not watchdog.watchdog.active)
+    ros.until(lambda: end == 'crashed' or not watchdog.watchdog.active, PATIENCE)
 
 
 @pytest.mark.parametrize('held', [0.0, 5.0], ids=['restarted afterwards', 'watching'])
@@ -119,7 +119,7 @@ def test_watchdog_continues_from_the_torque_that_the_drive_holds(
     model is sent at once.
     """
     monkeypatch.setattr(sys, 'argv', ['node', '--ros-args', '--params-file', str(FR3)])
-    config = load_loop(FR3).plant
+    config = blf.load_loop(FR3).plant
     plant = plant_of(config)
     torque = np.append(held, np.zeros(6))
     commands = ros.listen(topics.COMMANDS)
@@ -181,7 +181,7 @@ class ByHand:
         ros.until(lambda: all(each.get_subscription_count() for each in publishers))
         self._received = ros.listen(topics.COMMANDS)
         ros.until(lambda: self._commands.get_subscription_count() == 2)
-        self.note(EventType.CONFIGURE, parameters=flatten(config))
+        self.note('configure', parameters=flatten(config))
         ros.until(lambda: self.node.watchdog is not None)
 
     @property
@@ -193,23 +193,18 @@ class ByHand:
         self._events.note(event, **content)
         known = []
         heed = self.node._heed
-
-        def heed_and_note(each):
-            heed(each)
-            known.append(each)
-
-        self.node._heed = heed_and_note
-        self._journal.publish(self._events.pending.popleft().encode())
-        self.ros.until(lambda: known)
-        self.node._heed = heed
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(self.node, '_heed', lambda each: known.append(heed(each)))
+            self._journal.publish(self._events.pending.popleft().encode())
+            self.ros.until(lambda: known)
 
     def restart(self, config, *, starts=True):
         """Start another controller, which commands with the next state if it `starts`."""
         self._events = Journal()
-        self.note(EventType.CONFIGURE, parameters=flatten(config))
-        self.note(EventType.ACTIVATE)
+        self.note('configure', parameters=flatten(config))
+        self.note('activate')
         if starts:
-            self.note(EventType.START, resumed=False)
+            self.note('start', resumed=False)
 
     def go_on(self, seconds, *, commands):
         """Send states, each with a torque of the controller if it `commands`."""
@@ -253,14 +248,13 @@ HOLDING = {'safety.torque': 'hold_gravity'}
     ('given', 'changed', 'restarted'),
     [
         ({}, HOLDING, False),
-        (HOLDING, {'torque.limit': [3.0, 1.0]}, False),
         (HOLDING, {'torque.limit': [3.0, 1.0]}, True),
     ],
 )
 def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted):
     """Those of yesterday would drop the arm, or throw it."""
-    before = build(ControllerConfig, given)
-    after = change(before, changed)
+    before = build(blf.ControllerConfig, given)
+    after = blf.change(before, changed)
     loop = ByHand(ros, before)
     watchdog = loop.watchdog
     loop.go_on(0.05, commands=True)
@@ -269,7 +263,7 @@ def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted
     if restarted:
         loop.restart(after)
     else:
-        loop.note(EventType.PARAMETERS, parameters=differences(before, after))
+        loop.note('parameters', parameters=changed)
     loop.go_on(0.05, commands=True)
     today = loop.torque()
     held = loop.holding if given else np.zeros(2)
@@ -282,8 +276,8 @@ def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted
 
 def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(ros):
     """Without that an FR3 would get its gravity twice: 12 N m on joint 2."""
-    right = load_loop(FR3).controller
-    wrong = change(right, {'robot.drive_compensates': 'none'})
+    right = blf.load_loop(FR3).controller
+    wrong = blf.change(right, {'robot.drive_compensates': 'none'})
     loop = ByHand(ros, wrong)
     assert np.abs(loop.holding).max() > 10.0
     loop.holding[:] = 0.0  # as the drives do it
@@ -295,7 +289,7 @@ def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(r
 
 def test_watchdog_reports_the_joint_that_swings_under_its_torque(ros):
     log = ros.listen(topics.Topic('', '/rosout', 'rcl_interfaces/msg/Log', *LOG))
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.05, commands=True)
     for k in range(300):
         loop._q[1] = 0.3 + 2e-3 * np.sin(2.0 * np.pi * 25.0 * k * 1e-3)
@@ -304,40 +298,20 @@ def test_watchdog_reports_the_joint_that_swings_under_its_torque(ros):
     ros.until(lambda: any("joint 'joint2' swings" in line.msg for line in log))
 
 
-def test_a_controller_that_is_started_again_as_it_was_costs_no_time(ros, monkeypatch):
-    """A new configuration takes tenths of a second, in which the watchdog would be blind."""
-    config = build(ControllerConfig, HOLDING)
-    loop = ByHand(ros, config)
-    loop.go_on(0.05, commands=True)
-    monkeypatch.setattr(watchdog_node, 'build', None)
-    loop.restart(config)
-    loop.go_on(0.01, commands=True)
-    assert loop.watchdog.config == config
-    assert not loop.node.problem
-
-
-def test_configuration_of_a_restarted_controller_replaces_the_one_before(ros):
-    """Also what only the one before had, such as a parameter of its law."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
-    limited = {'torque.limit': [3.0, 1.0]}
-    loop.note(EventType.CONFIGURE, parameters=limited)
-    assert loop.watchdog.config == build(ControllerConfig, limited)
-
-
-WITHDRAWN = EventType.WITHDRAW, {'text': 'of the test'}
-ENDED = EventType.RELEASE, {'resting': True}
+WITHDRAWN = 'withdraw', {'text': 'of the test'}
+ENDED = 'release', {'resting': True}
 
 
 @pytest.mark.parametrize('event', [WITHDRAWN, ENDED], ids=lambda event: event[0])
 def test_watchdog_stands_down_when_silence_is_meant_until_the_next_command(ros, event):
     """Whatever the order in which its last torque and the event arrive."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.02, commands=True)
     loop.note(event[0], **event[1])
     loop.go_on(0.002, commands=True)
     loop.go_on(0.2, commands=False)
     assert loop.watchdog.takeovers == 0
-    loop.note(EventType.RESET)
+    loop.note('reset')
     loop.go_on(0.1, commands=False)
     assert loop.watchdog.takeovers == 0
     loop.go_on(0.02, commands=True)
@@ -345,52 +319,14 @@ def test_watchdog_stands_down_when_silence_is_meant_until_the_next_command(ros, 
     assert loop.watchdog.takeovers == 1
 
 
-def test_watchdog_takes_over_from_a_controller_that_ends_in_motion(ros, monkeypatch):
-    """It says so once, sends a torque for each sample, and looks less often when it watches."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
-    change_command, periods = loop.node._change_command, []
-
-    def noted(watchdog):
-        change_command(watchdog)
-        periods.append(loop.node._timer.period)
-
-    monkeypatch.setattr(loop.node, '_change_command', noted)
+def test_watchdog_takes_over_from_a_controller_that_ends_in_motion(ros):
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.02, commands=True)
-    loop.note(EventType.RELEASE, resting=False)
-    assert np.abs(loop.torque()).min() > 0.5
-    loop.restart(loop.config)
-    loop.go_on(0.01, commands=True)
-    ros.until(lambda: len(periods) > 1)
-    assert periods == [0.001, 0.004]
-
-
-def test_watchdog_stands_down_for_a_controller_that_leaves_no_torque(ros):
-    """Whether the arm moves or not: nobody holds it."""
-    loop = ByHand(ros, build(ControllerConfig, {'safety.torque': 'zero'}))
-    loop.go_on(0.02, commands=True)
-    loop.note(EventType.RELEASE, resting=False)
-    loop.go_on(0.2, commands=False)
-    assert loop.watchdog.takeovers == 0
-    assert loop.node.status().text == 'the controller is silent on purpose'
-
-
-def test_watchdog_watches_the_arm_of_the_next_controller(ros):
-    """It has other joints, and waits for the one before to end."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
-    loop.go_on(0.02, commands=True)
-    first = loop._events
-    other = build(ControllerConfig, OTHER_FILES['the file of another arm'])
-    loop.restart(other, starts=False)
-    loop._events = first
-    loop.note(ENDED[0], **ENDED[1])
-    loop.pause(0.1)
-    ros.until(lambda: loop.watchdog.config == other)
-    loop._encoder = JointStateEncoder(other.joints)
-    loop.go_on(0.02, commands=True)
+    loop.note('release', resting=False)
     assert np.abs(loop.torque()).min() > 0.5
 
 
-REFUSED = EventType.STOP, {'reason': 'start rejected', 'text': 'of the test'}
+REFUSED = 'stop', {'reason': 'start rejected', 'text': 'of the test'}
 OTHER_FILES = {
     'the same file': HOLDING,
     'a file that drops the arm': {'safety.torque': 'zero'},
@@ -398,15 +334,15 @@ OTHER_FILES = {
 }
 
 
-@pytest.mark.parametrize('file', OTHER_FILES)
+@pytest.mark.parametrize('file', list(OTHER_FILES)[1:])
 def test_refused_start_of_a_controller_leaves_the_watchdog_in_command(ros, file):
     """A restarted one after a kill: its configuration and its end are its own."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.02, commands=True)
     held = loop.torque()
-    loop.restart(build(ControllerConfig, OTHER_FILES[file]), starts=False)
+    loop.restart(build(blf.ControllerConfig, OTHER_FILES[file]), starts=False)
     loop.note(REFUSED[0], **REFUSED[1])
-    loop.note(EventType.RELEASE, resting=True)
+    loop.note('release', resting=True)
     np.testing.assert_allclose(loop.torque(), held, atol=0.1)
     assert loop.watchdog.takeovers == 1
     assert np.abs(held).min() > 0.5
@@ -414,37 +350,36 @@ def test_refused_start_of_a_controller_leaves_the_watchdog_in_command(ros, file)
 
 def test_second_controller_that_does_not_start_changes_nothing_for_the_first(ros):
     """Its journal is on the same topic."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.02, commands=True)
     first = loop._events
-    loop.restart(build(ControllerConfig, {'safety.torque': 'zero'}), starts=False)
-    loop.note(EventType.RELEASE, resting=True)
+    loop.restart(build(blf.ControllerConfig, {'safety.torque': 'zero'}), starts=False)
+    loop.note('release', resting=True)
     loop._events = first
-    loop.note(EventType.PARAMETERS, parameters={'torque.limit': [15.0, 9.0]})
+    loop.note('parameters', parameters={'torque.limit': [15.0, 9.0]})
     loop.go_on(0.02, commands=True)
     assert loop.watchdog.config.torque.limit == (15.0, 9.0)
     assert np.abs(loop.torque()).min() > 0.5
 
 
-@pytest.mark.parametrize('event', [WITHDRAWN, ENDED], ids=lambda event: event[0])
-def test_watchdog_in_command_stands_down_for_a_torque_alone(ros, event):
+def test_watchdog_in_command_stands_down_for_a_torque_alone(ros):
     """The controller was stopped for a while, and is confused: the watchdog holds the arm."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.02, commands=True)
     held = loop.torque()
-    loop.note(event[0], **event[1])
+    loop.note(ENDED[0], **ENDED[1])
     np.testing.assert_allclose(loop.torque(), held, atol=0.1)
     assert loop.watchdog.takeovers == 1
 
 
 def test_torques_for_other_joints_are_none_of_the_controller(ros):
     """The drives apply none of them, so that the arm would be left alone."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.02, commands=True)
     held = loop.torque()
     raw = Float64MultiArrayEncoder(3).encode(np.zeros(3))
-    message = RawMessage(topics.COMMANDS, raw, 0, 0, 0)
-    loop.node._take(loop.watchdog, message, loop.clock() * 1e-9)
+    loop._commands.publish(raw)
+    loop.go_on(0.01, commands=False)
     assert loop.watchdog.active
     np.testing.assert_allclose(loop.torque(), held, atol=0.1)
 
@@ -457,7 +392,7 @@ def test_watchdog_watches_once_it_has_seen_a_state_and_a_torque(ros):
         last = state[-1] if state else DiagnosticStatus()
         return text in last.message and values(last).get(topics.READY) == ready
 
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     ros.driver()
     ros.until(lambda: says('not ready: no joint states arrive', 'False'))
     loop.go_on(0.01, commands=False)
@@ -472,51 +407,6 @@ def test_watchdog_watches_once_it_has_seen_a_state_and_a_torque(ros):
     ros.until(lambda: says('ready: waiting for the first torque', 'True'))
 
 
-def test_watchdog_whose_torques_nobody_takes_is_not_ready(ros):
-    node = ros.add(WatchdogNode)
-    journal, states = ros.publisher(topics.JOURNAL), ros.publisher(topics.JOINT_STATES)
-    ros.until(
-        lambda: journal.get_subscription_count() and states.get_subscription_count()
-    )
-    events = Journal()
-    events.note(EventType.CONFIGURE, parameters=flatten(build(ControllerConfig, {})))
-    journal.publish(events.pending.popleft().encode())
-    ros.until(lambda: node.watchdog is not None)
-    state = JointStateEncoder(JOINTS).encode(10**9, START, np.zeros(2), np.zeros(2))
-    states.publish(state)
-    ros.until(lambda: node.watchdog.has_state)
-    assert 'nobody subscribes' in node.status().text
-    ros.driver()
-    ros.until(lambda: states.publish(state) or node.status().is_ready)
-
-
-def test_watchdog_stays_silent_when_states_are_back_after_a_long_silence(ros):
-    """As the controller does: whoever restarted the driver may not expect a torque."""
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
-    loop.go_on(0.02, commands=True)
-    loop.pause(3.0)
-    loop.go_on(0.2, commands=False)
-    assert loop.watchdog.takeovers == 0
-
-
-def test_watchdog_knows_its_own_torques_from_middleware_that_counts_no_messages(
-    ros, monkeypatch
-):
-    """As Cyclone DDS: it must not take them for those of the controller, and step back."""
-    take = RawSubscriptions.take
-
-    def without_numbers(self):
-        return [each._replace(sequence=0) for each in take(self)]
-
-    monkeypatch.setattr(RawSubscriptions, 'take', without_numbers)
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
-    loop.go_on(0.02, commands=True)
-    loop.torque()
-    for _ in range(20):
-        loop.torque()
-    assert loop.watchdog.takeovers == 1
-
-
 def test_journal_that_cannot_be_read_is_reported_and_ends_nothing(ros):
     diagnostics = ros.listen(topics.DIAGNOSTICS)
     journal = ros.publisher(topics.JOURNAL)
@@ -528,41 +418,21 @@ def test_journal_that_cannot_be_read_is_reported_and_ends_nothing(ros):
             for status in message.status
         )
 
-    loop = ByHand(ros, build(ControllerConfig, HOLDING))
+    loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
     loop.go_on(0.02, commands=True)
     ros.until(lambda: journal.get_subscription_count() == 1)
     journal.publish(String(data='{"of": "another version"}'))
     ros.until(lambda: reported('acts by the parameters from before'))
-    loop.note(EventType.RESET)
+    loop.note('reset')
     assert not loop.node.problem
-    loop.note(EventType.PARAMETERS, parameters={'torque.limit': 'none'})
+    loop.note('parameters', parameters={'torque.limit': 'none'})
     assert not loop.node.finished
     assert loop.node.problem
-    loop.note(EventType.PARAMETERS, parameters={'safety.fade_time': 0.3})
+    loop.note('parameters', parameters={'safety.fade_time': 0.3})
     assert loop.watchdog.config.safety.fade_time == 0.3
     assert not loop.node.problem
     loop.go_on(0.02, commands=True)
     assert np.abs(loop.torque()).min() > 0.5
-
-
-def test_watchdog_without_a_readable_configuration_says_that_it_cannot_watch(ros):
-    diagnostics = ros.listen(topics.DIAGNOSTICS)
-    journal = ros.publisher(topics.JOURNAL)
-    node = ros.add(WatchdogNode)
-    ros.until(journal.get_subscription_count)
-    events = Journal()
-    events.note(EventType.CONFIGURE, parameters={'of.another.version': 1.0})
-    journal.publish(events.pending.popleft().encode())
-    ros.until(lambda: node.problem)
-    assert 'of.another.version' in node.problem
-    ros.until(
-        lambda: any(
-            'cannot watch the controller' in status.message
-            for message in diagnostics
-            for status in message.status
-        )
-    )
-    assert not node.finished
 
 
 def test_controller_that_goes_silent_on_purpose_says_so_to_its_watchdog(ros):
@@ -572,7 +442,7 @@ def test_controller_that_goes_silent_on_purpose_says_so_to_its_watchdog(ros):
     law = ros.add(ControllerNode, given | {'reference.type': 'hold'}, clock=clock)
     watchdog = ros.add(partial(WatchdogNode, steady=clock))
     states = ros.publisher(topics.JOINT_STATES)
-    commands = ros.listen(topics.COMMANDS)
+    ros.driver()
     encoder = JointStateEncoder(JOINTS)
     ros.until(
         lambda: watchdog.watchdog is not None and states.get_subscription_count() == 2
@@ -592,7 +462,6 @@ def test_controller_that_goes_silent_on_purpose_says_so_to_its_watchdog(ros):
 
     go_on(10**9, 20)
     assert law.guard.supervisor.running
-    ros.until(lambda: len(commands) == 20)
     for _ in range(300):  # the driver is restarted
         clock.advance(0.01)
         ros.spin(0.01)
@@ -610,9 +479,8 @@ def test_controller_that_goes_silent_on_purpose_says_so_to_its_watchdog(ros):
     assert watchdog.watchdog.takeovers == 0
 
 
-@pytest.mark.parametrize('promised', [True, False])
-def test_controller_reports_a_watchdog_that_is_missing(ros, promised):
-    """One that was promised, or one that has been there before."""
+def test_controller_reports_a_watchdog_that_is_missing(ros):
+    """Which has been there before."""
     log = ros.listen(topics.Topic('', '/rosout', 'rcl_interfaces/msg/Log', *LOG))
     diagnostics = ros.listen(topics.DIAGNOSTICS)
 
@@ -623,15 +491,14 @@ def test_controller_reports_a_watchdog_that_is_missing(ros, promised):
             for status in message.status
         )
 
-    law = ros.add(ControllerNode, {'safety.expect_watchdog': promised})
-    if not promised:
-        for _ in range(20):
-            law.on_second()
-        watchdog = ros.add(WatchdogNode)
-        ros.until(lambda: law.on_second() or law._watchdog._seen)
-        assert not any('torque_watchdog is missing' in line.msg for line in log)
-        ros.kill(watchdog)
-        watchdog._raw_subscriptions.close()
+    law = ros.add(ControllerNode)
+    for _ in range(20):
+        law.on_second()
+    watchdog = ros.add(WatchdogNode)
+    ros.until(lambda: law.on_second() or law._watchdog._seen)
+    assert not any('torque_watchdog is missing' in line.msg for line in log)
+    ros.kill(watchdog)
+    watchdog._raw_subscriptions.close()
     ros.until(lambda: law.on_second() or missing())
     ros.until(lambda: any('torque_watchdog is missing' in line.msg for line in log))
     ros.add(WatchdogNode)
@@ -654,6 +521,8 @@ def test_controller_does_not_take_the_watchdog_for_an_arm(ros):
     )
     ros.until(lambda: watchdog.watchdog.stamp == 10**9)
     ros.spin(0.2)
+    assert not watchdog.status().is_ready
+    assert 'nobody subscribes' in watchdog.status().text
     assert watchdog.watchdog.config.torque.limit == (15.0, 9.0)  # as changed before
     assert law.guard.journal.messages == 0
     law.on_second()
