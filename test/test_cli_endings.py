@@ -327,9 +327,7 @@ def test_recordings_are_read_before_it_is_said_that_nothing_is_to_be_written(
     ended = Ended(['identify', 'run.csv', '--urdf', 'pendulum.urdf'], folder)
     assert (ended.code, ended.lines) == (
         1,
-        [
-            'blf_dsc identify: nothing to write: give --out, --report, --payload or --foresee'
-        ],
+        ['blf_dsc identify: nothing to write: give --out, --report or --payload'],
     )
 
 

@@ -13,8 +13,7 @@ from random_arm import chain_of, random_urdf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.clearance import Clearance, distance
 from blf_dsc_controller.identification.exciting_reference import (
@@ -76,37 +75,6 @@ def chain_problem():
     return config, ExcitationProblem(config, 1, 0.02, -3.0)
 
 
-def test_unknowns_of_the_search_are_in_units_of_the_limits():
-    """An amplitude of 1 alone reaches one limit of position, velocity or acceleration."""
-    config, _ = chain_problem()
-    two = ExcitationProblem(config, 2, 0.02, -3.0)
-    limits = config.limits
-    lower, upper = np.array((limits.position_lower, limits.position_upper))
-    n, h = two.n, two.harmonics
-    for k in range(n, n + 2 * n * h):
-        x = np.zeros(n + 2 * n * h)
-        x[:n] = 0.5
-        x[k] = 1.0
-        found = two.parameters(x)
-        middle = 0.5 * (lower + upper)
-        np.testing.assert_allclose(
-            found['offset'] - middle, 0.5 * two.reach, atol=1e-12
-        )
-        amplitude = np.reshape(found['amplitude'], (n, 2 * h))
-        assert np.count_nonzero(amplitude) == 1
-        joint, tone = np.argwhere(amplitude)[0]
-        # first all cosines, joint by joint, then all sines
-        which, at = divmod(k - n, n * h)
-        assert (joint, tone) == (at // h, which * h + at % h)
-        assert found['phase'][tone] == pytest.approx(-0.5 * np.pi * which)
-        rate = found['frequency'][tone]
-        assert rate == pytest.approx(
-            2.0 * np.pi / config.learning.window * (at % h + 1)
-        )
-        reached = amplitude[joint, tone] * rate ** np.arange(3.0)
-        assert (reached / two.limits[:3, joint]).max() == pytest.approx(1.0)
-
-
 def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions():
     problem = chain_problem()[1]
     x = search(problem, 0, 1)
@@ -143,60 +111,6 @@ def test_predicted_information_of_a_panda_matches_its_loop():
     assert found.gain == pytest.approx(gain, rel=0.01)
     assert found.left == pytest.approx(np.exp(-0.5 * gain / len(Phi)), rel=0.01)
     assert found.ratios[1].max() > 0.8
-
-
-def test_ripple_has_the_columns_of_the_law():
-    config = change(chain_problem()[0], {'learning.ripple_cycles': [2.0]})
-    problem = ExcitationProblem(config, 1, 0.02, -3.0)
-    q = np.linspace(0.0, 1.0, 3 * 64).reshape(64, 3)
-    rows = problem._rows(q, 0.0 * q, 0.0 * q)
-    assert rows.shape == (64, 3, settings_of_config(config).m)
-    for i in range(3):
-        sine, cosine = rows[:, i, -6 + i], rows[:, i, -3 + i]
-        np.testing.assert_array_equal(sine, np.sin(2.0 * q[:, i]))
-        np.testing.assert_array_equal(cosine, np.cos(2.0 * q[:, i]))
-    assert problem.evaluate(problem.parameters(np.ones(3 + 6))).gain > 0.0
-
-
-def test_load_friction_has_the_column_of_the_law():
-    config = change(chain_problem()[0], {'learning.load_friction': True})
-    problem = ExcitationProblem(config, 1, 0.02, -3.0)
-    settings = settings_of_config(config)
-    q = np.linspace(0.0, 1.0, 3 * 64).reshape(64, 3)
-    dq = np.linspace(-1.0, 1.0, 3 * 64).reshape(64, 3)
-    rows = problem._rows(q, dq, 0.0 * q)
-    assert rows.shape == (64, 3, settings.m)
-    load = rows[:, :, : settings.p] @ settings.initial_estimate[: settings.p]
-    sign = np.tanh(dq / config.learning.coulomb_velocity)
-    for i in range(3):
-        np.testing.assert_allclose(rows[:, i, -3 + i], np.abs(load[:, i]) * sign[:, i])
-
-
-def test_lack_of_room_counts_as_an_excess():
-    config, problem = chain_problem()
-    low = ExcitationProblem(config, 1, 0.02, 3.0)  # a floor above the arm
-    motion = problem.parameters(np.full(9, 0.1))
-    assert not low.evaluate(motion).is_allowed
-    assert low.evaluate(motion).excess > problem.evaluate(motion).excess + 1.0
-
-
-def test_torque_ratio_is_the_larger_with_and_without_the_payload():
-    config, problem = chain_problem()
-    motion = problem.parameters(np.full(9, 0.1))
-    P = config.learning.initial_estimate
-    load = parameters_of(config.robot, config.robot.chain(config.joints)).load
-
-    def ratios(payload, start):
-        robot = replace(config.robot, payload=payload)
-        learning = config.learning
-        learning = replace(learning, initial_estimate=tuple(start))
-        other = replace(config, robot=robot, learning=learning)
-        return ExcitationProblem(other, 1).evaluate(motion).ratios
-
-    light = ratios(0.0, P)
-    heavy = ratios(0.0, P + 0.2 * load)
-    np.testing.assert_allclose(ratios(0.2, P), np.maximum(heavy, light))
-    assert (heavy[3] > light[3]).any()
 
 
 def test_tool_writes_a_preset_for_an_arm_from_a_urdf_that_keeps_it_from_the_floor(

@@ -49,7 +49,7 @@ def test_mjcf_that_asks_for_gigabytes_is_refused_before_it_is_compiled(
     (tmp_path / 'part.xml').write_text(text)
     whole = tmp_path / 'whole.xml'
     whole.write_text('<mujoco><include file="part.xml" /></mujoco>')
-    command = ['identify', 'run.csv', '--urdf', str(whole), '--foresee']
+    command = ['identify', 'run.csv', '--urdf', str(whole)]
     assert main(command) == 1
     error = capsys.readouterr().err
     assert re.search(message, error)

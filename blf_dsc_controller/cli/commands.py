@@ -360,7 +360,7 @@ _IDENTIFY = Command(
     'is held back for this test. With --payload, weigh what the arm holds. Exit code: 0 done, 3 '
     'do not use the result (it is written with --force only), 1 an error.',
     example='run1/bag --urdf robot.urdf --out corrected.urdf --report page.html\n'
-    '  blf_dsc identify run.csv --urdf robot.urdf --map time=t --map tau=tau_* --out new.xml\n'
+    '  blf_dsc identify run.csv --urdf robot.urdf --map time=t --map tau=tau_* --out new.urdf\n'
     '  blf_dsc identify empty/bag --urdf robot.urdf --payload loaded/bag',
     options=(
         *_NAMES,
@@ -379,7 +379,7 @@ _IDENTIFY = Command(
         ),
         option(
             '--out',
-            'file to write: .urdf, .xml (MJCF), .yaml (our parameters); can be repeated',
+            'file to write: .urdf, .yaml (our parameters); can be repeated',
             type=Path,
             action='append',
             default=[],
@@ -398,12 +398,6 @@ _IDENTIFY = Command(
             nargs='?',
             const=True,
             metavar='BAG',
-        ),
-        option(
-            '--foresee',
-            'fit nothing, but say what can be identified from the recording, or from the table '
-            'of a planned motion without torques',
-            action='store_true',
         ),
         option(
             '--effort',

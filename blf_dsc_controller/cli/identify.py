@@ -22,17 +22,9 @@ from blf_dsc_controller.identification.exciting_reference import (
     ExcitationProblem,
     search,
 )
-from blf_dsc_controller.identification.foresight import (
-    foresee,
-    foresight_lines,
-)
-from blf_dsc_controller.identification.from_files import (
-    foresee_recordings,
-    identify_bag,
-)
+from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.identify import STAGES
-from blf_dsc_controller.identification.mjcf import mjcf
 from blf_dsc_controller.identification.parameters import robot_parameters
 from blf_dsc_controller.identification.problems import is_usable, problems_of
 from blf_dsc_controller.identification.summary import (
@@ -52,7 +44,7 @@ from blf_dsc_controller.writing import write_text
 UNUSABLE = 3
 """Exit code if the model does not explain the torques held back."""
 
-_FORMATS = {'.urdf', '.xml', '.yaml'}
+_FORMATS = {'.urdf', '.yaml'}
 _DIGITS = 4  # decimals of an angle [rad] in the file
 _WIDTH = 98
 
@@ -66,9 +58,6 @@ def identify(options: Namespace) -> int:
         gravity=tuple(options.gravity),
         payload=options.rated_payload,
     )
-    if options.foresee:
-        _foresee(options, robot)
-        return 0
     outputs = _outputs(options)
     found = _identified(options, robot)
     facts = _facts(found, options)
@@ -92,13 +81,6 @@ def identify(options: Namespace) -> int:
         note = '\n'.join([*facts, *tables])
         _write(outputs, found, robot, note)
     return 0 if usable else UNUSABLE
-
-
-def _foresee(options: Namespace, robot: Robot) -> None:
-    """Print what the recordings can show."""
-    names = NameMap.parse(options.map)
-    motion = foresee_recordings(options.bags, robot, options.namespace, names)
-    print('\n'.join(foresight_lines(motion)))
 
 
 def _identified(options: Namespace, robot: Robot) -> Identified:
@@ -140,8 +122,8 @@ def _outputs(options: Namespace) -> list[Path]:
     for path in outputs:
         if path.suffix not in _FORMATS:
             raise BlfDscError(
-                f'{path}: got {path.suffix or "no suffix"}; expected .urdf, .xml (MJCF) or .yaml '
-                '(parameters of this package)'
+                f'{path}: got {path.suffix or "no suffix"}; expected .urdf, or .yaml (parameters '
+                'of this package)'
             )
     if len(set(suffixes)) < len(suffixes):
         raise BlfDscError(f'{_listed(outputs)}: give one file of each format')
@@ -157,9 +139,7 @@ def _outputs(options: Namespace) -> list[Path]:
 
 def _refuse_no_output(options: Namespace) -> None:
     if not (options.out or options.report or options.payload):
-        raise BlfDscError(
-            'nothing to write: give --out, --report, --payload or --foresee'
-        )
+        raise BlfDscError('nothing to write: give --out, --report or --payload')
 
 
 def _facts(found: Identified, options: Namespace) -> list[str]:
@@ -190,8 +170,6 @@ def _write(outputs: Sequence[Path], found: Identified, robot: Robot, note: str) 
                 robot.text, found.chain, found.parts.bodies, viscous, coulomb, note
             )
             write_text(path, text)
-        elif path.suffix == '.xml':
-            write_text(path, mjcf(found, robot.gravity, note))
         else:
             urdf = next(each for each in outputs if each.suffix == '.urdf')
             comment = ''.join(f'# {line}\n' for line in note.splitlines())
@@ -228,8 +206,6 @@ def excite(options: Namespace) -> None:
         f'mean over all directions, instead of {100.0 * before.left:.0f} % with the configured '
         'reference. First the cosines, then the sines.'
     )
-    shown, _, *_ = foresight_lines(foresee(problem.recording(parameters), config.robot))
-    about += f' For `blf_dsc identify`, {shown}.'
     lines = [*textwrap.wrap(about, _WIDTH), options.line]
     reference = {f'reference.{name}': value for name, value in parameters.items()}
     node = {f'**/{CONTROLLER}': {'reference.type': 'sinusoids', **reference}}

@@ -51,7 +51,7 @@ class Motion(NamedTuple):
     joints: Sequence[str]
     stamp: Stamps  # (N,) ns
     q: Group
-    tau: Group | None  # none of a planned motion
+    tau: Group
     theta: Group | None  # of the motors
     unit: str  # `q=` and the columns, to which a unit can be added; empty: it was given
     others: str  # what to do to get other torques
@@ -82,14 +82,11 @@ def checked(motion: Motion, tree: Tree) -> Sound:
     if motion.unit:
         _check_angles(motion, ~missing, tree)
         _check_speeds(motion, ~missing, tree)
-    if motion.tau is not None:
-        _check_torques(motion, motion.tau, ~missing)
-        zeros = unrecorded(motion.tau.values, size)
-        if zeros.any():
-            said.append(
-                f'torques are exactly 0 in {zeros.sum()} row(s), read as missing'
-            )
-        missing |= zeros
+    _check_torques(motion, motion.tau, ~missing)
+    zeros = unrecorded(motion.tau.values, size)
+    if zeros.any():
+        said.append(f'torques are exactly 0 in {zeros.sum()} row(s), read as missing')
+    missing |= zeros
     return Sound(~missing, said)
 
 

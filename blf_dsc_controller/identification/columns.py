@@ -60,7 +60,7 @@ class Columns(NamedTuple):
     time: list[Column]  # s
     rate: float  # Hz; 0: the time is in columns
     q: list[Column]  # rad, or m
-    tau: list[Column]  # N m, or N; none of a planned motion
+    tau: list[Column]  # N m, or N
     theta: list[Column]  # rad, or m, of the motors; none if they are not known
     has_currents: bool  # by their names or units: currents or shares of a rated torque
 
@@ -68,8 +68,6 @@ class Columns(NamedTuple):
     def text(self) -> str:
         """The columns, as they are reported."""
         positions = f'positions {self.q[0].name!r} to {self.q[-1].name!r}'
-        if not self.tau:
-            return positions
         text = f'{positions}, torques {self.tau[0].name!r} to {self.tau[-1].name!r}'
         if self.theta:
             motors = f'{self.theta[0].name!r} to {self.theta[-1].name!r}'
@@ -82,26 +80,22 @@ def choose_columns(
     names: Sequence[str],
     given: Mapping[str, str],
     joints: Sequence[str],
-    *,
-    planned: bool,
 ) -> Columns:
     """Return the columns of the joints, which have these names in the table.
 
-    `given` has what was chosen of KINDS; a `planned` motion has no torques.
+    `given` has what was chosen of KINDS.
 
     Raises:
         BlfDscError: they are not found, or their units are not known.
     """
     q = _of_joints(path, names, 'q', given['q'], joints)
-    tau: list[str] = []
-    if not planned:
-        tau = _of_joints(path, names, 'tau', given['tau'], joints)
-        if len(tau) != len(q):
-            raise BlfDscError(
-                f'{path} has {len(q)} positions ({", ".join(q)}) and {len(tau)} torques '
-                f'({", ".join(tau)}): choose as many, as in --map tau=tau_*'
-            )
-    theta = [] if planned else _of_motors(path, names, given['theta'], joints, q)
+    tau = _of_joints(path, names, 'tau', given['tau'], joints)
+    if len(tau) != len(q):
+        raise BlfDscError(
+            f'{path} has {len(q)} positions ({", ".join(q)}) and {len(tau)} torques '
+            f'({", ".join(tau)}): choose as many, as in --map tau=tau_*'
+        )
+    theta = _of_motors(path, names, given['theta'], joints, q)
     _check_meanings(path, names, {'q': q, 'tau': tau, 'theta': theta}, joints)
     words = set().union(*(_meaning(name, joints) for name in tau))
     units = [_unit_of(name, 'tau', given['tau']) for name in tau]

@@ -25,7 +25,6 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.estimate import prior_covariance
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.clearance import Clearance
-from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.progress import steps
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
@@ -37,7 +36,6 @@ _COARSE = 4  # samples per filtered row
 _MARGIN = 1e-3  # fraction of each limit, and m of room, for peaks between samples
 _PENALTY = 1e4  # on the mean square excess: limits are exceeded by a few percent
 _SHRINKS = 30  # most reductions of the amplitudes, by 1 % each, to keep the limits
-_DURATION, _RECORDED = 30.0, 0.01  # s, of a recording of it, and between its samples
 _SPREAD = 0.2  # standard deviation of a search's initial amplitudes
 
 
@@ -85,7 +83,6 @@ class ExcitationProblem:
         self.n = settings.n
         self.harmonics = harmonics
         self._settings = settings
-        self._joints = config.joints
         self._clearance = Clearance(chain, radius, floor)
         self._guess = np.tile(settings.initial_estimate, (2, 1))
         self._guess[1, : settings.p] += load
@@ -161,14 +158,6 @@ class ExcitationProblem:
         return Excitation(
             float(gain), left, ratios.max(axis=0), room.min(axis=0), float(excess)
         )
-
-    def recording(self, parameters: dict[str, tuple[float, ...]]) -> Recording:
-        """Return half a minute of the reference, without torques."""
-        times = _RECORDED * np.arange(round(_DURATION / _RECORDED))
-        q = sampled(pack(self.n, [sinusoids_term(**parameters)]), times)[:, 0]
-        gap = np.zeros(times.size, dtype=bool)
-        joints = self._joints
-        return Recording(joints, _RECORDED, q, np.zeros_like(q), gap, 'planned')
 
     def _rows(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return [H(q, dq, dq, ddq) | D] (k, n, m) of a motion, as `law.columns` describes D."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm of bags and tables: they are read, joined and identified, or looked at beforehand."""
+"""The arm of bags and tables: they are read, joined and identified."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.foresight import Foresight, foresee
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.identify import (
     READING,
@@ -73,28 +72,23 @@ def identify_bag(
     )
 
 
-def foresee_recordings(
-    paths: Sequence[Path], robot: Robot, namespace: str = '', names: NameMap = NO_NAMES
-) -> Foresight:
-    """Return what recordings together can show, or tables of a planned motion without torques.
-
-    Raises:
-        BlfDscError: as `identify_bag` does.
-    """
-    recordings = _read(paths, robot, namespace, names, planned=True)
-    return foresee(joined(*recordings)[0], robot)
-
-
 def _read(
-    paths: Sequence[Path], robot: Robot, namespace: str, names: NameMap, **how: bool
+    paths: Sequence[Path],
+    robot: Robot,
+    namespace: str,
+    names: NameMap,
+    *,
+    commanded: bool,
 ) -> list[Recording]:
-    """Return the recordings of one arm; `how` is as for `read_recording`."""
+    """Return the recordings of one arm."""
     joints: tuple[str, ...] = ()
     if robot.tip:
         joints = tuple(joint.name for joint in robot.chain(()).joints)
     recordings: list[Recording] = []
     for path in paths:
-        recording = read_recording(path, robot.text, joints, namespace, names, **how)
+        recording = read_recording(
+            path, robot.text, joints, namespace, names, commanded=commanded
+        )
         joints = recording.joints
         recordings.append(recording)
     return recordings

@@ -50,12 +50,8 @@ def read_table(
     text: str,
     joints: Sequence[str] = (),
     names: NameMap = NO_NAMES,
-    *,
-    planned: bool = False,
 ) -> Recording:
     """Read a recording of the arm of a URDF (its text) from a table.
-
-    A `planned` motion has no torques: they are zero.
 
     `joints` are the arm's, by default all from the root to where it branches, or as
     many of them as the table has.  `names.joints` may have `time`, `q`, `tau` and
@@ -70,7 +66,7 @@ def read_table(
     given = {kind: others.pop(kind, '') for kind in KINDS}
     trunk = tuple(joints) or tree.trunk() or tree.only_chain()
     theirs = NameMap(joints=others).joints_of(trunk)
-    columns = choose_columns(path, table.names, given, theirs, planned=planned)
+    columns = choose_columns(path, table.names, given, theirs)
     if joints:
         _check_count(path, columns, trunk)
     groups = _groups(path, table, columns)
@@ -81,7 +77,7 @@ def read_table(
         joints=trunk[: len(columns.q)],
         stamp=clock.stamp,
         q=groups['q'],
-        tau=None if planned else groups['tau'],
+        tau=groups['tau'],
         theta=groups['theta'] if columns.theta else None,
         unit='' if has_unit else f'q={_pattern(table, columns)}',
         others='choose the columns that have it, as in --map tau=effort_*',
@@ -95,14 +91,13 @@ def read_table(
 def _resampled(
     motion: Motion, rows: NDArray[np.bool_], tree: Tree, source: str
 ) -> Recording:
-    """Return some rows (N,) of the motion of an arm as a recording; no torques are zero."""
+    """Return some rows (N,) of the motion of an arm as a recording."""
     joints = tuple(motion.joints)
-    q = _scaled(motion.q)[rows]
     return resampled(
         joints,
         motion.stamp[rows],
-        q,
-        np.zeros_like(q) if motion.tau is None else _scaled(motion.tau)[rows],
+        _scaled(motion.q)[rows],
+        _scaled(motion.tau)[rows],
         source,
         tree.turning(joints),
         None if motion.theta is None else _scaled(motion.theta)[rows],

@@ -24,19 +24,18 @@ def read_recording(
     names: NameMap = NO_NAMES,
     *,
     commanded: bool = False,
-    planned: bool = False,
 ) -> Recording:
     """Read a recording of the arm of a URDF (its text) from a bag or a table.
 
     `joints` are the arm's, from its base to its tip; none: see `read_bag`,
     `read_table`.  `names` are those that differ in the file.  `commanded`: commands of
-    a bag are read instead of efforts; `planned`: a table needs no torques.
+    a bag are read instead of efforts.
 
     Raises:
         BlfDscError: the file cannot be read, or does not hold positions and torques of the arm.
     """
     if path.suffix.lower() in TABLES:
-        return read_table(path, text, joints, names, planned=planned)
+        return read_table(path, text, joints, names)
     _check_file(path)
     return read_bag(path, text, joints, namespace, names, commanded)
 
