@@ -4,31 +4,19 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import replace
 
-import matplotlib.image
 import numpy as np
 import pytest
 import recorded_run
 from recorded_run import BOUND_RAD, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
-from test_law_urdf import panda
 
-from blf_dsc_controller.analysis.estimates import (
-    bodies_of,
-    errors_of_bodies,
-    estimates_of,
-)
-from blf_dsc_controller.analysis.figures import close_up, draw
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.output import plain, write_json
-from blf_dsc_controller.analysis.panels import panels
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.factory.estimate import learned_arm
-from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LATE_STEPS
-from blf_dsc_controller.run import LearnedArm, Run, Series, Stop
+from blf_dsc_controller.run import LearnedArm, Run, Series
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 SAMPLES = 10_000
@@ -60,28 +48,6 @@ def test_tracking(run):
     assert metrics.torque_rate == pytest.approx((8.0 * rate, 3.0 * rate), rel=1e-4)
 
 
-def test_joint_that_left_its_bound_is_not_the_one_that_caused_it(run):
-    text = (
-        "joint 'shoulder' has demanded more than its torque limit of 40 N m for 0.1 s: carry "
-        "less; joint 'elbow' is +0.0021 rad from its reference: past its bound of 0.002 rad"
-    )
-    stop = Stop(int(run.stamp[500]), OUTSIDE_BOUND, text)
-    assert measure(replace(run, stops=(stop,))).violating_joint == 'elbow'
-
-
-def test_first_violation_is_the_earliest_of_all_joints(run):
-    error = run.error.copy()
-    error[4000, 0] = 0.0021
-    # on the bound counts as outside: the barrier is infinite there
-    error[3000, 1] = -BOUND_RAD
-    metrics = measure(replace(run, error=error))
-    assert metrics.held is False
-    assert (metrics.first_violation, metrics.violating_joint) == (
-        pytest.approx(3.0),
-        'elbow',
-    )
-
-
 def test_learning(run):
     metrics = measure(run)
     assert metrics.latch_time == pytest.approx(LATCH_S)
@@ -108,40 +74,6 @@ def test_learning(run):
     assert np.isnan(measure(left).parameter_error.time_to_1_percent)
 
 
-def test_parameter_error_is_unknown_at_moments_before_the_first_estimate(run):
-    """As of a recording that begins late: not that of the nearest sample."""
-    stamp, values = run.monitor.stamp[6000:], run.monitor.values[6000:]
-    late = replace(run, monitor=replace(run.monitor, stamp=stamp, values=values))
-    metrics = measure(late)
-    assert np.isnan(metrics.parameter_error.at[5])
-    assert metrics.parameter_error.at[10] == metrics.parameter_error.end
-
-
-def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
-    """Three times slower: 30 s, of which the parameter error of the last 10 s counts."""
-    stamp = run.stamp[0] + 3 * (run.stamp - run.stamp[0])
-    slow = replace(run, stamp=stamp, monitor=replace(run.monitor, stamp=stamp))
-    error = recorded_run.relative_error(1e-3 * np.arange(SAMPLES))
-    last = error[3e-3 * np.arange(SAMPLES) >= 29.997 - 10.0]
-    expected = np.sqrt(np.mean(last**2))
-    assert measure(slow).parameter_error.tail == pytest.approx(expected, rel=1e-9)
-
-
-def test_parameter_error_is_shown_in_percent(run):
-    title = 'relative parameter error'
-    (panel,) = (each for each in panels([run]) if each.title == title)
-    error, one_percent = panel.lines
-    share = estimates_of(run).relative_error
-    assert error.values[[0, -1]] == pytest.approx(100.0 * share[[0, -1]])
-    assert panel.unit == '%'
-    assert (one_percent.values == 1.0).all()
-
-
-def test_close_up_of_a_change_without_errors_shows_torques_and_parameters(run):
-    shown = [panel.title for panel in close_up(replace(run, error=None), 5.0)]
-    assert shown == ['torque of each joint', 'relative parameter error']
-
-
 def test_each_largest_error_at_the_tool_has_the_bound_of_its_own_sample(run):
     """Position and angle are worst at different times, with bounds that change."""
     error, bound = np.zeros((2, SAMPLES, 2))
@@ -165,17 +97,6 @@ def test_each_largest_error_at_the_tool_has_the_bound_of_its_own_sample(run):
             'angle_ratio': 2.0 / 3.0,
         }
     )
-
-
-def test_smallest_bound_and_torque_limit_count(run):
-    bound = run.bound.copy()
-    bound[4000:5000, 1] = 3.0 * BOUND_RAD
-    limit = run.torque_limit.copy()
-    limit[7000:, 0] = 0.5 * LIMIT_NM
-    metrics = measure(replace(run, bound=bound, torque_limit=limit))
-    assert metrics.torque_limit == (0.5 * LIMIT_NM, LIMIT_NM)
-    assert metrics.bound == (BOUND_RAD, BOUND_RAD)
-    assert metrics.widest_bound == (BOUND_RAD, 3.0 * BOUND_RAD)
 
 
 def test_timing(run):
@@ -345,146 +266,3 @@ def test_parameter_error_is_the_torque_error_along_the_reference():
         3.0 - 2.0 * np.sin(TIME)
     )
     assert off == pytest.approx(expected, rel=0.01)
-
-
-def test_derivatives_of_the_reference_are_those_at_uneven_times():
-    """Three points at any distances show a parabola exactly; every third sample is left out."""
-    calls = []
-
-    def record(q, dq, _v, a):
-        calls.append((q[:, 0], dq[:, 0], a[:, 0]))
-        return pendulum(q, dq, _v, a)
-
-    run = run_of(P, regressor=record)
-    kept = np.arange(TIME.size) % 3 != 0
-    parabola = (TIME**2)[:, np.newaxis]
-    some = {
-        name: getattr(run, name)[kept]
-        for name in (
-            *('stamp', 'received', 'position', 'velocity', 'torque'),
-            *('error', 'bound', 'torque_limit'),
-        )
-    }
-    estimates_of(replace(run, reference=parabola[kept], **some))
-    ((q, dq, a),) = calls
-    np.testing.assert_allclose(dq, 2.0 * np.sqrt(q), atol=1e-8)
-    np.testing.assert_allclose(a, 2.0, atol=1e-6)
-
-
-def test_regressor_is_evaluated_along_the_reference():
-    calls = []
-
-    def record(q, dq, v, a):
-        calls.append((q[:, 0], dq[:, 0], v[:, 0], a[:, 0]))
-        return pendulum(q, dq, v, a)
-
-    estimates_of(run_of(P, regressor=record))
-    ((q, dq, v, a),) = calls
-    t = np.arcsin(q)
-    np.testing.assert_allclose(a, -q, atol=1e-4)
-    np.testing.assert_array_equal(dq, v)
-    np.testing.assert_allclose(np.abs(dq), np.cos(t), atol=1e-4)
-
-
-def test_table_and_summary_name_the_torque_error():
-    run = run_of(1.1 * P)
-    assert measure(run).parameter_error.of_torques
-    line = (
-        'torque error of the learned model 5 s 10 %, 10 s 10 %, end 10 %; not below 1 %'
-    )
-    assert f'model       {line}' in format_table(measure(run)).splitlines()
-    still = replace(run, reference=np.full_like(run.reference, np.nan))
-    assert np.isnan(measure(still).parameter_error.end)
-    assert 'torque error' not in format_table(measure(still))
-
-
-@pytest.mark.parametrize(('known', 'share'), [(True, 1.0), (False, 0.5)])
-def test_estimate_errors_are_shown_in_deviations_of_the_prior(known, share):
-    run = run_of(P + np.linspace(0.5, 1.0, TIME.size)[:, np.newaxis])
-    run = run if known else replace(run, truth=None)
-    title = f'{"errors" if known else "changes"} of the estimates, by link'
-    (panel,) = (panel for panel in panels([run]) if panel.title == title)
-    off = {line.name: line.values[-1] / share for line in panel.lines}
-    assert off == pytest.approx({'Izz1': 200.0, 'm*cx1': 100.0, 'Ixx1': 50.0})  # %
-
-
-def test_estimates_are_grouped_by_link_and_friction():
-    names = (
-        *(f'{kind}{link}' for link in (1, 2) for kind in ('m*cx', 'Izz', 'rotor')),
-    )
-    names += ('viscous joint1', 'viscous joint2', 'coulomb joint1', 'coulomb joint2')
-    bodies = bodies_of(names)
-    sizes = {'link 1': 3, 'link 2': 3, 'viscous': 2, 'coulomb': 2}
-    assert {body: len(members) for body, members in bodies.items()} == sizes
-    assert bodies_of(names[:3]) == {name: [k] for k, name in enumerate(names[:3])}
-    # the friction is unknown: how far does it move?
-    true = np.array([0.0] * 6 + [np.nan] * 4)
-    estimate = np.array(
-        [[9.0] * 10, [0.0, 0.0, 0.0, 3.0, 4.0, 0.0, np.nan, 10.0, np.nan, np.nan]]
-    )
-    found = errors_of_bodies(bodies, estimate, np.tile(true, (2, 1)), np.full(10, 2.0))[
-        :, 1
-    ]
-    # rejected
-    np.testing.assert_allclose(found, (0.0, 250.0 / np.sqrt(3.0), 50.0, np.nan))
-
-
-def test_change_of_the_true_arm_is_marked():
-    true = np.tile(P, (TIME.size, 1))
-    true[400:500] *= np.linspace(1.01, 1.5, 100)[:, np.newaxis]
-    true[500:] *= 1.5
-    for panel in panels([run_of(P, true)]):
-        marks = [mark.time for mark in panel.marks if mark.text == 'the arm changes']
-        first = panel.title in ('error of joint1', 'torque error')
-        assert marks == pytest.approx([4.0] if first else [])
-
-
-@pytest.mark.parametrize('configured', [True, False])
-def test_seven_joints_and_sixty_parameters_fit_into_the_figures(tmp_path, configured):
-    config = panda()
-    arm = learned_arm(config)
-    names = tuple(arm.units)
-    stamp = np.arange(50) * PERIOD
-    wide = np.tile(np.linspace(0.1, 1.0, 50)[:, np.newaxis], (1, 7))
-    learned = np.ones((50, len(names) + 2)) * np.arange(len(names) + 2)
-    series = Series((*names, LAMBDA_MIN, LATCHED), stamp, learned)
-    run = Run(
-        *(
-            config.joints,
-            stamp,
-            stamp,
-            wide,
-            wide,
-            wide,
-            wide + 0.001,
-            wide / 1e3,
-            wide,
-            wide,
-        ),
-        monitor=series,
-        truth=series,
-        arm=arm if configured else None,
-    )
-    with warnings.catch_warnings():
-        # matplotlib warns when there is no room for the axes
-        warnings.simplefilter('error')
-        drawn = draw(run, tmp_path)
-    assert [path.name for path in drawn] == ['tracking.png', 'parameters.png']
-    for path in drawn:
-        assert 1200 < matplotlib.image.imread(path).shape[1] < 2000
-    shown = {
-        panel.title: panel for panel in panels([run]) if panel.group == 'Parameters'
-    }
-    # as there are colours
-    assert all(len(panel.lines) <= 8 for panel in shown.values())
-    of_links = {'torque error', 'errors of the estimates, by link'}
-    assert set(shown) == (of_links if configured else {'relative parameter error'})
-
-
-def test_estimates_that_are_too_many_are_thinned_out_up_to_the_last(run, monkeypatch):
-    monkeypatch.setattr('blf_dsc_controller.analysis.estimates._MAX_SAMPLES', 7)
-    found = estimates_of(run)
-    assert found.time.size <= 7
-    assert found.time[-1] == run.time_of(run.monitor.stamp)[-1]
-    last = run.monitor.values[-1, run.monitor.indices(found.names)]
-    np.testing.assert_array_equal(found.estimate[-1], last)

@@ -6,14 +6,11 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
 import pytest
 import recorded_run
-from hypothesis import given
-from hypothesis import strategies as st
 from matplotlib import pyplot as plt
 from matplotlib import rcParams
 from matplotlib.colors import to_hex, to_rgb
@@ -24,18 +21,13 @@ from blf_dsc_controller.analysis.figures import draw
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import (
-    _AXIS_MARGIN,
     ALARM,
     COLOURS,
-    _span,
-    _torque,
-    envelope,
     panels,
 )
 from blf_dsc_controller.analysis.report import plots, read_bag, write_report
 from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import (
@@ -47,7 +39,6 @@ from blf_dsc_controller.messages.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.supervisor import Reason
 
 pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
@@ -85,21 +76,6 @@ def lightened(colour, opacity=0.75):
     return to_hex(np.array(to_rgb(colour)) * opacity + 1.0 - opacity)
 
 
-def test_a_change_of_the_arm_is_drawn_from_close_by(tmp_path):
-    event = {
-        'events.begin': (1.0,),
-        'events.duration': (0.0,),
-        'events.payload': (0.25,),
-    }
-    loop = load_loop('recommended', {'sim_plant': {'duration': 4.0, **event}})
-    drawn = draw(simulate(loop.controller, loop.plant).run(), str(tmp_path))
-    assert [path.name for path in drawn[:2]] == ['tracking.png', 'change.png']
-    image = pixels(tmp_path / 'change.png')
-    assert amount(image, '#DCE9F5') > 100_000  # the bound
-    for colour in COLOURS[:2]:  # error and torque of two joints
-        assert amount(image, colour) > 500
-
-
 def test_draw_writes_both_figures_and_leaves_no_trace(drawn):
     folder, before = drawn
     assert (dict(rcParams), plt.get_fignums()) == (before, [])  # no changed settings
@@ -114,63 +90,6 @@ def test_draw_writes_both_figures_and_leaves_no_trace(drawn):
     assert amount(tracking, '#D55E00') > 1000
     for colour in COLOURS[:2]:
         assert amount(parameters, lightened(colour, 0.6)) > 500
-
-
-def test_violation_is_marked_and_errors_stay_visible_beside_the_wide_start_of_a_funnel(
-    run, drawn, tmp_path
-):
-    error = run.error.copy()
-    error[2000, 1] = 0.003
-    widening = np.linspace(20.0, 1.0, len(run.bound))[:, None]
-    folders = [drawn[0]]
-    for changes in ({'error': error}, {'bound': run.bound * widening}):
-        folders.append(tmp_path / next(iter(changes)))
-        # without what else would be drawn
-        draw(replace(run, monitor=None, **changes), folders[-1])
-    (none, blue), (red, _), (_, beside) = (
-        [amount(image, colour) for colour in ('#B3001B', '#0072B2')]
-        for image in (pixels(folder / 'tracking.png') for folder in folders)
-    )
-    assert (none, red > 100) == (0, True)
-    assert beside > 0.8 * blue
-
-
-@pytest.mark.parametrize(
-    ('errors', 'largest'),
-    [
-        ([0.1, -0.4], 2.0),
-        ([0.1, -4.0], 4.0),
-        ([3.0, -1e101], 3.0),
-        ([np.nan, 1e101], 2.0),
-    ],
-)
-def test_axis_of_a_funnel_has_room_for_its_errors_but_not_for_absurd_ones(
-    errors, largest
-):
-    """Of either sign, in mrad; its bound narrows from 9 mrad to 2 mrad."""
-    span = _span(np.array([9e-3, 2e-3]), np.array(errors))
-    assert span == pytest.approx(_AXIS_MARGIN * largest)
-    assert _span(np.array([2e-3, 2e-3]), np.array(errors)) == 0.0
-
-
-@pytest.mark.parametrize(
-    ('limit', 'names'),
-    [
-        (None, ['torque']),
-        ([np.nan, np.nan], ['torque']),
-        ([9.0, np.nan], ['torque', 'limit']),
-    ],
-)
-def test_torque_is_drawn_with_its_limit_if_that_is_known(limit, names):
-    columns = {'torque': np.array([1.0, -3.0]), 'torque_limit': limit}
-    run = SimpleNamespace(
-        joints=('a',),
-        column=lambda name, _: columns[name],
-        units=lambda _: SimpleNamespace(torque='N m'),
-    )
-    (panel,) = _torque(run, np.arange(2.0), 0)
-    assert [line.name for line in panel.lines] == names
-    assert panel.note == 'peak 3'
 
 
 def test_missing_series_and_a_single_sample_are_drawn(run, drawn, tmp_path):
@@ -194,54 +113,6 @@ def test_missing_series_and_a_single_sample_are_drawn(run, drawn, tmp_path):
     )
     one = {name: getattr(run, name)[:1] for name in (*arrays, 'torque_limit')}
     assert draw(replace(run, **one), tmp_path)
-
-
-def test_logarithmic_error_panel_shows_small_and_large_errors(run):
-    error = 1e-6 * np.ones_like(run.error)
-    error[700, 1] = 0.0015
-    found = panels([replace(run, error=error)])
-    (panel,) = (panel for panel in found if panel.title == '|error| of elbow')
-    magnitude, bound = panel.lines
-    assert panel.log
-    assert (magnitude.values.max(), magnitude.time[magnitude.values.argmax()]) == (
-        1.5,
-        pytest.approx(0.7, abs=0.02),
-    )
-    assert magnitude.values.min() == pytest.approx(1e-3)  # mrad
-    assert set(bound.values) == {2.0}
-
-
-@pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('level', [0.0001, np.nan])
-def test_constant_series_on_a_logarithmic_axis_is_drawn(
-    run, tmp_path, level, monkeypatch
-):
-    monkeypatch.setattr(figures, '_draw_motion', lambda *_: None)
-    learning = run.monitor
-    values = learning.values.copy()
-    values[:, learning.names.index('lambda_min')] = level
-    values[-1, learning.names.index('lambda_min')] *= 1.0 - 6e-16
-    unknown = replace(run, monitor=replace(learning, values=values))
-    assert tmp_path / 'parameters.png' in draw(unknown, tmp_path)
-
-
-@given(st.integers(1, 400), st.integers(1, 50), st.randoms(use_true_random=False))
-def test_envelope_keeps_the_extremes_of_every_piece(size, pieces, random):
-    values = np.array(
-        [random.choice([random.gauss(0, 1), np.nan]) for _ in range(size)]
-    )
-    time = np.arange(size) * 0.5
-    thin_time, thin = envelope(time, values, pieces)
-    assert thin.size <= max(2 * pieces, size if size <= 2 * pieces else 0)
-    kept = (thin_time / 0.5).astype(int)
-    assert np.all(np.diff(kept) >= 0)
-    np.testing.assert_array_equal(thin, values[kept])
-    for piece in np.split(np.arange(size), range(0, size, -(-size // pieces))[1:]):
-        known = values[piece][~np.isnan(values[piece])]
-        remaining = thin[np.isin(kept, piece)]
-        if known.size:
-            assert np.nanmax(remaining) == known.max()
-            assert np.nanmin(remaining) == known.min()
 
 
 @pytest.fixture(scope='module')
@@ -499,48 +370,3 @@ def test_figures_and_page_show_the_stop(tmp_path):
     )
     assert time == pytest.approx(STOP_S)
     assert text.startswith("error past the bound: joint 'elbow'")
-
-
-def test_stop_is_shaded_until_the_controller_restarts(tmp_path):
-    stop, start = (START + k * MILLISECOND for k in (1000, 1800))
-    events = [
-        Event(
-            1,
-            EventType.STOP,
-            stop,
-            1,
-            1,
-            {'reason': Reason.VELOCITY, 'text': 'too fast'},
-        ),
-        Event(2, EventType.START, start, 1, 1, {'resumed': False}),
-    ]
-    messages = [
-        *Synthetic(4000).messages(),
-        *((JOURNAL, START, each.encode()) for each in events),
-    ]
-    path = recorded_run.write_made(tmp_path / 'bag', messages)
-    bag = read_bag(path)
-    (plot,) = (
-        p for p in plots(panels([bag.run]), [bag]) if p['title'] == 'torque of elbow'
-    )
-    assert plot['marks'] == [
-        (pytest.approx(1.0), 'stop: velocity not plausible', ALARM, pytest.approx(1.8))
-    ]
-
-
-@pytest.mark.parametrize(
-    ('ends', 'written'),
-    [
-        ((2.0, 120.0), ['2', '5', '10', '20', '50', '100']),
-        ((17.0, 24.0), ['18', '20', '22', '24']),
-    ],
-)
-def test_logarithmic_axis_has_plain_numbers_to_read_it_by(ends, written, tmp_path):
-    picture = figures.Picture(1, 1, 'response', (4.0, 3.0), share_time=False)
-    axes = picture.axes[0, 0]
-    axes.loglog(ends, ends)
-    picture.save(tmp_path / 'response.png')
-    low, high = axes.get_xlim()
-    ticks = zip(axes.get_xticks(), axes.get_xticklabels(), strict=True)
-    assert [label.get_text() for x, label in ticks if low <= x <= high] == written
-    assert not any(each.get_text() for each in axes.get_xticklabels(minor=True))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import os
-import re
 import shutil
 from itertools import pairwise
 
@@ -42,7 +41,6 @@ from blf_dsc_controller.messages.codecs import (
     definition,
     typestore,
 )
-from blf_dsc_controller.messages.strings import encode_string
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
     FLOAT64_MULTI_ARRAY,
@@ -409,20 +407,6 @@ def test_missing_definition_of_another_topic_loses_no_other_message(
     assert (lost in output) == (schema is None)  # not even the type's name is known
 
 
-def test_types_of_this_package_need_a_name_but_no_definition(
-    entries, tmp_path, run, all_say
-):
-    file = write_mcap(tmp_path / 'bag', entries, lambda _: ('', b''))
-    assert run('recover', file, '--out', 'clean')[0] == 0
-    for each in (file, tmp_path / 'clean'):
-        assert run('replay', each)[0] == 0
-    file = write_mcap(tmp_path / 'unnamed', entries, lambda _: None)
-    all_say(file, '/joint_states (of unknown type)')
-    code, output, _ = run('recover', file, '--out', 'none')
-    lost = f'LOST bag_0.mcap: {len(entries)} messages of topics whose name or type'
-    assert (code, lost in output, 'ALL LOST: no message' in output) == (1, True, True)
-
-
 def test_files_that_are_missing_or_hold_other_numbers_than_stated(
     entries, copy, all_say
 ):
@@ -470,28 +454,6 @@ def test_what_holds_nothing_to_recover_says_what_is_missing(bag, told, tmp_path,
     assert error.startswith(f'blf_dsc recover: {bag} cannot be read as a bag: ')
     assert told in error
     assert not (tmp_path / 'clean').exists()
-
-
-@pytest.mark.parametrize(
-    ('storage', 'compression'),
-    [
-        (MCAP, CompressionMode.NONE),
-        (MCAP, CompressionMode.MESSAGE),
-        (SQLITE3, CompressionMode.NONE),
-    ],
-)
-@pytest.mark.parametrize('stated', [0, 2, 4])
-def test_count_of_a_topic_that_nobody_reads_is_checked_too(
-    entries, tmp_path, all_say, storage, compression, stated
-):
-    messages = [*entries, *(['/a', 'std_msgs/msg/String', 5, encode_string('')],) * 3]
-    bag = write(tmp_path / 'bag', messages, storage, compression=compression)
-    metadata = bag / 'metadata.yaml'
-    text = metadata.read_text()
-    counts = re.findall('message_count: 3\n', text)
-    assert len(counts) == 1
-    metadata.write_text(text.replace(counts[0], f'message_count: {stated}\n'))
-    all_say(bag, f'it holds 3 messages of /a, but counts {stated}')
 
 
 @pytest.mark.parametrize(

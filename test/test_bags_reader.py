@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import re
 import struct
 import tracemalloc
@@ -32,7 +31,6 @@ from blf_dsc_controller.bags.unpacking import LARGEST, unpacked
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (
-    JOINT_STATE_FIELDS,
     JointStateEncoder,
     typestore,
 )
@@ -46,7 +44,6 @@ from blf_dsc_controller.messages.topics import (
     REFERENCE,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.run import Series
 
 SAMPLES = 200
 MADE = Synthetic(SAMPLES)
@@ -118,26 +115,6 @@ def test_namespace_selects_one_of_several_robots(tmp_path):
         read_run(tmp_path / 'bag')
     assert read_run(tmp_path / 'bag', 'left').stamp.size == SAMPLES
     assert read_run(tmp_path / 'bag', '/right').stamp.size < SAMPLES
-
-
-def test_stop_before_the_first_state_is_at_the_first_state(tmp_path):
-    journal = Journal()
-    journal.note(EventType.STOP, reason='failed', text='too early')
-    raw = journal.pending[0].encode()
-    path = recorded_run.write_made(tmp_path / 'bag', [(JOURNAL, 0, raw), *MESSAGES])
-    ((time, stop),) = read_run(path).timed_stops
-    assert (time, stop.stamp, stop.text) == (0.0, MADE.stamp[0], 'too early')
-
-
-def test_namespace_is_no_beginning_of_another_one(tmp_path):
-    ten = [(f'/arm10{topic.resolved}', topic, at, raw) for topic, at, raw in MESSAGES]
-    one = [(f'/arm1{topic.resolved}', topic, at, raw) for topic, at, raw in STATES[7:]]
-    path = recorded_run.write(
-        tmp_path / 'bag',
-        [[name, topic.type, at, raw] for name, topic, at, raw in ten + one],
-    )
-    assert read_run(path, 'arm1').stamp.size == SAMPLES - 7
-    assert read_run(path, 'arm10').stamp.size == SAMPLES
 
 
 def test_only_joint_states_are_required(tmp_path):
@@ -267,96 +244,6 @@ def test_records_that_are_cut_off_or_too_long_are_errors(opcode, length, held, p
         found = next_record(stream, size, kinds)
         assert (found is None) == (opcode is Opcode.ATTACHMENT)
         assert stream.tell() == size
-
-
-def test_any_rows_of_long_topics_of_many_layouts_are_read():
-    """Of two devices.
-
-    The arm's joints change their order, the tool its name, later the fields.
-    """
-    lists = [
-        names
-        for k in range(150)
-        for names in (('a', 'b', f'tool{k}'), (f'tool{k}', 'b', 'a'), ('c',))
-    ]
-    messages = TopicMessages('/x', JOINT_STATES.type)
-    for k in range(3000):
-        values = [k] if k % 3 == 2 else [k, -k, k][:: 1 - k % 3 * 2]
-        fields = dict.fromkeys(JOINT_STATE_FIELDS[: 2 if k < 600 else 3], values)
-        raw = JointStateEncoder(lists[k % 450], fields).encode(10**9 + k, **fields)
-        messages.add(BagMessage('/x', k + 7, raw, k + 1))
-    for states, expected in (
-        (messages.joint_states(('b', 'a')), np.flatnonzero(np.arange(3000) % 3 < 2)),
-        (messages.joint_states(('c',)), np.arange(2, 3000, 3)),
-    ):
-        np.testing.assert_array_equal(states.number, expected)
-        for rows in (slice(None), slice(600, 900), np.array([999, 3, 700]), slice(0)):
-            known = expected[rows]
-            found = states.select(rows)
-            for values, offset in (
-                (found.received, 7),
-                (found.sequence, 1),
-                (found.stamp, 10**9),
-                (states.field(1)[rows, -1], 0),
-            ):
-                np.testing.assert_array_equal(values, known + offset)
-        effort = states.field(2)[:, -1]
-        np.testing.assert_array_equal(
-            effort, np.where(expected < 600, np.nan, expected)
-        )
-        lost = states.select(np.array([-1, 900, -1])).field(1)[:, -1]
-        np.testing.assert_array_equal(lost, [np.nan, expected[900], np.nan])
-
-
-def test_series_holds_its_values_and_the_first_before_it_begins():
-    series = Series(('a',), np.array([5, 9]), np.array([[1.0], [2.0]]))
-    assert series.held(np.array([0, 5, 8, 9, 20]), ['a']).ravel().tolist() == [
-        1,
-        1,
-        1,
-        2,
-        2,
-    ]
-
-
-def test_states_are_held_from_their_own_stamp_on():
-    messages = TopicMessages('/x', JOINT_STATES.type)
-    for stamp in (5, 9):
-        raw = ENCODER.encode(stamp, [stamp] * 2, [0, 0], [0, 0])
-        messages.add(BagMessage('/x', stamp, raw))
-    held = messages.joint_states(JOINTS).held(np.array([0, 5, 8, 9, 20]))
-    assert held.stamp.tolist() == [5, 5, 5, 9, 9]
-
-
-def joint_states(names):
-    """Return a topic with one message for each list of names."""
-    messages = TopicMessages('/x', JOINT_STATES.type)
-    for k, each in enumerate(names):
-        raw = JointStateEncoder(each).encode(k, *[[k] * len(each)] * 3)
-        messages.add(BagMessage('/x', k, raw))
-    return messages
-
-
-def test_columns_are_kept_only_for_names_that_stay():
-    """With a column for each name in each block, this would be 13 MB."""
-    names = [('a', f'tool{k}') for k in range(3000)]
-    messages = joint_states([*names, *[('a',)] * 100_000])
-    assert messages.joint_states(('a',)).field(0)[102_999:, 0] == 102_999
-    blocks = os.fstat(messages._file.fileno()).st_size
-    assert blocks < 1.2 * 8 * (7 * 103_000 + 3000 * 3 * 512)
-
-
-@pytest.mark.parametrize(
-    'names',
-    [
-        [[f'joint {k} {j}' for j in range(100)] for k in range(100)],
-        [[f'{j}' for j in range(k, k - 1000, -1)] for k in range(1000, 1400)],
-    ],
-    ids=['all different', 'in many orders'],
-)
-def test_names_without_end_are_refused(names):
-    with pytest.raises(BagError, match='these are no states of one robot'):
-        joint_states(names)
 
 
 def test_text_without_end_is_refused(tmp_path):

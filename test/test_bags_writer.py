@@ -19,7 +19,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import Writer as McapWriter
 from recorded_run import MILLISECOND, messages_on_disk, raw_records, read
 from rosbags.rosbag2 import (
     CompressionFormat,
@@ -257,7 +256,6 @@ def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(
 
 CHUNKS = 6
 PER_CHUNK = 5  # messages of each topic
-ALL = 2 * PER_CHUNK * CHUNKS
 
 
 def write(path, compression='none'):
@@ -346,38 +344,6 @@ def test_flipped_bytes_lose_nothing_silently(whole, tmp_path_factory, data):
     assert found == written
 
 
-def test_every_flipped_head_of_a_record_is_noticed(plain, tmp_path):
-    """A chunk may look like another record, or the end.
-
-    No later chunk is lost with it.
-    """
-    original, _ = plain
-    last = chunks(original)[-1][1]
-    for at, _ in raw_records(original):
-        for place in range(at, at + 9 if at < last else at):
-            content = bytearray(original)
-            content[place] ^= 1 << place % 8
-            messages, losses = recovered(tmp_path / f'{place}', content)
-            assert len(messages) >= ALL - 2 * PER_CHUNK
-            assert len(messages) == ALL or losses
-
-
-def test_topics_are_not_taken_from_a_damaged_description(plain, tmp_path):
-    """One flipped byte there would file messages under another name."""
-    content, written = bytearray(plain[0]), plain[1]
-    (at, end), *_, (_, last) = chunks(content)
-    content[(at + end) // 2] ^= 0x40  # where the topics are defined, too
-    kept = written[2 * PER_CHUNK :]
-    assert recovered(tmp_path / 'first', content)[0] == kept
-    name = content.index(b'/joint_states', last) + 1
-    content[name] ^= 1
-    messages, losses = recovered(tmp_path / 'both', content)
-    assert messages == []
-    assert any(
-        f'{len(kept)} messages of topics whose name or' in loss for loss in losses
-    )
-
-
 @pytest.mark.parametrize(
     ('damage', 'lost', 'words'),
     [
@@ -457,48 +423,6 @@ def test_compressed_messages_that_cannot_be_unpacked_are_losses(tmp_path, capsys
     assert output.splitlines()[:-1] == ['a: 2 messages', 'b: 0 messages', loss]
     with open_bag(out) as opened:
         assert [each.raw for each in opened.messages({'a'})] == 2 * [message(0)]
-
-
-def test_recovery_keeps_the_numbers_of_the_publishers(plain, tmp_path):
-    recovered(tmp_path / 'bag', plain[0][:-1])
-    with open_bag(tmp_path / 'bag_clean') as opened:
-        found = [each.sequence for each in opened.messages({JOINT_STATES.resolved})]
-    assert found == [*range(1, CHUNKS * PER_CHUNK + 1)]
-
-
-def test_message_before_its_topic_does_not_lose_the_later_ones(tmp_path):
-    """In a file without chunks and without an index, as after a kill."""
-    with (tmp_path / 'made.mcap').open('wb') as stream:
-        made = McapWriter(stream, use_chunking=False)
-        made.start()
-        schema = made.register_schema(COMMANDS.type, 'ros2msg', b'')
-        channel = made.register_channel('/x', 'cdr', schema)
-        for k in range(5):
-            made.add_message(channel, k, TORQUES.encode([k, k]), k, k)
-        made.finish()
-    data = (tmp_path / 'made.mcap').read_bytes()
-    records = [raw for _, raw in raw_records(data)]
-    place = next(k for k, raw in enumerate(records) if raw[0] == Opcode.CHANNEL)
-    first = next(k for k, raw in enumerate(records) if raw[0] == Opcode.MESSAGE)
-    last = next(k for k, raw in enumerate(records) if raw[0] == Opcode.DATA_END)
-    records.insert(first, records.pop(place))
-    content = data[:8] + b''.join(records[:last])
-    messages, losses = recovered(tmp_path / 'bag', content)
-    assert [at for _, at, _ in messages] == [1, 2, 3, 4]
-    assert any('1 messages of topics whose name or type' in loss for loss in losses)
-
-
-def test_files_of_a_split_bag_are_recovered_together(plain, tmp_path):
-    for name in ('bag_0.mcap', 'bag_1.mcap'):
-        folder = damaged(tmp_path / name, plain[0])
-        (folder / 'bag_1.mcap').write_bytes(plain[0])
-        (folder / 'bag_10.mcap').write_bytes(plain[0])
-        (folder / name).write_bytes(b'')
-        messages, (loss,) = recover(folder, tmp_path / f'{name}_clean')
-        assert sum(messages.values()) == 2 * ALL
-        assert loss.startswith(
-            f'{name}: the recording was not closed; nothing in it could be read'
-        )
 
 
 @pytest.mark.parametrize('mode', [CompressionMode.NONE, CompressionMode.MESSAGE])

@@ -34,11 +34,8 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.result_folder import (
     BAG,
     discard_unbegun,
-    expect_folder,
-    keep,
     make_folder,
 )
-from blf_dsc_controller.errors import BlfDscError
 
 HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 1  # s
@@ -274,39 +271,6 @@ def test_folder_of_a_run_without_a_bag_goes_at_an_interrupt(tmp_path):
     assert discard_unbegun() == [made[0], others[0]]
     assert [made[1], others[1]] == [each for each in (*made, *others) if each.exists()]
     assert discard_unbegun() == []
-
-
-def test_folder_that_a_recorder_makes_goes_until_its_run_begins(tmp_path):
-    """Not one that was there before."""
-    before, begun, unbegun = (
-        tmp_path / name for name in ('before', 'begun', 'unbegun')
-    )
-    before.mkdir()
-    for folder in (before, begun, unbegun):
-        expect_folder(folder)
-        folder.mkdir(exist_ok=True)
-        (folder / 'bag_0.mcap').touch()
-    keep(begun)
-    assert discard_unbegun() == [unbegun]
-    assert [before, begun] == sorted(tmp_path.iterdir())
-
-
-def test_folder_that_another_command_makes_meanwhile_is_left_alone(
-    tmp_path, monkeypatch
-):
-    out = tmp_path / 'out'
-    mkdir = Path.mkdir
-
-    def after_another(path, **given):
-        mkdir(path)
-        mkdir(path, **given)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, 'mkdir', after_another)
-        with pytest.raises(BlfDscError, match='out exists already and is not'):
-            make_folder(out)
-    assert discard_unbegun() == []
-    assert out.exists()
 
 
 @pytest.mark.parametrize(

@@ -51,18 +51,6 @@ def test_wave_that_lasts_is_found_with_its_amplitude_and_frequency(frequency, wh
     assert of_limit_cycle(cycle).startswith(said)
 
 
-@pytest.mark.parametrize('when', [STILL, IN_MOTION])
-@pytest.mark.parametrize('rows', [1, 2, 150, 1000])
-def test_run_that_is_too_short_for_slow_waves_shows_none(rows, when):
-    run = SimpleNamespace(
-        joints=('wrist',),
-        time=T[:rows],
-        error=wave(2.6e-3, 6.0)[:rows, None],
-        units=lambda _: TURNING,
-    )
-    assert limit_cycles(run, when) == []
-
-
 def test_stick_and_slip_whose_frequency_wanders_is_found():
     """As that of an arm in motion: 5.7 to 6.7 Hz."""
     phase = 2.0 * np.pi * (6.2 * T + 0.4 * np.sin(2.0 * np.pi * 0.2 * T))
@@ -89,20 +77,6 @@ def test_what_is_smaller_than_slower_errors_or_rings_after_each_reversal_is_none
     since = np.mod(T, 2.5)  # s, since the joint reversed
     rings = 5.3e-3 * np.exp(-since / 0.3) * np.sin(2.0 * np.pi * 4.0 * since)
     assert found(rings + wave(0.85e-3, 1.2), IN_MOTION) == []
-
-
-@pytest.mark.parametrize(
-    'error',
-    [
-        wave(3e-4, 6.0),  # small
-        wave(50e-3, 6.0) * np.exp(-T / 1.0),  # dies out
-        wave(4e-3, 0.6) + wave(1e-3, 1.8) + wave(6e-4, 3.0),  # of a motion
-        np.random.default_rng(0).normal(0.0, 5e-3, T.size),  # noise
-        8e-3 * np.tanh(np.sin(2.0 * np.pi * 0.4 * T) / 0.1),  # friction that reverses
-    ],
-)
-def test_what_is_no_limit_cycle_is_not_told(error):
-    assert found(error, IN_MOTION) == []
 
 
 def test_joint_at_rest_may_shake_more_slowly():

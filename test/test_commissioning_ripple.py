@@ -17,7 +17,6 @@ from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.cli import commission_ripple
 from blf_dsc_controller.cli.commission_ripple import on_robot
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.main import main
@@ -30,17 +29,14 @@ from blf_dsc_controller.commissioning import (
 )
 from blf_dsc_controller.commissioning.driven import Driven
 from blf_dsc_controller.commissioning.measurement import Measured, measured_in
-from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.planned import FROM_LIMITS
 from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.commissioning.ripple import ripples_in, to_learn
-from blf_dsc_controller.commissioning.ripple_page import of_ripple, ripple_table
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_files import identify_bag
-from blf_dsc_controller.identification.ripple import NOTHING, Ripple, Ripples
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import TURNING, Stop
@@ -255,33 +251,6 @@ def test_gains_of_a_file_are_proven_and_its_ripple_added(whole, capsys, monkeypa
     )
 
 
-def test_bag_that_shows_nothing_is_told_and_the_arm_is_held(whole, capsys, monkeypatch):
-    """As where positions come too rarely to tell."""
-    shorten(monkeypatch)
-    monkeypatch.setattr(proof, 'SHARES', (1.0,))
-    monkeypatch.setattr(postures.PostureByPosture, 'slow', lambda *_: None)
-    held = []
-
-    def hold(robot):
-        held.append(robot)
-
-    monkeypatch.setattr(postures.PostureByPosture, 'hold_after', hold)
-
-    def shows_nothing(_bags):
-        assert not held
-        raise BlfDscError('the joint states are 0.1 s apart')
-
-    monkeypatch.setattr(commission_ripple, 'ripples_by_bags', shows_nothing)
-    gains = whole.arm.with_name('out.yaml')
-    folder = str(whole.arm.with_name('proof_only'))
-    words = ['--prove', '--ripple', '--robot', 'plant', '--yes', '--record', folder]
-    assert commission(gains, *words, out='none.yaml') == 1
-    told = capsys.readouterr().err
-    assert f'0.1 s apart. Torque ripple was not measured; {gains} has' in told
-    assert len(held) == 1
-    assert not whole.arm.with_name('none.yaml').exists()
-
-
 class Pushed(PlantDriver):
     """An arm that somebody pushes past its bound."""
 
@@ -367,30 +336,6 @@ def test_reference_without_tones_is_refused_before_anything_moves(robot, arm, ca
     assert not arm.with_name('out.yaml').exists()
 
 
-def test_simulated_arm_without_ripple_shows_none(arm, capsys):
-    """Its file is written, and says so."""
-    arm.write_text(arm.read_text().replace('ripple: 0.004', 'ripple: 0.0'))
-    assert commission(arm, '--ripple', *at(NEAR)) == 0
-    told = capsys.readouterr().out
-    assert told.index('follows its own motion') < told.index('slow motion, for 16 s')
-    assert 'no torque ripple was found: learning.ripple_cycles stays []' in told
-    assert re.search(r'joint1 +none above \S+ N m at \d', told)
-    out = arm.with_name('out.yaml')
-    assert cycles_of(out) == ()
-    assert 'no torque ripple was found' in out.read_text()
-
-
-def test_simulated_arm_that_stops_keeps_its_gains(arm, capsys, monkeypatch):
-    def stopped(*_):
-        raise BlfDscError('the simulated arm stopped: it fell')
-
-    monkeypatch.setattr(simulated, 'slow_run', stopped)
-    assert commission(arm, '--ripple', *at(NEAR)) == 5
-    out = arm.with_name('out.yaml')
-    assert f'fell. Torque ripple was not measured; {out}' in capsys.readouterr().err
-    assert cycles_of(out) == ()
-
-
 @cache
 def ur5e(*, has_ripple):
     """Return what the slow motion shows of a simulated UR5e with its chosen gains."""
@@ -423,48 +368,6 @@ def test_ripple_of_a_ur5e_is_found_in_all_joints_and_none_where_there_is_none():
     assert all(each.is_known and not each.repeats for each in none)
 
 
-def shown(found, *ripples):
-    return '\n'.join(of_ripple(found.before, ripples))
-
-
-def test_it_says_how_sure_a_ripple_is(whole):
-    own = Ripple(40.01, 0.05, 1.2, 0.02)
-    seen = Ripples((own,), (5.0, 200.0), 0.1, 0.5)
-    none = seen._replace(found=())
-    alone = shown(whole.found, seen, none)
-    assert '40 per turn is known to +- 0.098; it shows in both directions' in alone
-    assert 'of 1 of 2 joints (joint1). No other joint shows it: trust it if' in alone
-    assert 'No other' not in shown(whole.found, seen, seen)
-    assert 'joint2 moved too little to show' in shown(whole.found, seen, NOTHING)
-    # what a motion that repeats shows is not learned
-    again = whole.found._replace(ripples=(seen._replace(repeats=True), none))
-    assert 'joint1 repeated the same motion' in shown(again, *again.ripples)
-    assert 'learning.ripple_cycles' not in again.parameters()
-    assert '1.2 +- 0.039 N m at 40.01 +- 0.098' in ripple_table(
-        again.before, again.ripples
-    )
-    # a list that the file has stays
-    known = change(whole.found.before, {'learning.ripple_cycles': [12.5]})
-    kept = whole.found._replace(before=known)
-    assert 'learning.ripple_cycles stays [12.5]' in shown(kept, none, none)
-    written = kept._replace(ripples=(seen, none)).config
-    assert written.learning.ripple_cycles == (40.0,)
-    # without the option, nothing has changed
-    assert sum('ripple' in each for each in sentences(whole.found)) == 1
-    assert 'is not looked for' in '\n'.join(sentences(whole.found))
-
-
-def test_slow_motion_has_the_tones_of_the_reference_at_half_the_pace():
-    config = blf.load_loop('ur5e').controller
-    slow = slow_motion.slow_frequencies(config)
-    shares = np.divide(slow, config.reference.frequency)
-    assert shares[0] == pytest.approx(0.5, rel=1e-3)
-    assert shares.max() <= 0.65
-    assert slow_motion.slow_motion(config).config.reference.frequency == slow
-    hold = change(config, {'reference.type': 'hold'})
-    assert slow_motion.slow_frequencies(hold) == ()
-
-
 def range_of(config, seconds=60.0):
     q = sampled(reference_of(config), np.arange(0.0, seconds, 0.01))[:, 0]
     return q.min(axis=0), q.max(axis=0)
@@ -493,16 +396,3 @@ def test_joints_keep_away_from_near_limits_in_the_slow_motion(preset):
     assert slow_motion.is_slow_motion(kept.config, near)
     assert not slow_motion.is_slow_motion(free.config, near)
     assert not slow_motion.is_slow_motion(config, config)
-
-
-def test_single_tone_becomes_two_that_do_not_repeat():
-    config = blf.load_loop('recommended').controller
-    assert len(config.reference.frequency) == 1
-    made = slow_motion.slow_motion(config)
-    assert len(made.config.reference.frequency) == 2
-    lower, upper = range_of(config)
-    assert (made.ranges[0] > lower - 1e-3).all()
-    assert (made.ranges[1] < upper + 1e-3).all()
-    np.testing.assert_allclose(
-        made.posture, sampled(reference_of(config), [0.0])[0, 0], atol=1e-12
-    )

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import io
-import logging
-import re
 import sys
 from pathlib import Path
 
@@ -18,22 +16,18 @@ from recorded_run import small_disk
 import blf_dsc_controller as blf
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.cli import commission as cli_commission
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import motion as motions
 from blf_dsc_controller.commissioning import proof
 from blf_dsc_controller.commissioning.driven import Driven
-from blf_dsc_controller.commissioning.planned import plan, postures_of
+from blf_dsc_controller.commissioning.planned import plan
 from blf_dsc_controller.commissioning.postures import SPEED, EndedError, move
-from blf_dsc_controller.commissioning.strength import MOST
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
@@ -75,15 +69,6 @@ def commission(arm, address, *options, postures=(NEAR,)):
     for posture in postures:
         words += ['--posture', *map(str, posture)]
     return main([*words, '--out', str(arm.with_name('out.yaml')), *options])
-
-
-def coarsen(arm, resolution):
-    """Give the arm encoders with such steps [rad], whose velocities are differences."""
-    coarse = f'    sensor: {{resolution: {resolution}, velocity: differenced}}\n'
-    text = arm.read_text()
-    arm.write_text(
-        text.replace('    initial.position', coarse + '    initial.position')
-    )
 
 
 def nothing_looks_whole(arm):
@@ -314,94 +299,6 @@ def test_contacts_end_a_motion_and_loads_are_not_told_in_it():
     assert motion.duration > motions.SETTLING + motion.excitation.period
 
 
-def test_reference_to_hold_visits_where_the_arm_is(arm):
-    config = change(blf.load_loop(arm).controller, {'reference.type': 'hold'})
-    np.testing.assert_array_equal(postures_of(config, here=np.array(BEGIN)), [BEGIN])
-    with pytest.raises(BlfDscError, match=r'reference\.type: got hold.*--posture'):
-        postures_of(config)
-
-
-def test_postures_differ_although_one_tone_passes_them_again_on_its_way_back(arm):
-    tone = {
-        'reference.type': 'sinusoids',
-        'reference.amplitude': [0.3, 0.2],
-        'reference.frequency': [1.0],
-        'reference.phase': [0.0],
-    }
-    config = change(blf.load_loop(arm).controller, tone)
-    shares = (postures_of(config) - config.reference.offset) / [0.3, 0.2]
-    # cosine of 30, 150 and 270 degrees
-    expected = np.array([[3.0**0.5 / 2.0, -(3.0**0.5) / 2.0, 0.0]] * 2).T
-    np.testing.assert_allclose(shares, expected, atol=1e-9)
-
-
-def test_gains_that_nobody_measured_are_told_where_a_robot_is_meant():
-    preset = blf.load_loop('fr3_direct').controller
-    assert 'nobody has measured' in not_commissioned(preset)
-    measured = {'commissioning.date': '2026-11-25 12:00'}
-    assert not_commissioned(change(preset, measured)) == ''
-    in_motors = not_commissioned(preset, in_motors=True)
-    assert 'begin with those of its maker' in in_motors
-    stiffer = change(preset, measured | {'feedback.stiffness': 2.0})
-    assert '2 times the gains for which' in not_commissioned(stiffer)
-    # of the paper's arm; of an arm that is known to be unknown (another warning)
-    assert not_commissioned(blf.load_loop('recommended').controller) == ''
-    unknown = {'robot.urdf': preset.robot.text, 'robot.tip': 'fr3_link8'}
-    soft = build(ControllerConfig, unknown)
-    assert not_commissioned(soft) == ''
-    assert any('blf_dsc commission' in each for each in config_warnings(soft))
-
-
-def test_loop_of_ones_own_logs_it_without_a_warning(caplog):
-    with caplog.at_level(logging.INFO):
-        blf.ArmController('fr3_direct').close()
-    (line,) = [each for each in caplog.records if 'nobody has measured' in each.message]
-    assert line.levelno == logging.INFO
-
-
-def test_a_posture_that_noise_hides_is_measured_again(arm, capsys):
-    """Both bags are kept, and only the second one counts."""
-    coarsen(arm, '4.0e-4')
-    assert commission(arm, 'plant', '--yes', '--torque', '0.03') == 0
-    told = capsys.readouterr().out
-    assert 'is measured again, up to 2 times' in told
-    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
-    folder = arm.with_name('out_bags')
-    assert {bag.name for bag in folder.iterdir()} == {
-        *('move_1', 'weak_posture_1', 'posture_1')
-    }
-    weak, strong = (
-        read_content(folder / name).controller_config().reference.amplitude[-3]
-        for name in ('weak_posture_1', 'posture_1')
-    )
-    assert strong == pytest.approx(MOST * weak)  # of the last joint's fastest line
-    run = blf.read_run(folder / 'posture_1')
-    assert np.abs(run.error[0]).max() < 1e-3  # from where the arm rests: a step or two
-    gains = gains_of(arm.with_name('out.yaml'))
-    bag = str(folder / 'posture_1')
-    again = arm.with_name('again.yaml')
-    assert main(['commission', bag, '--config', str(arm), '--out', str(again)]) == 0
-    np.testing.assert_array_equal(gains_of(again), gains)
-
-
-def test_gains_too_soft_for_any_bound_are_refused(whole, capsys, monkeypatch):
-    """So coarse are the positions, or so weak is the motion: the table shows it.
-
-    A lag of the damping would let this arm bear more.
-    """
-    monkeypatch.setattr(cli_commission, 'LAGS', ())
-    coarsen(whole, '6.0e-4')
-    assert commission(whole, 'plant', '--yes', '--torque', '0.015') == 1
-    told, why = capsys.readouterr()
-    off = re.search(
-        r'too soft for any bound: joint1 would be off by up to (.*) rad', why
-    )
-    assert float(off[1]) > 0.35  # the widest bound; how far, noise decides
-    assert '--torque' in why
-    assert 'as assumed' in told
-    assert nothing_looks_whole(whole)
-
-
 def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):
     """Its soft damping would let it drift on, if the run ended in the middle of a swing."""
     friction = '{coulomb: [1.0, 0.5], stribeck: 0.5, '
@@ -456,21 +353,6 @@ def test_arm_of_which_little_is_known_is_measured_anew_and_its_bag_gives_the_sam
     date = {'commissioning.date': measured.commissioning.date}
     assert change(recomputed, date) == measured
     assert measured.robot.coulomb != ()
-
-
-def test_motion_that_stays_hidden_is_told_after_its_posture(whole, capsys, monkeypatch):
-    """Not once all postures have been measured.
-
-    An arm that swings after a quick move would show it, over the steps of its encoders.
-    """
-    shorten_motions(monkeypatch)
-    coarsen(whole, '5.0e-3')
-    options = ('--yes', '--torque', '0.01', '--travel', '1e-5')
-    assert commission(whole, 'plant', *options, postures=(FAR, NEAR)) == 1
-    told = capsys.readouterr().err
-    assert 'posture 1: the positions do not show the motion' in told
-    assert PlantDriver.last.calls == ['connect', *['start', 'finish'] * 3]
-    assert nothing_looks_whole(whole)
 
 
 PROVEN = """

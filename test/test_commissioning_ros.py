@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import io
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 from elastic_two_link import ARM, NEAR, shorten_motions, shorten_moves
 from rclpy.parameter import Parameter
-from ros_rig import PATIENCE, FakeClock
+from ros_rig import PATIENCE
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.commission_ripple import on_robot
@@ -41,7 +38,6 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
-from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
 
@@ -179,22 +175,6 @@ def test_ripple_is_found_after_the_proof_and_its_bag_gives_the_same(slow):
     assert listed.cycles == cycles
 
 
-def test_ctrl_c_in_the_slow_motion_brings_the_arm_to_rest(slow):
-    motion = slow_motion.slow_motion(slow.commissioning.config)
-    reference = motion.config.reference
-
-    def is_slow():
-        return slow.node.guard.config.reference == reference
-
-    slow.during('move', slow.robot.request_end, is_slow)
-    slow.robot.wait()
-    with pytest.raises(EndedError, match=r'^slow motion: ended on request\. The gains'):
-        slow.robot.slow(motion)
-    assert calm(slow)
-    with pytest.raises(BlfDscError, match='slow motion, which shows torque ripple in'):
-        ripples_by_bags([slow.bags / 'slow_motion'])
-
-
 def test_a_run_goes_on_from_the_torque_that_holds_the_arm(ros, tmp_path):
     """A load that the law knows nothing of does not sag between two runs."""
     loaded = ARM.replace('constant: [0.0, 0.0]', 'constant: [1.0, 0.5]')  # N m
@@ -207,37 +187,6 @@ def test_a_run_goes_on_from_the_torque_that_holds_the_arm(ros, tmp_path):
     np.testing.assert_allclose(before.torque[-1], (1.0, 0.5), atol=0.05)
     np.testing.assert_allclose(after.torque[0], (1.0, 0.5), atol=0.05)
     np.testing.assert_allclose(after.position[100], before.position[-1], atol=2e-3)
-
-
-def test_log_has_oscillations_of_moves_but_not_of_motions_which_shake_the_arm(
-    rig, monkeypatch
-):
-    """Nor an empty warning, where a run begins with fewer than the one before has had."""
-    shorten_motions(monkeypatch)
-    shorten_moves(monkeypatch)
-    said = []
-    silent = SimpleNamespace(warning=said.append, info=str, fatal=str)
-    monkeypatch.setattr(rig.node.log, '_log', silent)
-    monkeypatch.setattr(
-        OscillationCheck, 'text', property(lambda found: f'{found.count} so far')
-    )
-
-    during = []
-
-    def oscillate():
-        during.append(rig.node.guard.config.reference.type)
-        rig.node.guard.oscillation.count += 2
-        rig.node.log.warn_of_findings(rig.node.guard)
-        if len(during) == 1:
-            rig.during('motion', oscillate)
-
-    rig.during('move', oscillate)
-    rig.measured(NEAR)
-    assert during == ['waypoints', 'sinusoids']
-    assert said == ['2 so far']
-    rig.node.log.warns_of_oscillations = True
-    rig.node.log.warn_of_findings(rig.node.begin(rig.commissioning.config, ()))
-    assert said == ['2 so far']
 
 
 def calm(rig):
@@ -362,36 +311,3 @@ def test_parameters_cannot_be_changed_meanwhile(rig):
     (answer,) = rig.node.set_parameters([Parameter('feedback.stiffness', value=2.0)])
     assert not answer.successful
     assert 'an arm is being measured' in answer.reason
-
-
-def test_it_says_who_is_missing(ros, tmp_path, monkeypatch):
-    monkeypatch.setattr(over_ros, '_PATIENCE', 0.5)  # s
-    rig = Rig(ros, tmp_path, clock=FakeClock())  # by which the arm never sends a state
-    ros.kill(rig.arm)
-    with pytest.raises(BlfDscError, match='nobody takes torques on /blf_dsc_contr'):
-        rig.robot.wait()
-    ros.driver()
-    ros.until(lambda: rig.node.is_heard)
-    with pytest.raises(BlfDscError, match='no joint states on /joint_states: start'):
-        rig.robot.wait()
-
-
-@pytest.mark.parametrize(
-    ('options', 'told'),
-    [
-        (['--states', 'franka/joint_states'], 'are for topics: give --ros'),
-        (['--ros', '--robot', '10.0.0.1'], 'leave out one of them'),
-        (['--ros', '--write', 'motion.yaml'], '--write measures nothing'),
-        (['--prove'], 'give --robot or --ros'),
-        (['--ros', '--prove'], 'prove the file that blf_dsc commission has written'),
-        (['--ros'], 'nobody can be asked here'),
-    ],
-)
-def test_options_that_contradict_each_other_are_refused(
-    options, told, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.setattr(sys, 'stdin', io.StringIO())
-    file = tmp_path / 'arm.yaml'
-    file.write_text(ARM)
-    assert main(['commission', '--config', str(file), *options]) == 1
-    assert told in capsys.readouterr().err

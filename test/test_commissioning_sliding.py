@@ -15,7 +15,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import BlfDscError
 
 
 def joint(name, kind, parent, axis, place, limits, effort, mass):
@@ -189,20 +189,6 @@ def test_what_slides_out_has_a_lever():
     # half a turn of the lever more, and what a drive of 300 N holds
     _, chain = robot_of(text.replace('effort="0"', 'effort="300"'))
     assert robot.carried(chain) == pytest.approx(300.0 / (9.81 * 0.6))
-
-
-@pytest.mark.parametrize(
-    ('name', 'value', 'text'),
-    [
-        ('rotor_inertia', 700.0, 'got 700 kg for x, .* its effort allows 600 kg;'),
-        ('coulomb', 700.0, 'got 700 N for x, .* its effort allows 600 N;'),
-        ('viscous', 700.0, 'got 700 N s/m for x, .* its effort allows 600 N s/m;'),
-    ],
-)
-def test_what_no_drive_that_slides_could_move(name, value, text):
-    given = {'robot.urdf': GANTRY, f'robot.{name}': [value, 1.0, 1.0]}
-    with pytest.raises(ConfigurationError, match=text):
-        build(ControllerConfig, given)
 
 
 def test_postures_of_a_joint_that_slides_may_be_2_cm_from_its_limits():

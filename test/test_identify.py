@@ -7,7 +7,6 @@ import base64
 import os
 import re
 import tracemalloc
-from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -36,7 +35,6 @@ from test_analysis_report import amount, lightened, pixels
 
 from blf_dsc_controller.analysis.panels import COLOURS, INK, ORANGE
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.friction import fading, fadings, sliding, slidings
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import read_chain
@@ -51,21 +49,17 @@ from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.identification.identify import STAGES, identify_arm
 from blf_dsc_controller.identification.physical import Cone, solve
-from blf_dsc_controller.identification.prior import Prior, prior_of
-from blf_dsc_controller.identification.problem import problem_of
+from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.problems import problems_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import (
     Recording,
-    evenly_interpolated,
-    interpolated,
     joined,
 )
 from blf_dsc_controller.identification.regression import regression
-from blf_dsc_controller.identification.scoring import nearest_friction
-from blf_dsc_controller.identification.sliding import COULOMB_SPEED, sliding_direction
-from blf_dsc_controller.identification.values import COULOMB, base_matrix, parts
-from blf_dsc_controller.identification.windows import rows_of, split
+from blf_dsc_controller.identification.sliding import sliding_direction
+from blf_dsc_controller.identification.values import base_matrix
+from blf_dsc_controller.identification.windows import rows_of
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT)
@@ -545,20 +539,6 @@ def test_gains_turn_currents_into_torques(plain, simple, tmp_path):
         identify_bag(bag, AT_TIP, gains=(1.0, 2.0))
 
 
-@pytest.mark.parametrize('term', ['load', 'coupling'])
-def test_coupling_and_load_friction_that_would_drive_are_not_identified(plain, term):
-    """Negative ones reduce the error, too, but friction does not drive."""
-    states = plain.copy()
-    gravity = gravity_of(TRUTH.inertias, plain[:, 0])
-    if term == 'load':
-        states[:, 2, :2] -= 0.05 * (np.abs(gravity) * np.sign(states[:, 1]))[:, :2]
-    else:
-        states[:, 2, 5:] -= 0.3 * states[:, 1, [6, 5]]
-    found = identified(states)
-    assert not found.parts.terms[3, :2].any()
-    assert not found.parts.coupling.any()
-
-
 UNIT = np.array([pseudo_inertia(e) for e in np.eye(10)])  # E_a of sum_a ten_a E_a
 
 
@@ -586,21 +566,6 @@ def test_rows_hold_for_an_exact_motion(period, tolerance):
     assert (np.abs(residual[inner]) < tolerance * scale).all()
     # No window contains the gap.
     assert np.abs(rows.time - t[len(t) // 2]).min() >= 0.1
-
-
-def test_solution_from_that_of_another_problem_is_the_same(plain):
-    problem = problem_of(
-        recording_of(measured(plain, 3)), AT_TIP, 'torque', None, find_signs=False
-    )
-    rows, fit = problem.rows, problem.windows.fit
-    late = rows.with_sliding(np.full(7, 3e-3))
-    other = regression(late, fit, problem.G, problem.prior)
-    alone = regression(rows, fit, problem.G, problem.prior)
-    assert np.abs(other.deviation / alone.deviation - 1.0).max() > 0.5
-    near = regression(rows, fit, problem.G, problem.prior, other)
-    np.testing.assert_allclose(near.deviation, alone.deviation, rtol=1e-4)
-    torques = rows.torques(fit, (near.theta - alone.theta)[:-1])
-    assert (np.abs(torques) < 1e-3 * alone.deviation).all()
 
 
 def test_memory_of_identification_does_not_grow_with_the_recording():
@@ -647,78 +612,6 @@ def test_nearest_physical_body_is_found():
     far = [Cone(k, np.array([[1e3]]), np.array([[[1.0]]])) for k in range(3)]
     expected = np.linalg.solve(A.T @ A + np.eye(3), A.T @ b)
     np.testing.assert_allclose(solve(A, b, far, np.zeros(3)), expected, atol=1e-3)
-
-
-@pytest.mark.parametrize('scale', [1e3, 1e5, 1e7])
-def test_body_is_found_to_the_digits_that_the_objective_has(scale):
-    """At 1e7, no step of Newton's method lowered it by what a double can show."""
-    target = np.diag([1.0, 2.0, -1.0, 3.0])
-    A, b = scale * UNIT.reshape(10, 16).T, scale * target.ravel()
-    z = solve(A, b, [Cone(0, np.zeros((4, 4)), UNIT)], inertia_of(np.eye(4)))
-    expected = np.diag([1.0, 2.0, 0.0, 3.0])
-    np.testing.assert_allclose(pseudo_inertia(z), expected, atol=2e-3)
-
-
-def test_what_data_would_put_on_a_bound_stays_inside():
-    """The maximum of s exp(-s^2 / 2 d^2), for a deviation d, is at s = d."""
-    deviation = 0.3
-    A = np.array([[np.sqrt(deviation**-2 - 1.0)]])  # |z|^2 / 2 is a part of it
-    positive = Cone(0, np.zeros((1, 1)), np.ones((1, 1, 1)))
-    for power, expected in ((1.0, deviation), (0.0, 0.0)):
-        cones = [positive._replace(power=power)]
-        s = solve(A, np.zeros(1), cones, np.ones(1))
-        assert s == pytest.approx(expected, rel=0.01, abs=0.05 * deviation)
-    prior = prior_of(ROBOT, ROBOT.chain(PANDA), *np.ones((2, 7)), load=False)
-    wider = prior.widened(np.full(prior.mean.size, 3.0))
-    assert [cone.power for cone in wider.cones if len(cone.J0) == 4] == [1.0] * 7
-
-
-def test_friction_of_a_urdf_is_the_nearest_that_changes_its_sign_at_once():
-    """Of contacts that yield over 3 mrad, and so build up their friction late."""
-    h = 0.002
-    t = np.arange(0.0, 10.0, h)[:, None]
-    q = 0.1 * np.sin(np.array([3.0, 4.0]) * t)
-    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
-    chain = Robot(urdf=urdf).chain(('joint1', 'joint2'))
-    model = base_parameters(chain, GRAVITY).model
-    gap = np.zeros(len(t), dtype=bool)
-    rows = rows_of(Recording(('joint1', 'joint2'), h, q, q, gap, ''), model)
-    rows = rows.with_sliding(np.array([0.0, 3e-3]))
-    windows = split(rows)
-    values = np.zeros(17 * 2 + 14)
-    parts(values).terms[COULOMB] = 1.0
-    viscous, coulomb = nearest_friction(rows, windows, values)
-    np.testing.assert_allclose((viscous[0], coulomb[0]), (0.0, 1.0), atol=1e-9)
-    assert 0.5 < coulomb[1] < 0.98
-    fit = windows.fit
-    own = {name: column[fit, 1] for name, column in rows.columns.items()}
-    columns = own['viscous'], rows.sliding_at_once()[fit, 1]
-    left = own['Coulomb'] - viscous[1] * columns[0] - coulomb[1] * columns[1]
-    weight = rows.weight[fit, 1] ** 2
-    assert abs(left @ (weight * columns[1])) < 1e-6 * weight.sum()
-
-
-@pytest.mark.parametrize('size', [1, 2, 9])
-def test_even_interpolation_is_that_of_numpy(size):
-    values = np.random.default_rng(size).normal(size=(size, 3))
-    at = np.linspace(-2.0, size + 1.0, 50)
-    expected = interpolated(at, np.arange(size), values)
-    found = evenly_interpolated(at, values)
-    np.testing.assert_allclose(found, expected, atol=1e-14)
-
-
-def test_search_begins_inside_all_cones():
-    """With a link whose inertia in the URDF is that of no body, too: J < 0 along an axis."""
-    joints = list(PANDA_CHAIN.joints)
-    inertia = joints[2].inertia.copy()
-    inertia[4:] *= -0.5
-    joints[2] = joints[2]._replace(inertia=inertia)
-    for chain in (PANDA_CHAIN, replace(PANDA_CHAIN, joints=joints)):
-        found = prior_of(ROBOT, chain, np.full(7, 80.0), np.ones(7), load=True)
-        for cone in found.cones:
-            own = found.start[cone.entries]
-            J = cone.J0 + np.tensordot(own, cone.E, 1)
-            assert np.linalg.eigvalsh(J)[0] > 0.0
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -788,26 +681,6 @@ def test_sliding_direction_solves_the_equation_of_dahl():
     found = sliding_direction(q[:, None], speed(t)[:, None], np.array([distance]))
     np.testing.assert_allclose(found[:, 0], exact, atol=2e-3)
     assert np.ptp(found[4000:]) == 0.0  # at rest it stays
-
-
-def test_shapes_of_friction_are_those_of_the_law_over_arrays():
-    """Gaussian and exponential Stribeck friction; as numpy's to the last digits."""
-    v = np.linspace(-0.5, 0.5, 151)[:, None] * [1.0, 0.1]
-    np.testing.assert_allclose(slidings(v, 0.02), np.tanh(v / 0.02), rtol=1e-14)
-    np.testing.assert_allclose(fadings(v, 0.1), np.exp(-((v / 0.1) ** 2)), rtol=1e-13)
-    assert slidings(v, 0.02)[7, 1] == sliding(v[7, 1], 0.02)
-    assert fadings(v, 0.1)[7, 1] == fading(v[7, 1], 0.1)
-    q = np.cumsum(v[:, :1] * [1.0, 2.0], axis=0)
-    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
-    chain = Robot(urdf=urdf).chain(('joint1', 'joint2'))
-    gap = np.zeros(len(v), dtype=bool)
-    recording = Recording(('joint1', 'joint2'), 0.01, 0.01 * q, q, gap, '')
-    rows = rows_of(recording, base_parameters(chain, GRAVITY).model)
-    dq = np.asarray(rows.dq)
-    for exponent in (2.0, 1.0):
-        shape = np.tanh(dq / COULOMB_SPEED) * np.exp(-(np.abs(dq / 0.2) ** exponent))
-        expected = rows.over_windows(lambda at, shape=shape: shape[at], rows.g)
-        np.testing.assert_allclose(rows.stribeck(0.2, exponent), expected, atol=1e-12)
 
 
 def test_contacts_that_yield_at_reversals_are_found(plain):

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,22 +24,11 @@ from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification import signs as signs_module
 from blf_dsc_controller.identification.identify import identify_arm
-from blf_dsc_controller.identification.joint_alone import _Fit, _sign, errors_alone
-from blf_dsc_controller.identification.left_out import transmitted_torques
 from blf_dsc_controller.identification.mounting import gravity_columns
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.problems import is_usable, problems_of
-from blf_dsc_controller.identification.regression import correlation_length
 from blf_dsc_controller.identification.summary import notes_of
-from blf_dsc_controller.identification.values import (
-    COULOMB,
-    OFFSET,
-    ROTOR_INERTIA,
-    VISCOUS,
-    parts,
-)
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
 TRUTH = truth_of(PANDA_CHAIN, 1)
@@ -195,13 +183,6 @@ def test_rows_with_clipped_torques_are_left_out_and_said(wide):
     assert not any('is clipped' in note for note in notes_of(plain))
 
 
-def test_torques_that_are_recorded_in_steps_are_not_clipped(wide):
-    torque = wide[:, TORQUE]
-    step = 0.02 * np.abs(torque).max(axis=0)
-    states = with_torque(wide, step * np.round(torque / step))
-    assert not problem(states).rows.clipped.any()
-
-
 def test_joint_whose_effort_has_another_unit_than_the_others_is_named(wide):
     states = wide * np.ones(7)
     states[:, TORQUE, 3] *= 0.2
@@ -209,90 +190,3 @@ def test_joint_whose_effort_has_another_unit_than_the_others_is_named(wide):
     named = [line for line in problems_of(found, 'torque') if 'DOES NOT FIT' in line]
     assert any(line.startswith(PANDA[3]) for line in named)
     assert not is_usable(found)
-
-
-@pytest.mark.parametrize(
-    ('viscous', 'coulomb', 'sign'),
-    [(2.0, 1.0, 1.0), (-2.0, -1.0, -1.0), (-2.0, 1.0, 0.0), (2.0, -1.0, 0.0)],
-)
-def test_friction_shows_a_sign_only_if_both_of_its_parts_agree(viscous, coulomb, sign):
-    """Each value is known to 1e-3, with residuals of one sample."""
-    z = np.array([viscous, coulomb, 0.0])
-    fit = _Fit(np.ones(3), z, 1e3 * np.eye(3), 1.0, 1.0, 1.0)
-    assert _sign(fit, [0, 1], 1.0) == sign
-
-
-@pytest.mark.parametrize(
-    ('residual', 'length', 'sign'),
-    [(100.0, 1.0, 1.0), (300.0, 1.0, 0.0), (100.0, 16.0, 0.0)],
-)
-def test_friction_shows_a_sign_if_it_is_five_deviations_long(residual, length, sign):
-    """Of 1; its deviation is 1e-3 of the residual, times the root of the length."""
-    z = np.array([2.0, 1.0, 0.0])
-    fit = _Fit(np.ones(3), z, 1e3 * np.eye(3), 1.0, residual, 1.0)
-    assert _sign(fit, [0, 1], length) == sign
-
-
-def test_errors_of_joints_alone_are_what_their_values_and_delays_leave():
-    random = np.random.default_rng(4)
-    X, rate = random.normal(size=(9, 2, 3)), random.normal(size=(9, 2))
-    values, left = random.normal(size=(2, 4)), random.normal(size=(9, 2))
-    u = np.einsum('kia,ia->ki', X, values[:, :3]) - rate * values[:, 3] - left
-    rows = SimpleNamespace(
-        u_and_rate=lambda _: (u, rate),
-        blocks=lambda _: [slice(0, 2), slice(2, 5)],
-        matrix=lambda windows: X[windows],
-        rms=lambda values, _: np.sqrt(np.mean(values**2, axis=0)),
-    )
-    test = np.array([1, 2, 4, 5, 8])
-    found = errors_alone(rows, test, SimpleNamespace(values=values))
-    np.testing.assert_allclose(found, np.sqrt(np.mean(left[test] ** 2, axis=0)))
-
-
-@pytest.mark.parametrize(
-    ('residual', 'length'),
-    [
-        ([0.0, 0.0, 0.0, 0.0], 1.0),  # an exact fit
-        ([1.0, 1.0, 1.0, 1.0], 1.0 + 2.0 * (3.0 + 2.0 + 1.0) / 4.0),
-        ([1.0, -1.0, 1.0, -1.0], 1.0),
-        ([1.0, 1.0, -1.0, -1.0], 1.0 + 2.0 * 1.0 / 4.0),
-    ],
-)
-def test_residuals_count_as_long_as_they_are_alike(residual, length):
-    assert correlation_length(np.array(residual)) == pytest.approx(length)
-
-
-@pytest.mark.parametrize(('recorded', 'chosen'), [(1.01, 1.0), (1.03, -1.0)])
-def test_reversed_signs_must_explain_the_torques_by_two_percent_better(
-    recorded, chosen, monkeypatch
-):
-    class Fit:
-        def __init__(self, *_):
-            pass
-
-        def bounds(self, signs):
-            return np.array([self.cost(each) for each in signs])
-
-        def cost(self, signs):
-            return 1.0 if signs[0] < 0.0 and signs[1] > 0.0 else recorded
-
-    monkeypatch.setattr(signs_module, '_Fit', Fit)
-    alone = SimpleNamespace(friction=np.zeros(2))
-    signs, _ = signs_module.likely_signs(alone, None, None)
-    np.testing.assert_array_equal(signs, [chosen, 1.0])
-
-
-def test_link_gets_the_torque_without_rotor_friction_and_offset():
-    """Of one joint, 3 + 4 t, in straight lines, which smoothing leaves as they are."""
-    h = 1e-3
-    t = h * np.arange(300)[:, np.newaxis]
-    dq, s = 1.0 + 2.0 * t, np.ones_like(t)
-    link = 3.0 + 4.0 * t
-    torque = link + 0.1 * 2.0 + 0.5 * dq + 0.7 * s + 0.2
-    values = np.zeros(31)
-    terms = parts(values).terms
-    terms[[ROTOR_INERTIA, VISCOUS, COULOMB, OFFSET]] = [[0.1], [0.5], [0.7], [0.2]]
-    rows = SimpleNamespace(period=h, q=t, dq=dq, torque=torque, sliding=s)
-    found = np.array(transmitted_torques(rows, values))
-    np.testing.assert_allclose(found[:, :1], link, atol=1e-9)
-    np.testing.assert_allclose(found[:, 1:], 4.0, atol=1e-6)

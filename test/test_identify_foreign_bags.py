@@ -193,35 +193,6 @@ def test_stand_ins_and_torques_that_nobody_recorded_are_missing_in_bags(tmp_path
     assert not recording.gap[:190].any()
 
 
-@pytest.mark.parametrize('form', FORMATS)
-def test_torques_that_are_none_are_refused_in_bags(tmp_path, form):
-    constant, unknown = TAU.copy(), TAU.copy()
-    constant[:, 3] = 1.5
-    unknown[:, 3] = np.nan
-    for k, (torque, said) in enumerate(
-        (
-            (constant, 'the effort of panda_joint4: 1.5 in all rows'),
-            (unknown, 'the effort of panda_joint4 has no numbers'),
-            (Q, 'the effort of panda_joint1 is the position of panda_joint1'),
-        )
-    ):
-        message = refused(states_bag(tmp_path / f'{k}', Q, torque, form))
-        assert said in message
-        assert '--effort command' in message
-
-
-def test_joints_in_two_messages_are_checked_each(tmp_path):
-    first, second = messages(PANDA[:4], TIME), list(messages(PANDA[4:], TIME))
-    encoder = JointStateEncoder(PANDA[4:])
-    for k in (100, 101):
-        stamp, _ = second[k]
-        bad = np.array([-9999.0, 0.0, 0.0])
-        second[k] = stamp, bytes(encoder.encode(stamp, bad, np.zeros(3), np.ones(3)))
-    recording = read_recording(written(tmp_path / 'bag', first, second), PANDA_TEXT)
-    assert 'the position of panda_joint5 is -9999 in 2 row(s)' in recording.source
-    is_the_motion(recording, 2e-3)
-
-
 @pytest.mark.parametrize('others', [(), ('fer_finger_joint1', 'fer_finger_joint2')])
 def test_joints_with_another_prefix_are_told_what_to_type(tmp_path, others):
     """Every joint needs its name, as those of a Panda, which is called fer now."""
@@ -241,42 +212,6 @@ def test_joints_with_another_prefix_are_told_what_to_type(tmp_path, others):
         bag, PANDA_TEXT, names=NameMap.parse(typed.split(' --map '))
     )
     is_the_motion(recording, 1e-6)
-
-
-def test_torques_of_bags_may_have_another_unit(tmp_path):
-    bag = states_bag(tmp_path / 'bag', Q, 1e3 * TAU)
-    found = read_recording(bag, PANDA_TEXT, names=NameMap.parse(['tau=[Nmm]']))
-    np.testing.assert_allclose(found.torque[:390], TAU[:390], atol=1e-6)
-    assert not found.currents
-    found = read_recording(bag, PANDA_TEXT, names=NameMap.parse(['tau=[mA]']))
-    assert found.currents
-    assert "the unit 'ounce' of tau is not known" in refused(bag, 'tau=[ounce]')
-    assert 'q is neither a topic nor one of the joints' in refused(bag, 'q=position')
-
-
-def test_joints_that_are_missing_are_named_still(tmp_path):
-    bag = written(
-        tmp_path / 'bag', messages(PANDA[:4], TIME), messages(PANDA[5:], TIME)
-    )
-    with pytest.raises(BlfDscError, match='no message has panda_joint5'):
-        read_recording(bag, PANDA_TEXT)
-
-
-@pytest.mark.parametrize('files', [1, 2])
-def test_database_without_metadata_is_read_if_it_is_one_file(tmp_path, files):
-    path = tmp_path / 'bag'
-    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag:
-        topic = bag.add_connection('/joint_states', JOINT_STATE, typestore=typestore())
-        for received, raw in messages(PANDA, TIME):
-            bag.write(topic, received, raw)
-    (path / 'metadata.yaml').unlink()
-    (database,) = path.glob('*.db3')
-    if files == 1:
-        is_the_motion(read_recording(path, PANDA_TEXT), 1e-6)
-        return
-    (path / 'other.db3').write_bytes(database.read_bytes())
-    with pytest.raises(BlfDscError, match=r'give one of its 2 files, as .*bag\.db3'):
-        read_recording(path, PANDA_TEXT)
 
 
 def foreign_mcap(path, encoding, profile):

@@ -104,17 +104,3 @@ def test_load_of_the_whole_recording_is_none_that_changes():
         7,
         33,
     )
-
-
-@pytest.mark.parametrize(
-    ('carried', 'words'),
-    [
-        (Carried(2.0), 'from 2.0 s on'),
-        (Carried(2.0, 3.5), 'from 2.0 to 3.5 s'),
-        (Carried(end=3.5), 'until 3.5 s'),
-    ],
-)
-def test_times_of_a_load_in_words(carried, words):
-    assert carried.when == words
-    at = carried.at(np.array([1.0, 3.0, 4.0]))
-    assert at.tolist() == [carried.begin < 0.0, True, np.isinf(carried.end)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,11 +19,8 @@ from blf_dsc_controller.identification.recording import resampled
 from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.ripple import (
     NOTHING,
-    Ripple,
-    Ripples,
     listed_cycles,
 )
-from blf_dsc_controller.identification.summary import ripple_table
 from blf_dsc_controller.simulation.loop import simulate
 from sim_plant.plant import plant_of
 
@@ -168,49 +164,3 @@ def test_motion_that_repeats_is_told():
 def test_an_arm_that_hardly_moves_shows_no_ripple():
     found, _ = found_in([[30.0]], reach=0.02)
     assert found == (NOTHING,) * 6
-
-
-def test_a_list_has_what_disturbs_most_once():
-    def joint(*found, seen=5.0):
-        return Ripples(found, (seen, 200.0), 0.1, 0.5)
-
-    a = Ripple(29.97, 0.02, 1.2, 0.02)
-    same = Ripple(30.06, 0.05, 1.1, 0.02)
-    weak = Ripple(60.0, 0.1, 0.3, 0.02)
-    weakest = Ripple(101.0, 0.2, 0.1, 0.02)
-    other = Ripple(12.5, 0.02, 0.6, 0.02)
-    joints = [joint(weak, a), joint(same), joint(weakest), NOTHING, joint(other)]
-    assert listed_cycles(joints) == (30.0, 12.5, 60.0)
-    assert listed_cycles([NOTHING]) == ()
-
-
-def test_the_table_has_units_and_the_line_to_paste():
-    joints = [
-        SimpleNamespace(name='turns', kind='revolute'),
-        SimpleNamespace(name='slides', kind='prismatic'),
-        SimpleNamespace(name='quiet', kind='revolute'),
-        SimpleNamespace(name='rests', kind='revolute'),
-    ]
-    ripples = (
-        Ripples((Ripple(29.98, 0.05, 1.2, 0.02),), (5.0, 200.0), 0.1, 0.5),
-        Ripples((Ripple(250.0, 0.1, 3.0, 0.5),), (50.0, 300.0), 0.1, 3.0),
-        Ripples((), (5.0, 180.0), 0.123, 0.5),
-        NOTHING,
-    )
-    arm = SimpleNamespace(chain=SimpleNamespace(joints=joints), ripples=ripples)
-    (text,) = ripple_table(arm)
-    # a motion that repeats has one line more
-    arm.ripples = (ripples[0]._replace(repeats=True), *ripples[1:])
-    (warned,) = ripple_table(arm)
-    first, last = warned.rsplit('\n', 1)
-    assert first == text
-    assert last.startswith('the motion repeats, ')
-    lines = [' '.join(line.split()) for line in text.splitlines()]
-    assert lines[1:] == [
-        'turns 1.2 +- 0.039 N m at 29.98 +- 0.098',
-        'slides 3 +- 0.98 N at 250 +- 0.2 rad/m',
-        'quiet none above 0.12 N m at 5 to 180',
-        'rests cannot be known: the joint moved too little',
-        'the controller learns to compensate it with this parameter:',
-        'learning.ripple_cycles: [30.0, 250.0]',
-    ]

@@ -25,15 +25,11 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_table import read_table
-from blf_dsc_controller.identification.identify import identify_arm
-from blf_dsc_controller.identification.parameters import robot_parameters
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import joined, resampled
 from blf_dsc_controller.identification.stiffness import compliance_of
-from blf_dsc_controller.identification.summary import notes_of, stiffness_table
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
@@ -128,25 +124,6 @@ def test_what_else_moves_the_encoders_does_not_change_the_stiffness(motion, what
     assert holds_the_truth(found, 1.7)
 
 
-def test_twist_that_encoders_do_not_show_is_not_known_but_bounded(motion):
-    """Steps of 25 mrad, and a twist of 1 mrad or less."""
-    twist = 0.3 * motion.link / STIFFNESS
-    assert twist.std(axis=0).max() < 0.05 * BITS[8]
-    found = motion.compliance(twist, bits=8)
-    value, least, most = found.stiffness
-    assert np.isinf(most[~found.is_known]).all()
-    assert (~found.is_known).sum() >= N - 1  # one in twenty may be known by chance
-    assert (least < STIFFNESS / 0.3).all()
-    assert (least > 0.0).all()
-    assert (value >= least).all()
-
-
-def test_exchanged_computed_and_undivided_positions_are_told(motion):
-    twist = motion.link / STIFFNESS
-    assert motion.compliance(-twist).is_negative.all()
-    assert not motion.compliance(99.0 * motion.q).is_twist  # of a gear of 1:100
-
-
 # Recordings.
 
 
@@ -192,19 +169,6 @@ def test_positions_of_motors_in_tables_are_found(tmp_path, motion, motors, entri
     np.testing.assert_allclose(
         recording.q[:590], motion.q[: 590 * EVERY : EVERY], atol=1e-9
     )
-
-
-def test_tables_without_both_positions_have_no_twist(tmp_path, motion):
-    only = table(tmp_path / 'a.csv', motion, [('motor_position_{}', 'theta'), TORQUES])
-    recording = read_table(only, PANDA_TEXT, PANDA)
-    assert recording.twist is None
-    np.testing.assert_allclose(recording.q[:1], motion.q[:1] + 0.001, atol=1e-9)
-    rates = table(
-        tmp_path / 'b.csv', motion, [LINKS, TORQUES, ('theta_dot_{}', 'dtheta')]
-    )
-    assert read_table(rates, PANDA_TEXT, PANDA).twist is None
-    with pytest.raises(BlfDscError, match=r'7 positions .* and 1 of motors'):
-        read_table(only, PANDA_TEXT, PANDA, NameMap.parse(['theta=t']))
 
 
 def write_both(path, motion, twist, names=PANDA):
@@ -287,11 +251,6 @@ def test_motors_that_move_as_their_links_show_no_stiffness(motion):
     assert (found.largest == 0.0).all()
 
 
-def test_motor_states_of_other_joints_are_left_alone(tmp_path, motion):
-    write_both(tmp_path / 'bag', motion, lambda _: 0.0, tuple('abcdefg'))
-    assert read_recording(tmp_path / 'bag', PANDA_TEXT, PANDA).twist is None
-
-
 # What the command says.
 
 
@@ -324,43 +283,3 @@ def test_command_prints_the_stiffness_and_writes_it_for_the_controller(whole, ca
     written = yaml.safe_load((whole / 'arm.yaml').read_text())['/**']
     found = written['ros__parameters']['robot.joint_stiffness']
     np.testing.assert_allclose(found, STIFFNESS, rtol=0.02)
-
-
-def test_what_is_wrong_with_positions_of_motors_is_said(whole):
-    """What is said if positions of motors are exchanged, not divided, computed, or unknown."""
-    recording = read_table(whole / 'a.npz', PANDA_TEXT, PANDA)
-    found = identify_arm(recording, ROBOT)
-    known = found.compliance
-    ones = np.ones(N)
-    faults = {
-        'are the positions of motors (theta) and links (q) exchanged': known._replace(
-            value=-known.value
-        ),
-        'divided by the ratios of their gears': known._replace(largest=99.0 * ones),
-        'the robot computes one position from the other': known._replace(
-            left=0.0 * ones
-        ),
-    }
-    equal = known._replace(value=0.0 * ones, deviation=0.0 * ones, largest=0.0 * ones)
-    faults['have the same positions'] = equal
-    unknown = known._replace(deviation=known.value)
-    nothing = known._replace(deviation=np.inf * ones)
-    for words, compliance in {**faults, '': unknown}.items():
-        notes = list(notes_of(found._replace(compliance=compliance)))
-        for each in faults:
-            assert any(each in note for note in notes) == (each == words)
-    assert not list(stiffness_table(found._replace(compliance=None)))
-    assert not list(
-        stiffness_table(found._replace(compliance=known._replace(largest=99.0 * ones)))
-    )
-    (text,) = stiffness_table(found._replace(compliance=unknown))
-    assert text.count('cannot be known: above ') == N
-    for compliance in (nothing, equal):
-        (text,) = stiffness_table(found._replace(compliance=compliance))
-        assert text.count('cannot be known') == N
-        assert 'above' not in text
-    one = unknown.deviation * (np.arange(N) == 3) + known.deviation
-    for compliance in (known._replace(deviation=one), None):
-        other = found._replace(compliance=compliance)
-        written = robot_parameters(other, ROBOT, whole / 'new.urdf')
-        assert 'robot.joint_stiffness' not in written

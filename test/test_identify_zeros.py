@@ -17,12 +17,9 @@ from random_arm import (
     truth_of,
 )
 
-from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification import conventions
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import is_usable, problems_of
-from blf_dsc_controller.identification.windows import rows_of
 
 # By the number of joints: the whole Panda, and the four whose links have most of the weight.
 # Beyond these, it is one body, and all is found in a fifth of the CPU time.
@@ -109,28 +106,6 @@ def test_a_last_joint_that_counts_the_other_way_is_named():
     (problem,) = problems_of(found, 'torque')
     assert problem.startswith('OTHER DIRECTIONS:')
     assert 'positions and efforts are negated of panda_joint7.' in problem
-
-
-def test_friction_explains_the_torques_of_its_own_windows(monkeypatch):
-    recording, robot = recorded(states_of(7)), ROBOTS[7]
-    chain = robot.chain(recording.joints)
-    rows = rows_of(recording, base_parameters(chain, robot.gravity).model)
-    seen = []
-    monkeypatch.setattr(conventions, '_POSTURES', 20)  # one in several windows
-
-    def keep(*given):
-        seen.append(given)
-        raise LookupError
-
-    monkeypatch.setattr(conventions, '_Gravity', keep)
-    with pytest.raises(LookupError):
-        conventions.likely_conventions(recording, robot, ())
-    ((_, _, _, u, friction),) = seen
-    assert len(u) >= 20
-    for own, columns in zip(u, friction, strict=True):
-        (k,) = np.flatnonzero((rows.u(0.0) == own).all(axis=1))
-        for column in columns:
-            assert (rows.friction([k])[0] == column).all(axis=1).any()
 
 
 def test_right_joints_are_not_doubted():

@@ -69,20 +69,6 @@ def rig_of(urdf=ENDLESS, wrap=None, start=START, **law):
 # Positions that wrap.
 
 
-@pytest.mark.parametrize(
-    ('turns', 'counted'), [(1, True), (-1, True), (1001, False), (-1001, False)]
-)
-def test_a_position_more_than_a_thousand_turns_away_is_no_wrap(turns, counted):
-    """It is no position: counted on, it would hide what the sensor says."""
-    wraps = Wraps(build(ControllerConfig, {**ARM, **SWING}))
-    rest = np.zeros(6)
-    wraps.count(rest, 0.0, 3.0)
-    away = rest + np.array([turns * tau, 0.0, 0.0, 0.0, 0.0, 0.0])
-    got, fault = wraps.count(away, 1e-3, 3.0)
-    assert fault is None
-    assert got[0] == pytest.approx(0.0 if counted else turns * tau, abs=1e-9)
-
-
 @pytest.mark.parametrize('lost', [np.nan, np.inf])
 def test_a_turn_is_counted_across_a_state_whose_position_is_lost(lost):
     wraps = Wraps(build(ControllerConfig, {**ARM, **SWING}))
@@ -165,14 +151,6 @@ def test_positions_are_believed_at_the_next_start_after_a_wrap():
         rig.step(500)
         assert rig.supervisor.running, rig.supervisor.text
         assert rig.guard.controller.signals.q[0] == pytest.approx(3.0 - tau, abs=0.01)
-
-
-def test_jump_that_is_no_turn_is_no_wrap():
-    rig = rig_of(BOUNDED, start={'initial.position': [3.0, -2.9]})
-    rig.step(10)
-    rig.sense = lambda state: [state.raw(q=state.q - [5.0, 0.0])]
-    rig.step()
-    assert rig.supervisor.reason is Reason.OUTSIDE_BOUND
 
 
 def test_watchdog_sees_no_wrap_in_its_differenced_velocities():
@@ -381,24 +359,4 @@ def test_configured_reference_begins_where_the_arm_is(reference):
     assert (
         'shifted by whole turns: joint1 by +1; joint2 by -1'
         in rig.guard.reference.turned
-    )
-
-
-def test_loop_of_ones_own_says_once_that_it_goes_the_short_way(caplog):
-    config = build(ControllerConfig, ARM | SWING)
-    plant = plant_of(build(PlantConfig, {**START, 'robot.urdf': ENDLESS}))
-    controller = blf.ArmController(config)
-
-    def run(first, count):
-        for k in range(first, first + count):
-            q, dq, effort = plant.measure().reshape(3, -1)
-            plant.step(controller.update(1e-3 * k, q, dq, effort))
-
-    run(0, 10)
-    for k in range(2):
-        controller.follow([TrajectoryPoint(1.0, tuple(within_a_turn([3.4, -2.9])))])
-        run(10 + 10 * k, 10)
-    (line,) = [each.getMessage() for each in caplog.records]
-    assert line.startswith(
-        'a motion goes the short way, shifted by whole turns: joint1'
     )
