@@ -41,7 +41,6 @@ from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.planned import measuring_gains, plan
 from blf_dsc_controller.commissioning.response import (
     Response,
-    reciprocal,
     refined,
     response_of,
 )
@@ -155,19 +154,6 @@ def test_a_joint_that_hardly_moves_the_tool_stays_within_its_limits(slides):
     assert (q >= config.limits.position_lower).all()
     # a fifth of the way is left for errors, and the last step of getting smaller is 5 % or less
     assert 0.036 < (q[:, 5] - posture[5]).max() < 0.0401
-
-
-@pytest.mark.parametrize('motion', [planned, sliding])
-def test_lines_belong_to_one_joint_each_and_are_known_from_the_configuration(motion):
-    made = motion().excitation
-    lines = lines_in(motion().config)
-    np.testing.assert_array_equal(lines.bins, made.bins)
-    assert lines.period == pytest.approx(made.period)
-    assert np.unique(made.bins).size == made.bins.size
-    assert not np.isin(made.slow, made.bins).any()
-    np.testing.assert_array_equal(lines.slow, made.slow)
-    # all together within 1 / period of each other
-    assert np.ptp(made.bins, axis=0).max() == 1
 
 
 def test_responses_are_those_of_the_linear_arm():
@@ -306,61 +292,6 @@ def lines_of(stiffness, noise):
         speed=np.zeros(2),
         friction=np.zeros(2),
     )
-
-
-def cross_lines(*, asymmetry=0.0):
-    """Return a response whose joint 2 is moved with a hundredth of the torque, and the true G.
-
-    G_12 is larger than G_21 by a share of `asymmetry`.
-    """
-    true = lines_of(
-        lambda f: -np.array([[5.0, 1.0], [1.0, 2.0]]) * f[:, None, None] ** 2, 0
-    )
-    G = true.position * [[1.0, 1.0 + asymmetry], [1.0, 1.0]]
-    columns = np.tile([1.0, 100.0], (len(G), 1))
-    rows = 1e-6 * np.ones((len(G), 2))
-    deviation = rows[:, :, None] * columns[:, None, :]
-    random = np.random.default_rng(5)
-    noise = random.normal(0.0, np.sqrt(0.5), (2, *G.shape)) * deviation
-    noisy = true._replace(
-        position=G + noise[0] + 1j * noise[1],
-        position_noise=rows,
-        velocity_noise=1e3 * rows,
-        columns=columns,
-    )
-    return noisy, G
-
-
-def test_weakly_moved_joint_says_by_the_other_one_how_it_moves_a_strong_one():
-    """At low frequencies, where G is symmetric."""
-    noisy, G = cross_lines()
-    mean = reciprocal(noisy)
-    low = noisy.frequency <= 12.0
-    across, back = np.abs(noisy.position - G)[low, 0, 1], (mean.position - G)[low]
-    assert across.mean() > 10.0 * np.abs(back[:, 0, 1]).mean()
-    np.testing.assert_allclose(back[:, 0, 1], back[:, 1, 0], atol=1e-12)
-    assert mean.shared[low].tolist() == [[[False, True], [True, False]]] * 3
-    (before, _), (after, _) = noisy.deviations(), mean.deviations()
-    np.testing.assert_allclose(after[low, 0, 1], before[low, 1, 0], rtol=1e-3)
-    for each in (mean.position, mean.velocity):  # and its own response is as it was
-        np.testing.assert_array_equal(
-            np.diagonal(each, axis1=1, axis2=2),
-            np.diagonal(
-                noisy.position if each is mean.position else noisy.velocity,
-                axis1=1,
-                axis2=2,
-            ),
-        )
-    np.testing.assert_array_equal(mean.position[~low], noisy.position[~low])
-    assert not mean.shared[~low].any()
-    np.testing.assert_array_equal(after[~low], before[~low])
-
-
-def test_responses_that_differ_by_more_than_noise_stay_as_they_were_measured():
-    noisy, _ = cross_lines(asymmetry=3.0)
-    kept = reciprocal(noisy)
-    np.testing.assert_array_equal(kept.position, noisy.position)
-    assert not kept.shared.any()
 
 
 def test_runs_show_responses_that_are_shared_where_noise_hides_the_asymmetry_of_gears():
