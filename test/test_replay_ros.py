@@ -6,7 +6,6 @@ Bags are played.
 
 from __future__ import annotations
 
-import threading
 import time
 
 import numpy as np
@@ -16,26 +15,16 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import recorded_run
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import deserialize_message
 from recorded_run import compared, of
 from ros_rig import FakeClock, RosRig, activate, configure, deactivate
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from test_nodes_trajectory import JOINTS, SECOND, send, trajectory
 
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.sources import open_bag
-from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.messages.topics import (
     COMMANDS,
-    JOINT_STATES,
-    ROBOT_DESCRIPTION,
     TRACKING_ERROR,
 )
-from blf_dsc_controller.nodes.player_node import PlayerNode
 from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.verify import verify
@@ -161,60 +150,3 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
 
 
 # Playing a bag: its messages byte for byte over ROS, in its time.
-
-
-@pytest.fixture(scope='module')
-def bag(tmp_path_factory):
-    """200 samples, 1 ms apart, after a URDF."""
-    message = typestore().types[ROBOT_DESCRIPTION.type](data='<robot/>')
-    raw = bytes(typestore().serialize_cdr(message, ROBOT_DESCRIPTION.type))
-    # As the middleware delivers it.
-    urdf = (ROBOT_DESCRIPTION, recorded_run.START, raw + bytes(-len(raw) % 4))
-    messages = [urdf, *recorded_run.Synthetic(200).messages()]
-    return recorded_run.write_made(tmp_path_factory.mktemp('played') / 'bag', messages)
-
-
-def test_bag_is_played_in_its_time_and_order_byte_for_byte(bag, ros):
-    received = {}
-    latched = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-    def listen(type_, name, quality=1000):
-        callback = received.setdefault(name, []).append
-        ros.tester.create_subscription(type_, name, callback, quality, raw=True)
-
-    listen(JointState, '/joint_states')
-    with open_bag(bag) as opened:
-        player = PlayerNode(opened, context=ros.context)
-        ros.until(player.outputs['/joint_states'].get_subscription_count)
-        begin = time.monotonic()
-        thread = threading.Thread(target=player.play)
-        thread.start()
-        ros.until(lambda: not thread.is_alive())
-        # never early, however slow the machine
-        assert time.monotonic() - begin >= 0.199
-        listen(String, '/robot_description', latched)  # late, as RViz is
-        sent = [raw for _, _, _, raw in of(recorded_run.messages(bag), JOINT_STATES)]
-        ros.until(lambda: len(received['/joint_states']) == len(sent))
-        ros.until(lambda: received['/robot_description'])
-        player.destroy_node()
-    assert [bytes(raw) for raw in received['/joint_states']] == sent
-    assert (
-        deserialize_message(received['/robot_description'][0], String).data
-        == '<robot/>'
-    )
-
-
-def test_bag_is_played_by_command_or_refused_in_one_line(bag, tmp_path, capfd):
-    assert main(['replay', str(bag), '--play']) == 0
-    out, err = capfd.readouterr()
-    assert (out[: len('playing 0.199 s: ')], err) == ('playing 0.199 s: ', '')
-    assert '/robot_description' in out
-    empty = recorded_run.write(tmp_path / 'bag', [])
-    for path, options, message in (
-        (bag, ['--map', 'commands=/x'], '--play publishes the bag as it is'),
-        (empty, [], f'{empty} is empty'),
-    ):
-        assert main(['replay', str(path), '--play', *options]) == 1
-        out, err = capfd.readouterr()
-        assert (out, err.count('\n')) == ('', 1)
-        assert err.startswith(f'blf_dsc replay: {message}')

@@ -25,7 +25,6 @@ import yaml
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
-from rosbags.interfaces import QosDurability
 
 from blf_dsc_controller.bags.unpacking import LARGEST, unpacked
 from blf_dsc_controller.errors import BlfDscError
@@ -76,8 +75,6 @@ class OpenBag:
     Attributes:
         held: name and type, empty where unknown, of each topic.
         counts: number of messages of each topic.
-        latched: topics whose publishers keep messages for late subscribers.
-        times: of the first message and after the last [ns].
     """
 
     def __init__(self, reader: Any, path: Path) -> None:
@@ -85,18 +82,9 @@ class OpenBag:
         self._is_ros1 = path.suffix == _ROS1
         self.held: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
-        self.latched: set[str] = set()
         for each in reader.connections:
             self.held[each.topic] = each.msgtype.replace('__schemaless__', '')
             self.counts[each.topic] += each.msgcount
-            ext: Any = each.ext
-            offered = getattr(ext, 'offered_qos_profiles', ())
-            kept = any(
-                qos.durability is QosDurability.TRANSIENT_LOCAL for qos in offered
-            )
-            if kept or getattr(ext, 'latching', False):
-                self.latched.add(each.topic)
-        self.times: tuple[int, int] = reader.start_time, reader.end_time
         if not self._is_ros1 and reader.compression_mode != 'message':
             storage: Any = reader.storage
             parts: list[Any] = storage.storages if path.is_dir() else [storage]

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING
 
 from blf_dsc_controller.bags import reader, recovery, table
 from blf_dsc_controller.bags.content import NameMap, read_content
-from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.cli.main import make_room
-from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import announce_reading
 from blf_dsc_controller.run import Run
@@ -28,7 +26,6 @@ PARTIAL = 4
 """Exit code if all compared outputs are equal, but others could not be compared."""
 
 _PAGES = {'', '.html', '.htm'}
-_DISCOVERY = 1.0  # s, until subscribers have found the publishers
 
 
 def report(options: Namespace) -> None:
@@ -112,10 +109,7 @@ def recover(options: Namespace) -> int:
 
 
 def replay(options: Namespace) -> int:
-    """Replay a bag and print what is equal, or publish it."""
-    if options.play:
-        play(options)
-        return 0
+    """Replay a bag and print what is equal."""
     from blf_dsc_controller.replay.verify import verify
 
     announce_reading([options.bag], 'run through the controller again')
@@ -135,35 +129,6 @@ def replay(options: Namespace) -> int:
 def speed_text(times: float) -> str:
     """Return how many times as fast as real time, with two digits below 10."""
     return f'{times:.0f}x real time' if times >= 9.5 else f'{times:.2g}x real time'
-
-
-def play(options: Namespace) -> None:
-    """Publish the messages of a bag until its end, or Ctrl-C."""
-    if options.map or options.namespace or options.law:
-        raise BlfDscError(
-            '--play publishes the bag as it is: no --map, --namespace or --law'
-        )
-    require_ros()
-    import rclpy
-
-    from blf_dsc_controller.nodes.player_node import PlayerNode
-    from blf_dsc_controller.nodes.process import drain
-
-    rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
-    try:
-        with open_bag(options.bag) as bag:
-            if not any(bag.counts.values()):
-                raise BlfDscError(f'{options.bag} is empty: it holds no message')
-            node = PlayerNode(bag)
-            seconds = (bag.times[1] - bag.times[0]) * 1e-9
-            print(f'playing {seconds:.3f} s: {", ".join(node.outputs)}', flush=True)
-            time.sleep(_DISCOVERY)
-            node.play()
-            drain(node.outputs.values())
-    except KeyboardInterrupt:
-        pass
-    finally:
-        rclpy.try_shutdown()
 
 
 def _verification(result: Verification) -> Iterator[str]:

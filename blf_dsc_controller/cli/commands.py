@@ -158,14 +158,13 @@ _REPLAY = Command(
     name='replay',
     module='bags',
     about='Run a bag through the controller again and compare every output bit for bit. The '
-    'controller has the recorded configuration and gets the recorded joint states. With --play, '
-    'publish the bag instead. Exit code: 0 all outputs are bit-equal, 3 some differ, 4 some '
+    'controller has the recorded configuration and gets the recorded joint states. '
+    'Exit code: 0 all outputs are bit-equal, 3 some differ, 4 some '
     'could not be compared and the others are bit-equal, 1 an error.',
     example='run1/bag',
     options=(
         *_NAMES,
         option('bag', _BAG, type=Path),
-        option('--play', 'publish the recorded topics over ROS', action='store_true'),
         option(
             '--law',
             'law to run if the recorded one is a Python file, which no bag can choose: its path, '
