@@ -5,17 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenario import Scenario
 
+import blf_dsc_controller as blf
 from benchmark import random_arms
 from blf_dsc_controller.law.sensor import FILTER
-from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.run import FIRST_STAMP
-from blf_dsc_controller.simulation.loop import simulate, write_bag
-from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.simulation.loop import write_bag
 from blf_dsc_controller.supervision.swing import Swing
-from blf_dsc_controller.supervision.swing_names import SwingNames
-from sim_plant.plant import plant_of
 
 T = 1e-3  # s
 LATE = 5  # samples until a torque acts and shows
@@ -23,7 +19,7 @@ ASSUMED = 1.0  # kg m^2
 RATE = 1.0 / FILTER  # 1/s, configured damping over the assumed inertia
 
 
-def braked(lighter, seconds=1.0, push=0.0, *, watched=True):
+def braked(lighter, seconds=1.0, push=0.0):
     """Return speeds (k,) [rad/s] and shares (k,) of a joint that a stop brakes from 1 rad/s.
 
     Its inertia is the assumed one over `lighter`; `push` [N m] acts on it all the time.
@@ -37,7 +33,7 @@ def braked(lighter, seconds=1.0, push=0.0, *, watched=True):
     for _ in range(round(seconds / T)):
         slow += T / FILTER * (speed - slow)
         swing.observe(np.array([slow]), np.zeros(1), np.zeros(1), T)
-        share = swing.share[0] if watched else 1.0
+        share = swing.share[0]
         torques.append(-share * RATE * ASSUMED * slow)
         speed += T / inertia * (torques.pop(0) + push)
         seen.append((speed, share))
@@ -61,11 +57,6 @@ def test_light_joint_comes_to_rest_with_the_share_that_damps_it_well(lighter):
     assert 0.3 / lighter < shares.min() < 3.0 / lighter
 
 
-def test_without_it_the_damping_shakes_a_joint_of_an_eighth_of_the_inertia():
-    speeds, _ = braked(8.0, watched=False)
-    assert np.abs(speeds[-100:]).max() > 3.0
-
-
 def test_joint_that_has_swung_is_braked_again_if_it_moves_on():
     """Pushed by 2 N m it would reach 16 rad/s in a second; all of the damping leaves 0.06."""
     speeds, shares = braked(3.5, 2.0, push=2.0)
@@ -74,22 +65,14 @@ def test_joint_that_has_swung_is_braked_again_if_it_moves_on():
     assert abs(speeds[-1]) < 0.1
 
 
-@pytest.mark.parametrize(('sigma', 'resolution'), [(3.8e-4, 0.0), (1e-4, 3.8e-4)])
-def test_noise_and_steps_of_an_encoder_are_no_swing(sigma, resolution):
-    """A hundred times the noise of an encoder of 20 bits, or steps of 0.38 mrad."""
-    random = np.random.default_rng(0)
-    swing = Swing(1)
-    swing.begin()
-    slow, last = 0.0, 0.0
-    for k in range(5000):
-        q = 1e-3 * np.sin(1e-3 * k) + random.normal(0.0, sigma)
-        if resolution:
-            q = resolution * np.round(q / resolution)
-        slow += T / FILTER * ((q - last) / T - slow)
-        last = q
-        swing.observe(*np.array([[slow], [sigma**2], [resolution]]), T)
-    assert swing.share[0] == 1.0
-    assert not swing.has_swung[0]
+def test_steps_of_coarse_encoders_are_no_swing():
+    """Of 0.38 mrad, in Damiao's frames: a differenced velocity comes in steps of 0.38 rad/s."""
+    coarse = {'sensor.resolution': 3.8e-4, 'sensor.velocity': 'differenced'}
+    arm = Scenario('openarm', plant=coarse)
+    arm.run(2.0)
+    arm.controller.fail('by hand')
+    arm.run(2.0)
+    assert arm.text == 'by hand'
 
 
 ARMS = {
@@ -115,7 +98,7 @@ def test_stop_of_an_arm_that_nobody_foresaw_brakes_it(arm, tmp_path):
     study = random_arms.study_of(name, 'wide')
     plant = random_arms.arm_of(study, number)
     with np.errstate(all='ignore'):
-        record = simulate(study.controller, plant, after_stop=1.3)
+        record = blf.simulate(study.controller, plant, after_stop=1.3)
     n = len(plant.joints)
     t = 1e-9 * record.stamps - record.stopped
     speed = np.abs(record.truths[:, -n:]).max(axis=1)
@@ -123,32 +106,19 @@ def test_stop_of_an_arm_that_nobody_foresaw_brakes_it(arm, tmp_path):
     assert speed[t > IN_FLIGHT].max() < before
     assert speed[t > 1.0].max() < 0.15
     write_bag(tmp_path / 'bag', record)
-    result = verify(tmp_path / 'bag')
+    result = blf.verify(tmp_path / 'bag')
     assert (result.difference, result.remarks) == (None, ())
 
 
 def test_stop_names_the_joints_that_swing_in_it():
     study = random_arms.study_of('fr3', 'wide')
-    guard = Guard(study.controller)
-    arm = plant_of(random_arms.arm_of(study, 9))
-    guard.starting.activate()
+    loop = blf.load_loop('fr3')._replace(
+        controller=study.controller, plant=random_arms.arm_of(study, 9)
+    )
+    arm = Scenario(loop)
     with np.errstate(all='ignore'):
-        for k in range(1500):
-            stamp = FIRST_STAMP + k * study.controller.sample_time_ns
-            torque = guard.update(stamp, np.array(arm.measure()))
-            arm.step(torque)
-    assert guard.supervisor.phase is Phase.SAFE_STOP
-    text = guard.supervisor.text
-    assert text.count("joint 'fr3_joint7' swings under the damping of the stop") == 1
-    assert 'robot.rotor_inertia' in text
-
-
-def test_what_a_swing_means_is_said_once_in_a_stop():
-    """In an overloaded loop all seven joints of a Panda swing, one after the other."""
-    names = SwingNames(('a', 'b', 'c'))
-    names.begin()
-    assert 'robot.rotor_inertia' in names.name(np.array([False, True, False]))
-    assert names.name(np.array([False, True, False])) == ''
-    assert names.name(np.array([True, True, True])) == "joints 'a', 'c' swing, too"
-    names.begin()
-    assert 'robot.rotor_inertia' in names.name(np.array([False, False, True]))
+        arm.run(1.5)
+    assert arm.controller.phase is blf.Phase.SAFE_STOP
+    swings = "joint 'fr3_joint7' swings under the damping of the stop"
+    assert arm.text.count(swings) == 1
+    assert arm.text.count('robot.rotor_inertia') == 1
