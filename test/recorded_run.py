@@ -40,10 +40,9 @@ from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 LATCHED = {ROBOT_DESCRIPTION.resolved: [ROBOT_DESCRIPTION.offered]}
 
-# Learns within a second: a window of half a second, which is less excited.
+# Learns within a second: a window of 0.3 s, which is less excited.
 QUICK = {
-    'learning.window': 0.5,
-    'learning.settling_time': 0.1,
+    'learning.window': 0.3,
     'learning.excitation_threshold': 1e-7,
 }
 

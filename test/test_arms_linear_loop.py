@@ -256,7 +256,6 @@ def test_a_law_of_joints_does_not_multiply_its_feedback_by_inertias():
         'feedback.inertia': 'none',
         'feedback.joint_stiffness': [600.0] * 6,
         'feedback.joint_damping': [30.0] * 6,
-        'surface.time_constant': 0.001,
         'disturbance.gain': [0.0] * 6,
         'barrier.bound': [0.5] * 6,
     }

@@ -60,7 +60,6 @@ CHANGED = LoopConfig(
         ControllerConfig,
         {
             'barrier.slope_limit': [1e300, 12345.678901234567],
-            'learning.regularization': 3e-300,
             'learning.bias': False,
         },
     ),

@@ -320,15 +320,6 @@ def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
         (CONTROLLER, {'limits.jerk': [1.0, NAN]}, 'got .nan at entry 2 of'),
         (CONTROLLER, {'limits.jerk': [1.0]}, 'got 1, but 2 entries are needed'),
         (CONTROLLER, {'limits.jerk': 1.0}, 'got 1.0, but a double array is expected'),
-        *(
-            (CONTROLLER, {'reference.stream_timeout': value}, message)
-            for value, message in (
-                (0.0, 'got 0.0, but it must be above 0 s'),
-                (-1.0, 'got -1.0, but it must be above 0 s'),
-                (NAN, 'got .nan, but a finite number is needed'),
-                ([0.2, 0.2], 'got [0.2, 0.2], but a double is expected'),
-            )
-        ),
         # Of an arm that cannot be read, no lengths are known.
         (
             BOTH,

@@ -337,7 +337,6 @@ def test_load_is_filtered_as_least_squares_would():
     ('given', 'problem'),
     [
         ({'contact.enabled': 1}, 'contact.enabled: got 1, but a bool'),
-        ({'contact.bandwidth': 0.0}, 'contact.bandwidth: got 0'),
         ({'contact.threshold': -1.0}, 'contact.threshold: got -1'),
         ({'contact.loads': 'yes'}, 'contact.loads: got .yes.'),
         ({'contact.reaction': 'flee'}, 'contact.reaction: got .flee.'),

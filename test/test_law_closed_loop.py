@@ -333,14 +333,11 @@ def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
     np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
 
 
-@pytest.mark.parametrize('time_constant', [0.002, 0.016])
 @pytest.mark.parametrize(
     ('gain', 'mu', 'weight'),
     [(150.0, 20.0, 1000.0), (60.0, 60.0, 1.0), (0.0, 40.0, 500.0)],
 )
-def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(
-    time_constant, gain, mu, weight
-):
+def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(gain, mu, weight):
     """The model-based law knows the disturbance, but alpha2 lags beta2 by lambda alpha2'.
 
     xi1 compensates it by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The
@@ -349,10 +346,9 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(
     """
     gains = {'surface.gain': gain, 'surface.mu': mu, 'barrier.weight': weight}
     changes = {name: [value] * 2 for name, value in gains.items()}
-    changes['surface.time_constant'] = time_constant
     loop = run_preset(8.0, preset='model_based', law=changes)
     rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
-    expected = (time_constant + 0.5e-3) * 0.3 / rate
+    expected = (0.002 + 0.5e-3) * 0.3 / rate
     np.testing.assert_allclose(loop.largest(1.0), expected, rtol=0.05)
     changes |= FROZEN | instead(known_rate=True)
     loop = run_preset(8.0, NO_DISTURBANCE, law=changes)
@@ -373,12 +369,12 @@ def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
 
 def test_settings_follow_the_configuration():
     """Learning waits for window and filters, tau_d + T_a of (26)."""
-    given = {'learning.window': 0.75, 'learning.settling_time': 0.25}
+    given = {'learning.window': 0.75}
     given |= {'learning.adaptation_gain': [1.5, 2.0, 3.0]}
     config = build(ControllerConfig, given)
     settings = settings_of_config(config)
     columns = len(columns_of(config))
-    assert settings.excitation.learning_start == 1.0
+    assert settings.excitation.learning_start == 1.25
     assert settings.window.length == 750
     assert columns > 0
     assert settings.adaptation.adaptation_gain.tolist() == [

@@ -210,13 +210,11 @@ def test_rejected_column_stays_zero_and_is_checked_again():
 
 
 def test_window_after_a_change_may_be_partial_and_stays_near_the_estimate_before():
-    off = []
-    for law in ({}, {'learning.anchor_weight': 0.0}):
-        learning = run_preset(CHANGED + 5.0, payload(0.75), law=law).controller
-        assert learning.state.latch.latched[0] == 1.0
-        assert learning.state.window.rows[0] < learning.settings.window.length
-        off.append(np.ptp(learning.state.estimate - learning.state.latch.anchor))
-    assert off[0] < off[1]
+    learning = run_preset(CHANGED + 5.0, payload(0.75)).controller
+    assert learning.state.latch.latched[0] == 1.0
+    assert learning.state.window.rows[0] < learning.settings.window.length
+    off = np.abs(learning.state.estimate - learning.state.latch.anchor)
+    assert off.max() < 0.5
 
 
 def test_change_detection_is_off_for_rows_of_lambda_which_contradict_each_other_on_any_arm():

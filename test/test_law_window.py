@@ -267,7 +267,6 @@ def test_columns_match_their_names():
     learning = {
         'learning.viscous': True,
         'learning.coulomb': True,
-        'learning.coulomb_velocity': 0.2,
         'learning.load_friction': True,
         'learning.frequencies': [1.5, 4.0],
         'learning.ripple_cycles': [20.0, 30.0],
@@ -284,7 +283,7 @@ def test_columns_match_their_names():
     for i in range(2):
         ripple.fill_ripple(settings.columns, i, q[i], rows)
 
-    rubs = np.tanh(dq / 0.2)
+    rubs = np.tanh(dq / 0.01)
     value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': rubs}
     value['load_friction'] = np.abs(tau) * rubs
     for w in (1.5, 4.0):
@@ -321,10 +320,9 @@ def test_friction_columns_recover_friction():
     learning = {
         'learning.viscous': True,
         'learning.coulomb': True,
-        'learning.coulomb_velocity': 0.05,
         'learning.excitation_threshold': 1e-4,
     }
-    arm |= {'disturbance.coulomb_velocity': 0.05}
+    arm |= {'disturbance.coulomb_velocity': 0.01}
     estimate, active = learned('recommended', 20.0, learning, arm)
     assert all(active.values())
     for name, values in (true | {'bias': (0.0, 0.0)}).items():

@@ -34,12 +34,12 @@ RUNS = 24
 LOOP = """\
 sim_plant:
   ros__parameters:
-    duration: 0.3
-    events: {begin: [0.0, 0.2], duration: [0.1, 0.0]}
+    duration: 0.75
+    events: {begin: [0.0, 0.7], duration: [0.1, 0.0]}
 blf_dsc_controller:
   ros__parameters:
     approach: {enabled: false}
-    learning: {window: 0.1, settling_time: 0.05, excitation_threshold: 1.0e-12}
+    learning: {window: 0.1, excitation_threshold: 1.0e-12}
 """
 
 STUDY = """\

@@ -67,9 +67,7 @@ def run_lockstep(ros, plant, controller=None):
     commands = ros.listen(topics.COMMANDS)
     joint_states = ros.listen(topics.JOINT_STATES, raw=True)
     arm = ros.add(PlantNode, {'mode': 'lockstep', **OBSERVED, **plant})
-    ros.add(
-        ControllerNode, {'telemetry.enabled': False, **OBSERVED, **(controller or {})}
-    )
+    ros.add(ControllerNode, {**OBSERVED, **(controller or {})})
     truth = ros.listen(topics.TRUTH)
     samples = round(plant['duration'] * 1000) + 1
     ros.until(lambda: arm.finished and len(commands) >= samples)
@@ -264,7 +262,7 @@ def test_parameter_change_takes_effect_at_the_published_sample(ros):
     ros.listen(topics.JOINT_STATES)
     ros.listen(topics.TRUTH)
     arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 1.0, **OBSERVED})
-    ros.add(ControllerNode, OBSERVED | {'telemetry.enabled': False})
+    ros.add(ControllerNode, OBSERVED)
     ros.until(lambda: arm.plant.sample > 50)
     request = SetParametersAtomically.Request()
     request.parameters = [

@@ -304,14 +304,14 @@ def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
     """Another version or law, and messages that the recorder missed."""
 
     def change(content):
-        del content['parameters']['learning.anchor_weight']
+        del content['parameters']['learning.residual_floor']
 
     configured(entries, change)
     of(entries, MONITOR)[7][3] = None
     path = recorded_run.write(tmp_path / 'bag', entries, publishers=1)
     missed, newer = verify(path).remarks
     assert missed == f'the recorder missed messages of {MONITOR.resolved}: 1 missed'
-    assert 'before the law had learning.anchor_weight' in newer
+    assert 'before the law had learning.residual_floor' in newer
 
     monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
     (remark,) = verify(bag).remarks

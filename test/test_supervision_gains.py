@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from paper_case import EXACT, NO_DISTURBANCE, P, configured, instead, run
+from paper_case import EXACT, NO_DISTURBANCE, configured, instead, run
 from plants import rigid_gears
 
 from blf_dsc_controller.arms.model import inertia_matrices
@@ -54,8 +54,7 @@ def test_presets_cause_no_warnings(preset):
         ('torque.limit', {'torque.limit': [5.0, 20.0]}),
         ('feedback.gain', {'feedback.gain': [60.0, 120.0]}),
         ('disturbance.gain', {'disturbance.gain': [100.0, 15000.0]}),
-        ('surface.time_constant', {'surface.time_constant': 0.0005}),
-        ('surface.gain', {'surface.time_constant': 0.05}),
+        ('surface.gain', {'surface.gain': [300.0, 300.0]}),
         ('barrier.slope_limit', {'barrier.slope_limit': [2e4, 5e4]}),
         ('learning.weight', {'learning.weight': 2500.0}),
         ('learning.weight', instead(update='gradient')),
@@ -113,23 +112,10 @@ def test_change_must_not_worsen_an_existing_warning_nor_cause_one(gain, accepted
     assert all(
         text.startswith('feedback.gain: K_p over the inertia is ') for text in found
     )
-    (text,) = worsened(before, change(before, {'surface.time_constant': 0.0005}), load)
-    assert text.startswith(
-        'surface.time_constant: 0.0005 s is less than the sample time'
-    )
-
-
-def test_filter_that_knows_the_rate_of_its_input_does_not_ring():
-    changes = {'surface.time_constant': 0.05} | EXACT | instead(known_rate=True)
-    assert warnings(changes) == []
-    known = {'learning.initial_estimate': list(P)}
-    loop = configured('recommended', 4.0, changes | known, NO_DISTURBANCE)
-    assert np.abs(run(loop).xi1).max() < BOUND / 4.0
 
 
 def test_laws_cause_no_warnings_about_gains_they_do_not_have():
     changes = {
-        'surface.time_constant': 0.05,
         'learning.window': 5.0,
         'law': 'backstepping',
     }
@@ -526,11 +512,11 @@ def test_stiffness_of_an_arm_without_a_urdf_is_rejected():
 def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expected):
     """Of an arm that is 1.4 and 1.6 times lighter, with time constants of one and two samples."""
     found = []
+    config = arm_of('panda_rigid', 0.004, instead(known_rate=known_rate))
     for time_constant in (0.004, 0.008):
-        surface = instead(known_rate=known_rate)
-        surface['surface.time_constant'] = time_constant
-        config = arm_of('panda_rigid', 0.004, surface)
         settings = settings_of_config(config)
+        surface = settings.surface._replace(time_constant=time_constant)
+        settings = settings._replace(surface=surface)
         M0 = inertias(config, settings)
         size = partial(growth, settings, 0.004, config.robot.lag)
         found.append(
@@ -542,9 +528,10 @@ def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expecte
 def test_gains_follow_the_sample_time():
     fast, slow = (arm_of('panda_rigid', T) for T in (0.001, 0.005))
     assert slow.feedback.damping_rate < fast.feedback.damping_rate
-    assert (fast.surface.time_constant, slow.surface.time_constant) == (0.004, 0.005)
     planar = (arm_of('noisy', T) for T in (0.001, 0.005))
-    settings = map(settings_of_config, (fast, slow, *planar))
+    settings = [settings_of_config(each) for each in (fast, slow, *planar)]
+    filters = [each.surface.time_constant for each in settings]
+    assert filters == [0.004, 0.005, 0.002, 0.005]
     intervals = [(each.window.row_interval, each.window.interval) for each in settings]
     assert intervals == [(10, 50), (2, 10), (1, 10), (1, 2)]
 

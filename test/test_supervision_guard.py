@@ -327,25 +327,15 @@ def test_correction_of_the_estimate_that_would_diverge_is_refused_once_it_is_mad
     quick = {
         'learning.window': 0.2,
         'learning.excitation_threshold': 1e-12,
-        'learning.settling_time': 0.0,
     }
     arm = arm_of(quick)
     heavy = {'learning.weight': 2e5}
-    arm.run(0.4)
+    arm.run(0.8)
     (problem,) = arm.change(heavy)
     assert problem.startswith('learning.weight: the Newton step')
     arm.restart(quick | {'learning.excitation_threshold': 1e9})
     arm.run(0.4)
     assert arm.change(heavy) == []
-
-
-def test_gains_can_change_while_the_projection_holds_the_estimate():
-    """Whose norm is the radius then, but for rounding."""
-    held = {'learning.radius': 0.6, 'learning.initial_estimate': [0.55, 0.16, 0.16]}
-    arm = arm_of(held)
-    for _ in range(20):
-        arm.run(0.01)
-        assert arm.change({'feedback.gain': [60.0, 25.0]}) == []
 
 
 def test_retuning_leaves_a_joint_without_integrator_without_a_disturbance():

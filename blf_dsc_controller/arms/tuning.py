@@ -58,8 +58,6 @@ _PUSH = 0.03
 _HEAVIEST = 1.5
 _UNMODELLED = 0.01  # rms, fraction of the rated torque: ripple, noise, Stribeck
 _WINDOW = 5.0  # s
-_REGULARISATION = 1e-5  # pulls P (about 1) to 0
-_ANCHOR = 15.0  # times the mean square of the unmodelled torque
 # Of feedback through the inertia: over m omega_b^2, or over omega_b
 _BARRIER, _INTEGRAL, _DAMPING = 0.5, 0.4, 0.6
 _SURFACE = 0.4, 1.3  # K and mu
@@ -214,7 +212,6 @@ def _of_arm(arm: Design) -> dict[str, Value]:
     """Return what does not depend on the feedback: limits, learning, safety."""
     zeros = (0.0,) * len(arm.chain.joints)
     return {
-        'surface.time_constant': max(arm.sample_time, SURFACE),
         'feedback.robust_gain': zeros,
         'truth.constant': zeros,
         'truth.amplitude': zeros,
@@ -264,16 +261,11 @@ def _learning_of(arm: Design) -> dict[str, Value]:
         'learning.initial_estimate': _listed(P),
         'learning.radius': 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload),
         'learning.window': _WINDOW,
-        'learning.regularization': _REGULARISATION,
-        'learning.settling_time': 0.3,
-        'learning.filter_pole': 20.0,
         'learning.excitation_threshold': 1e-9,
-        'learning.anchor_weight': _ANCHOR * float(floor.min()) ** 2,
         'learning.residual_floor': _listed(floor),
         'learning.bias': False,
         'learning.viscous': True,
         'learning.coulomb': True,
-        'learning.coulomb_velocity': 0.02,
     }
 
 

@@ -19,7 +19,7 @@ from blf_dsc_controller.arms.joint_gains import (
 from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration import tool_bound
-from blf_dsc_controller.configuration.controller_groups import Feedback, Surface
+from blf_dsc_controller.configuration.controller_groups import Feedback
 from blf_dsc_controller.configuration.law_file import GROUP
 from blf_dsc_controller.configuration.law_traits import (
     GAINS,
@@ -41,9 +41,8 @@ _OBSERVER = 150.0  # rad/s, below the drives' own loops
 
 def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
     """Return the gains and limits that follow from given parameters by dotted name."""
-    period = given.get('sample_time', ArmConfig.sample_time)
     if not given.get('robot.urdf'):
-        return {'surface.time_constant': max(period, Surface().time_constant)}
+        return {}
     robot, chain = given_robot(given)
     base = parameters_of(robot, chain)
     arm = _design(given, robot, chain, base)

@@ -114,9 +114,6 @@ class Safety:
 class Telemetry:
     """What the controller publishes besides its commands."""
 
-    enabled: bool = _telemetry(
-        True, 'publish reference, errors, estimates and monitors'
-    )
     decimation: int = _telemetry(
         10,
         'samples per message of reference and monitor; errors come with every sample',
@@ -225,9 +222,6 @@ class Surface:
         'gain of the virtual control that remains at the bound',
         '1/s',
         'mu',
-    )
-    time_constant: float = positive(
-        0.002, 'time constant of the surface filter', 's', 'lambda'
     )
 
 
@@ -360,9 +354,6 @@ class Learning:
     weight: float = non_negative(
         100.0, 'weight of the prediction error; 0: no learning from it', symbol='kappa'
     )
-    regularization: float = positive(
-        1e-5, 'regularisation of the Newton step', symbol='rho'
-    )
     excitation_threshold: float = positive(
         0.003,
         'minimum eigenvalue of the excitation matrix of an excited window',
@@ -375,25 +366,9 @@ class Learning:
         'tau_d',
         above=0.0,
     )
-    settling_time: float = _at_start(
-        0.5,
-        'time for the filters to settle before the window is used',
-        's',
-        'T_a',
-        at_least=0.0,
-    )
-    filter_pole: float = in_window(
-        10.0, 'pole of the filters on regressor and torque', 'rad/s', above=0.0
-    )
     bias: bool = sizing(True, 'also estimate a constant disturbance of each joint')
     viscous: bool = sizing(False, 'also estimate the viscous friction of each joint')
     coulomb: bool = sizing(False, 'also estimate the Coulomb friction of each joint')
-    coulomb_velocity: float = in_window(
-        0.01,
-        'velocity scale of the sign change of the Coulomb column',
-        'rad/s',
-        above=0.0,
-    )
     load_friction: bool = sizing(
         False,
         'also estimate the share of the torque in its gear by which the Coulomb friction of each '
@@ -424,9 +399,6 @@ class Learning:
         (0.07, 0.07),
         'rms unmodelled torque that is not treated as a change of the arm',
         'N m',
-    )
-    anchor_weight: float = non_negative(
-        0.1, 'pull to the estimate before a change, until a new window is full'
     )
     weighing: bool = sizing(
         False,
@@ -490,14 +462,6 @@ class Contact:
 
     enabled: bool = sizing(
         False, 'compute the external torque with its interval, and detect contacts'
-    )
-    bandwidth: float = in_window(
-        30.0,
-        'pole of the filter of the external torque: a larger one is faster, '
-        'but noisier',
-        'rad/s',
-        'L',
-        above=0.0,
     )
     threshold: float = positive(
         8.0,

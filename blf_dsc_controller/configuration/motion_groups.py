@@ -55,12 +55,6 @@ class Reference:
         _of_reference((), 'positions of all joints, one row per waypoint', 'rad')
     )
 
-    stream_timeout: float = positive(
-        0.25,
-        'time without a new target after which the reference of a stream brakes',
-        's',
-    )
-
     def rows(self, joints: int) -> np.ndarray:
         """Return the waypoints (k, n) [rad] of so many joints."""
         return np.reshape(self.waypoints, (-1, joints))
@@ -87,7 +81,6 @@ class Approach:
         'guide an arm that starts outside the bound into it; false: refuse '
         'such a start',
     )
-    longest: float = positive(30.0, 'longest duration of the approach', 's')
 
 
 @dataclass(frozen=True)

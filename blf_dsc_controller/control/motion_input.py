@@ -43,6 +43,7 @@ _SMALL = 4096  # bytes of a message that is read at once: a few points
 _LEAD = 0.02  # s from now to the time for which a trajectory is planned, at first
 _TARGET_LEAD = 0.004  # likewise for a target
 _LONGEST_LEAD = 2.0
+_STREAM_TIMEOUT = 0.25  # s without a new target, after which the reference brakes
 _PAUSE = 1.0  # s without messages, after which a stopped sender is followed again
 _RARELY = 1.0  # s between two warnings of a stream
 _ON_TRAJECTORY = JOINT_TRAJECTORY.name
@@ -210,7 +211,6 @@ class MotionInput:
     def _target_of(self, guard: Guard, trajectory: Trajectory) -> Target | None:
         """Return a single point within the time-out as a target, otherwise None."""
         config = guard.config
-        timeout = config.reference.stream_timeout
         now = guard.reference.time
         point = trajectory.points[0]
         begin = now if trajectory.begin is None else trajectory.begin
@@ -219,7 +219,7 @@ class MotionInput:
             not can_retarget()
             or not guard.supervisor.running
             or len(trajectory.points) > 1
-            or not 0.0 <= ahead <= timeout
+            or not 0.0 <= ahead <= _STREAM_TIMEOUT
             or trajectory_problems(trajectory, config.joints, now)
         ):
             return None
@@ -229,7 +229,7 @@ class MotionInput:
         return self._points.target(
             now,
             self._short_way(guard, self._points, positions),
-            timeout=timeout,
+            timeout=_STREAM_TIMEOUT,
             fastest=np.array(config.limits.velocity),
             velocities=velocities[order] if velocities.size else None,
             ahead=ahead,
@@ -252,7 +252,7 @@ class MotionInput:
         target = self._positions.target(
             guard.reference.time,
             self._short_way(guard, self._positions, positions),
-            timeout=guard.config.reference.stream_timeout,
+            timeout=_STREAM_TIMEOUT,
             fastest=np.array(guard.config.limits.velocity),
         )
         lead = self._target_lead
@@ -264,7 +264,7 @@ class MotionInput:
     ) -> np.ndarray:
         """Return positions (n,) [rad] nearest to the last ones of a stream, or the reference."""
         config = guard.config
-        near = stream.last(guard.reference.time, config.reference.stream_timeout)
+        near = stream.last(guard.reference.time, _STREAM_TIMEOUT)
         if near is None:
             near = guard.controller.reference_at(guard.reference.time)[0]
         (shifted,), turned = short_way(positions[np.newaxis], near, config)

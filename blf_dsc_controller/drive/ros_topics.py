@@ -64,9 +64,7 @@ class RosTopics(Beside):
         """
         config = controller.config
         self._estimates = controller.estimate_names
-        self._sent = frozenset(_ALWAYS)
-        if config.telemetry.enabled:
-            self._sent |= frozenset(_TELEMETRY)
+        self._sent = frozenset((*_ALWAYS, *_TELEMETRY))
         link, self._process = _start(config.joints, namespace, self._sent)
         super().__init__(link, controller)
         self._report = StatusReport(self.log)

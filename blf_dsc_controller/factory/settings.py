@@ -14,6 +14,7 @@ from blf_dsc_controller.arms.base_parameters import (
     payload_inertia,
 )
 from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
+from blf_dsc_controller.arms.joint_gains import SURFACE
 from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.compiled.layout import filled
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -63,6 +64,18 @@ _CHECKS = 0.01  # s, between two checks of the excitation
 # s, between rows of the window and between its checks
 _ROWS, _SLOWER_CHECKS = 0.01, 0.05
 _PRIOR = 0.01  # 1 / (independent rows in a window): pull to the initial estimate
+# rad/s, of the filters of rows: ten times a usual reference's frequency, far below 1/T
+_ROW_POLE, _SLOW_ROW_POLE = 20.0, 10.0
+# s for these filters, and that of (8), to settle
+_SETTLING, _SLOW_SETTLING = 0.3, 0.5
+_REGULARISATION = 1e-5  # rho, which pulls P (about 1) to 0
+# pull to the estimate before a change until a new window is full: times the mean square
+# of the unmodelled torque; of the two links, whose rows are not scaled
+_ANCHOR, _PLANAR_ANCHOR = 15.0, 0.1
+# rad/s: a sharper sign change of friction chatters with noise
+_REVERSAL, _SLOW_REVERSAL = 0.02, 0.01
+_EXTERNAL = 30.0  # rad/s, pole of the external torque: a faster one is noisier
+_SURFACE = 0.002  # s, of the surface filter of the two links
 _SLOW = 0.05  # rad/s, reference velocity below which the rows of a joint count less
 # standard deviation of what friction has more at breakaway, over its initial estimate
 _BREAKAWAY = 0.7
@@ -178,7 +191,14 @@ def _barrier(config: ControllerConfig) -> barrier.Settings:
 def _surface(config: ControllerConfig, lag: float) -> surface.Settings:
     """Return the surface; the filter of an arm from a URDF uses the known rate f."""
     is_urdf = config.model == 'urdf'
-    return filled(surface.Settings, config.surface, known_rate=int(is_urdf), lag=lag)
+    fastest = SURFACE if is_urdf else _SURFACE
+    return filled(
+        surface.Settings,
+        config.surface,
+        time_constant=max(config.sample_time, fastest),
+        known_rate=int(is_urdf),
+        lag=lag,
+    )
 
 
 def _feedback(config: ControllerConfig) -> feedback.Settings:
@@ -239,9 +259,15 @@ def _columns(config: ControllerConfig, p: int) -> columns.Settings:
         columns.Settings,
         learning,
         first=p,
+        coulomb_velocity=_coulomb_velocity(config),
         tones=len(learning.frequencies),
         ripples=len(learning.ripple_cycles),
     )
+
+
+def _coulomb_velocity(config: ControllerConfig) -> float:
+    """Return the velocity scale [rad/s] of the sign change of the Coulomb column."""
+    return _REVERSAL if config.model == 'urdf' else _SLOW_REVERSAL
 
 
 def _row(config: ControllerConfig) -> prediction.Settings:
@@ -251,6 +277,7 @@ def _row(config: ControllerConfig) -> prediction.Settings:
         prediction.Settings,
         config.learning,
         prediction=prediction.FILTERED,
+        filter_pole=_ROW_POLE if is_urdf else _SLOW_ROW_POLE,
         motion_scale=_SLOW if is_urdf else 0.0,
         lag=config.robot.lag if is_urdf else 0.0,
         omega=_OMEGA,
@@ -277,6 +304,7 @@ def _window(config: ControllerConfig) -> window.Settings:
         row_interval=row_interval,
         interval=max(1, round(between_checks / T)),
         prior_weight=(_PRIOR if is_urdf else 0.0) * least * least,
+        regularization=_REGULARISATION,
     )
 
 
@@ -289,11 +317,14 @@ def _excitation(config: ControllerConfig) -> excitation.Settings:
     """
     learning = config.learning
     least = _least_floor(config)
-    is_compared = config.model == 'urdf' and learning.change_detection
+    is_urdf = config.model == 'urdf'
+    is_compared = is_urdf and learning.change_detection
+    settling_time = _SETTLING if is_urdf else _SLOW_SETTLING
     return filled(
         excitation.Settings,
         learning,
-        learning_start=learning.window + learning.settling_time,
+        learning_start=learning.window + settling_time,
+        anchor_weight=_ANCHOR * least * least if is_urdf else _PLANAR_ANCHOR,
         starts_full=int(not is_compared or config.feedback.inertia != 'none'),
         residual_floor=len(config.joints) * least * least,
     )
@@ -339,9 +370,10 @@ def _external(
     return filled(
         external_torque.Settings,
         config.contact,
+        bandwidth=_EXTERNAL,
         window=sliding.length,
         row_interval=sliding.row_interval,
-        coulomb_velocity=config.learning.coulomb_velocity,
+        coulomb_velocity=_coulomb_velocity(config),
         row_variance=_PRIOR * least * least,
         unmodelled=np.array(config.learning.residual_floor),
     )

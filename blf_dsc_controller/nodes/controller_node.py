@@ -144,10 +144,8 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _output_topics(self) -> list[topics.Topic]:
         """Return the topics that this node publishes in the loop."""
-        outputs = [topics.COMMANDS]
-        if not self.config.telemetry.enabled:
-            return outputs
-        outputs += [
+        outputs = [
+            topics.COMMANDS,
             topics.REFERENCE,
             topics.TRACKING_ERROR,
             topics.BOUND,
@@ -330,7 +328,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _publish_telemetry(self, torque: np.ndarray | None) -> None:
         """Publish the messages about the last state and its torque (n,) [N m]."""
-        if self._loop is not None and self.config.telemetry.enabled:
+        if self._loop is not None:
             for message in self._loop.messages(
                 torque, errors_wanted=self._errors_subscribed or bool(self.outputs)
             ):
@@ -396,7 +394,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.config = config
         if self._loop is not None:
             message = self._loop.retune(config)
-            if message is not None and config.telemetry.enabled:
+            if message is not None:
                 self._publish(message)
 
     def report_if_changed(self, guard: Guard) -> None:

@@ -54,6 +54,7 @@ _IN_MOTION = 0.6
 So for all starts of a law but its first one.  What the model lacks, as a load that a reset has
 made the law forget, acts by the acceleration.
 """
+_LONGEST = 30.0  # s, of an approach: a slower one is no approach
 _LONGEST_IN_MOTION = 4.0  # s
 _MOVING = 2.0 * AT_REST  # rad/s; steps of a motor's velocity reach AT_REST
 _PERIOD = 0.005  # s, between two checked samples
@@ -205,13 +206,12 @@ def blend(
     """Blend from `before` to `target`, starting at t0 [s], as fast as the limits allow.
 
     Raises:
-        MotionError: `target` within approach.longest, or every blend within that and `longest`
-            [s], violates a limit.
+        MotionError: `target` within `_LONGEST`, or every blend within that and `longest` [s],
+            violates a limit.
     """
     n = len(config.joints)
-    seen = config.approach.longest
-    longest = min(longest, seen)
-    found = worst_violation(pack(n, [target]), check_times(t0, t0 + seen), config)
+    longest = min(longest, _LONGEST)
+    found = worst_violation(pack(n, [target]), check_times(t0, t0 + _LONGEST), config)
     if found is not None:
         raise MotionError(
             f'the reference exceeds the limits of the arm: {found}; reduce the motion, or relax '
@@ -233,7 +233,7 @@ def blend(
             raise MotionError(
                 f'no motion of at most {longest:g} s from here to the reference stays '
                 f'within the limits of the arm: in the longest one, {found}; start closer and '
-                f'at rest, or relax {found.parameters} or approach.longest',
+                f'at rest, or relax {found.parameters}',
                 found,
             )
         too_short = duration
@@ -330,7 +330,7 @@ def _via_centre(
         motion = blend(unpack(rest.vector), target, rest.settled, config)
     except MotionError:
         return None
-    return motion if motion.settled <= t + config.approach.longest else None
+    return motion if motion.settled <= t + _LONGEST else None
 
 
 def _check_limits(config: ControllerConfig, q: np.ndarray) -> None:

@@ -55,7 +55,7 @@ def _limits_of_gains(config: ControllerConfig, load: ReferenceLoad) -> Iterator[
     yield from _limits_of_torque(config, load)
     yield from _limits_of_feedback(config, settings, load)
     if settings.has_barrier == 1:
-        yield from _limits_of_surface(config, settings)
+        yield from _limits_of_surface(settings)
         yield from _limits_of_slope(config, settings, load)
 
 
@@ -98,21 +98,15 @@ def _damping(settings: Settings, load: ReferenceLoad) -> Floats:
     return np.asarray(np.maximum(load.damping(settings), 1e-12))
 
 
-def _limits_of_surface(config: ControllerConfig, settings: Settings) -> Iterator[Limit]:
-    T, filtering = config.sample_time, config.surface.time_constant
-    yield Limit(
-        'surface.time_constant:',
-        T / filtering,
-        f'{filtering:g} s is less than the sample time, {T:g} s: alpha2 follows the measurement '
-        'noise, and its derivative enters the torque: give more',
-    )
+def _limits_of_surface(settings: Settings) -> Iterator[Limit]:
     if settings.surface.known_rate == 0:
+        filtering = settings.surface.time_constant
         rate = float(np.max(settings.surface.gain / 2.0 + settings.surface.mu))
         yield Limit(
             'surface.gain, surface.mu: K/2 + mu',
             filtering * rate,
             f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
-            f'{0.25 / filtering:.3g} 1/s: lower surface.time_constant or the gains',
+            f'{0.25 / filtering:.3g} 1/s: lower the gains',
         )
 
 
