@@ -92,7 +92,7 @@ def worked(
 def without_bound(controller: ControllerConfig) -> ControllerConfig:
     """Return a controller with bounds that only an arm that shakes would leave."""
     n = len(controller.joints)
-    free = {'barrier.bound': [FREE] * n, 'barrier.initial_bound': [0.0] * n}
+    free = {'barrier.bound': [FREE] * n}
     return change(controller, free)
 
 
@@ -113,14 +113,10 @@ def borne(controller: ControllerConfig, plant: PlantConfig) -> float:
 
 def scaled(controller: ControllerConfig, factor: float) -> ControllerConfig:
     """Return a controller with all gains multiplied."""
-    gains = {
-        'feedback.gain': controller.feedback.gain,
-        'barrier.weight': controller.barrier.weight,
-        'barrier.slope_limit': controller.barrier.slope_limit,
-        'disturbance.gain': controller.disturbance.gain,
-    }
+    integral = factor * np.array(controller.disturbance.gain)
     stiff = {
-        name: (factor * np.array(values)).tolist() for name, values in gains.items()
+        'feedback.stiffness': factor * controller.feedback.stiffness,
+        'disturbance.gain': integral.tolist(),
     }
     return change(controller, stiff)
 

@@ -3,7 +3,8 @@
 
     tau = - s (K e + D e') + G(q),   e = q - qr
 
-K is `barrier.weight` [N m/rad], D `feedback.gain` [N m s/rad], G the gravity of P^(0).
+K is `feedback.joint_stiffness` [N m/rad], D `feedback.joint_damping` [N m s/rad], G the gravity of
+P^(0).
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ class JointPD(NamedTuple):
             at_rest[i] = 0.0
         settings.model.regressor(signals.q, at_rest, at_rest, at_rest, H)
         for i in range(settings.n):
-            K, D = settings.barrier.weight[i], settings.feedback.gain[i]
+            D = settings.feedback.gain[i]
+            K = settings.barrier.weight[i]
+            K += D * (settings.surface.gain[i] / 2.0 + settings.surface.mu[i])
             error, rate = signals.xi1[i], signals.dq[i] - signals.dqr[i]
             signals.demand[i] = -self.scale * (K * error + D * rate)
             for j in range(settings.p):

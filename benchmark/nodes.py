@@ -55,6 +55,7 @@ _PATIENCE = 120.0  # s for a torque, including compilation of kernels
 _CPUCLOCK_SCHED = 2  # as clock_getcpuclockid(3) does: in ns, where /proc has 10 ms
 _ARMS = {'recommended': 'node', 'panda': 'node with seven joints'}
 _NULL = 'null node'
+_NEVER = 1_000_000_000  # samples: no telemetry
 _QUIET = 'controller, telemetry off'
 _RECORDED = 'controller, telemetry on, recorder'
 _NULL_NODE = 'benchmark.null_node'
@@ -183,7 +184,7 @@ def _started(
     Wait for the first torque.
     """
     is_recorded = name == _RECORDED
-    telemetry = Telemetry(enabled=is_recorded)
+    telemetry = config.telemetry if is_recorded else Telemetry(decimation=_NEVER)
     law = replace(config, telemetry=telemetry, wait_for_subscribers=int(is_recorded))
     folder.mkdir()
     dump(folder / 'config.yaml', {CONTROLLER: law})

@@ -31,6 +31,7 @@ from blf_dsc_controller.analysis.panels import ALARM, COLOURS, panels
 from blf_dsc_controller.cli.result_folder import make_folder
 from blf_dsc_controller.configuration.nodes import LoopConfig, dump, load_loop
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.lyapunov import decay_rate, exponential_bound
 from blf_dsc_controller.law.state import Settings
@@ -104,7 +105,7 @@ _QUIET = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0
 _PUSHED = {'disturbance.constant': [8.0, 0.1]}  # 8 N m against joint 1
 _AT_REST = {'reference.amplitude': [0.0, 0.0], 'reference.offset': START}
 _LEAKY = {  # in the paper's form, eta = 0.02
-    'disturbance.leakage': 0.02,
+    'two_link.leakage': 0.02,
     'law': 'paper',
     'gains.prediction': 'filtered',
     'gains.update': 'newton',
@@ -130,7 +131,7 @@ SWEEPS: dict[
     ),
     'initial parameters [of the truth]': (
         (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
-        lambda value: ({'learning.initial_estimate': [value * each for each in P]}, {}),
+        lambda value: ({'two_link.initial_estimate': [value * each for each in P]}, {}),
     ),
 }
 """Conditions: values of each, and the changes of law and plant for a value."""
@@ -145,7 +146,7 @@ CASES = {
     **{preset: Case(preset) for preset in SIDE_BY_SIDE},
     'paper_quiet': Case('paper', plant=_QUIET),
     'paper_at_rest': Case('paper', _AT_REST),
-    'paper_from_zero': Case('paper', {'learning.initial_estimate': [0.0] * 3}),
+    'paper_from_zero': Case('paper', {'two_link.initial_estimate': [0.0] * 3}),
     'leaky': Case('recommended', {**_LEAKY, 'truth.amplitude': [0.1, 0.1]}),
     'leaky_constant': Case(
         'recommended', _LEAKY, {'disturbance.amplitude': [0.0, 0.0]}
@@ -418,13 +419,12 @@ def _from_zero(results: Results) -> Claim:
 def _swift_torque(results: Results) -> Claim:
     """Evaluate the barrier's torque at the largest error, and a pushed arm."""
     run = results.runs['paper']
-    barrier = CASES['paper'].loop().controller.barrier
+    config = CASES['paper'].loop().controller
+    weight = law_gains(config).weight
     error = np.abs(np.asarray(run.error))
-    ratio = error / np.array(barrier.bound)
+    ratio = error / np.array(config.barrier.bound)
     k, i = np.unravel_index(ratio.argmax(), ratio.shape)
-    torque = (
-        barrier.weight[i] * error[k, i] / np.cos(0.5 * np.pi * ratio[k, i] ** 2) ** 2
-    )
+    torque = weight[i] * error[k, i] / np.cos(0.5 * np.pi * ratio[k, i] ** 2) ** 2
     pushed = ('paper_pushed', 'recommended_pushed')
     paper, recommended = results.ratios(*pushed)
     return Claim(

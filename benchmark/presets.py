@@ -40,8 +40,7 @@ WEIGHED = 25.0  # s
 
 def without_learning(controller: ControllerConfig) -> ControllerConfig:
     """Return a controller that keeps its estimate at first: a PID over the model of the URDF."""
-    count = len(controller.learning.initial_estimate)
-    still = {'learning.weight': 0.0, 'learning.adaptation_gain': [0.0] * count}
+    still = {'learning.enabled': False}
     return change(controller, still)
 
 

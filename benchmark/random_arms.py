@@ -316,13 +316,11 @@ def rival(
     changes: dict[str, object] = {
         'law': law,
         'barrier.bound': [FREE] * n,
-        'barrier.initial_bound': [0.0] * n,
-        'barrier.slope_limit': [2.0 * each for each in robot.stiffness],
-        'barrier.weight': list(robot.stiffness),
-        'feedback.gain': list(robot.damping),
+        'feedback.joint_stiffness': list(robot.stiffness),
+        'feedback.joint_damping': list(robot.damping),
+        'feedback.stiffness': 1.0,
         'disturbance.observer_bandwidth': 0.0,
-        'learning.weight': 0.0,
-        'learning.adaptation_gain': [0.0] * len(config.learning.initial_estimate),
+        'learning.enabled': False,
     }
     return change(change(config, changes), gains)
 

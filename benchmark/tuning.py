@@ -52,17 +52,17 @@ class Task(NamedTuple):
 
 
 _SHARED = (
-    Gain('feedback.gain', 5.0, 200.0, joint=0),
-    Gain('feedback.gain', 2.0, 100.0, joint=1),
-    Gain('learning.adaptation_gain', 0.01, 30.0),
+    Gain('two_link.feedback_gain', 5.0, 200.0, joint=0),
+    Gain('two_link.feedback_gain', 2.0, 100.0, joint=1),
+    Gain('two_link.adaptation_gain', 0.01, 30.0),
 )
 _SURFACE_OF_35 = Gain('gains.surface_gain', 10.0, 300.0)
 _PROPOSED = (
     *_SHARED,
-    Gain('surface.gain', 10.0, 600.0),
-    Gain('surface.mu', 1.0, 100.0),
+    Gain('two_link.surface_gain', 10.0, 600.0),
+    Gain('two_link.mu', 1.0, 100.0),
     Gain('disturbance.gain', 0.1, 300.0),
-    Gain('learning.weight', 0.1, 100.0),
+    Gain('two_link.learning_weight', 0.1, 100.0),
 )
 _COMPARISON = (
     *_SHARED,

@@ -30,6 +30,7 @@ CHOICES = {
     'gains.update': 'newton',
     'gains.compensation': 'reference',
     'gains.bumpless': True,
+    'gains.change_detection': True,
 }
 """What `blf_dsc` does, as gains of the law `paper`."""
 
@@ -100,7 +101,7 @@ def run(config: LoopConfig) -> Loop:
 
 BOUND = 2e-3  # rad
 WINDOW = 2.0 * np.pi  # s
-OFF = {'learning.weight': 0.0}
+OFF = {'two_link.learning_weight': 0.0}
 CHANGED = 20.0  # s
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from blf_dsc_controller.configuration import known_arm, law_file
+from blf_dsc_controller.configuration import known_arm, law_file, two_link
 from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import CONTROLLER, NODES
 from blf_dsc_controller.configuration.schema import (
@@ -52,7 +52,14 @@ def _optional() -> str:
         known_arm.GROUP,
         known_arm.KnownArm,
     )
-    return ''.join((*tables, known))
+    planar = _of_group(
+        'The arm of two links',
+        'The controller has them without `robot.urdf`: the gains of an arm from a URDF follow '
+        'from its stiffness and damping.',
+        two_link.GROUP,
+        two_link.TwoLink,
+    )
+    return ''.join((planar, *tables, known))
 
 
 def _of_group(heading: str, text: str, group: str, cls: type) -> str:

@@ -43,7 +43,7 @@ LATCHED = {ROBOT_DESCRIPTION.resolved: [ROBOT_DESCRIPTION.offered]}
 # Learns within a second: a window of 0.3 s, which is less excited.
 QUICK = {
     'learning.window': 0.3,
-    'learning.excitation_threshold': 1e-7,
+    'two_link.excitation_threshold': 1e-7,
 }
 
 

@@ -46,7 +46,9 @@ class Loop:
         name = f'{self.law.get_fully_qualified_name()}/set_parameters_atomically'
         for _ in range(20):
             gain = ([60.0, 20.0] * self.rng.uniform(0.5, 1.5, 2)).tolist()
-            parameter = Parameter('feedback.gain', value=gain).to_parameter_msg()
+            parameter = Parameter(
+                'two_link.feedback_gain', value=gain
+            ).to_parameter_msg()
             request = SetParametersAtomically.Request(parameters=[parameter])
             self.ros.call(SetParametersAtomically, name, request)
 

@@ -119,7 +119,7 @@ def test_missing_series_and_a_single_sample_are_drawn(run, drawn, tmp_path):
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp('bags')
     recorded_run.record(path / 'one')
-    recorded_run.record(path / 'other', **{'feedback.gain': [30.0, 10.0]})
+    recorded_run.record(path / 'other', **{'two_link.feedback_gain': [30.0, 10.0]})
     synthetic = Synthetic(4000)
     synthetic.error[1234, 0] = -0.005  # one sample far outside
     synthetic.torque[2000:2010, 1] = 20.0  # ten samples at the limit
@@ -231,8 +231,8 @@ def test_several_bags_are_overlaid_and_their_parameter_differences_listed(
     write_report(bags, tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
     assert '<p>1 parameters differ.</p>' in text
-    row = 'blf_dsc_controller: feedback.gain</td><td>[60.0, 20.0]</td><td>[30.0, 10.0]</td>'
-    assert row in text
+    row = 'two_link.feedback_gain</td><td>[60.0, 20.0]</td><td>[30.0, 10.0]</td>'
+    assert f'blf_dsc_controller: {row}' in text
 
 
 def test_page_is_self_contained_and_escapes_names(tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ from blf_dsc_controller.arms.joint_gains import linear, unknown_arm
 from blf_dsc_controller.arms.linear_loop import Joints, Loop, Timing
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.tuning import (
-    adaptation_gain,
     gains_of,
     loop_delay,
     through_inertia,
@@ -34,7 +33,7 @@ class AtRest:
         self.arm = arm._replace(sample_time=period, stiffness=stiffness, joints=joints)
         self.q = np.random.default_rng(3).uniform(*arm.limits, (POSTURES, n))
         self.viscous = np.full(n, 0.1)  # N m s/rad
-        self.Gamma = gains_of(self.arm, None)['learning.adaptation_gain'][0]
+        self.Gamma = gains_of(self.arm).adaptation
 
     def growth(self, Gamma, payload):
         """Return the largest factor of an error within a window, with a payload [kg]."""
@@ -83,11 +82,3 @@ def test_half_of_the_prior_would_diverge_on_slow_loops():
     """What was the gain of every stiff loop."""
     at_rest = AtRest('ur5e', 'whole', 0.01, 0.25)
     assert at_rest.growth(0.5, 0.0) > 10.0
-
-
-def test_gain_is_that_of_the_joint_whose_model_is_least_certain():
-    gain = adaptation_gain(np.array([100.0, 10.0]), np.array([10.0, 10.0]))
-    assert gain == pytest.approx(0.1)  # kg m^2 s^2: 10 / 10^2
-    assert (
-        adaptation_gain(np.ones(2), np.zeros(2)) == 0.5
-    )  # nothing is modelled at rest

@@ -12,7 +12,6 @@ from paper_case import instead
 from blf_dsc_controller.arms.joint_gains import (
     JointGains,
     damped_arm,
-    law_gains,
     linear,
     unknown_arm,
 )
@@ -31,6 +30,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, load_loop, locate
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.factory.settings import settings_of_config
 
 ONE = np.ones((1, 1, 1))  # one joint with a link of 1 kg m^2, in one posture
 TIMING = Timing(0.001, delay=1, drive_lag=0.001, velocity_lag=0.0025)
@@ -207,23 +207,15 @@ def test_gains_of_known_gears_have_the_margin_and_no_more():
     assert arm.margin(linear(stiffer, arm.inertia, 4)).value < MARGIN
 
 
-def test_gains_of_the_law_add_up_to_stiffness_and_damping():
+@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'openarm'])
+def test_gains_of_the_law_add_up_to_stiffness_and_damping(preset):
     """Of a static error: w + K_p (K / 2 + mu) is the stiffness; of a velocity, K_p the damping."""
-    gains = JointGains(np.array([600.0, 50.0]), np.array([30.0, 5.0]))
-    law = law_gains(gains, np.array([1.0, 0.1]))
-    rate = law['surface.gain'] / 2.0 + law['surface.mu']
-    found = law['barrier.weight'] + law['feedback.gain'] * rate
-    np.testing.assert_allclose(found, gains.stiffness)
-    np.testing.assert_allclose(law['feedback.gain'], gains.damping)
-
-
-def test_the_integral_is_smaller_where_a_heavy_arm_is_hardly_damped():
-    gains = JointGains(np.array([600.0]), np.array([30.0]))
-    light, heavy = (gains.integral(np.array([J])) for J in (0.5, 20.0))
-    assert light == pytest.approx(0.45 * gains.rate * gains.damping)
-    # stable without friction: d (1.8 r d) > J 1.5 c r^2 d, three times over
-    slow = 1.5 * gains.rate * heavy
-    assert 20.0 * slow * 3.0 == pytest.approx(gains.damping * 1.8 * gains.rate * 30.0)
+    config = load_loop(preset).controller
+    law = settings_of_config(config)
+    rate = law.surface.gain / 2.0 + law.surface.mu
+    found = law.barrier.weight + law.feedback.gain * rate
+    np.testing.assert_allclose(found, config.feedback.joint_stiffness, rtol=1e-3)
+    np.testing.assert_allclose(law.feedback.gain, config.feedback.joint_damping)
 
 
 def test_the_slow_oscillation_is_damped_with_motors_of_seven_times_the_guess_too():
@@ -232,19 +224,18 @@ def test_the_slow_oscillation_is_damped_with_motors_of_seven_times_the_guess_too
     config = load_loop('panda', {CONTROLLER: changes}).controller
     links, guess, _ = links_of('panda', payload=3.0)
     heavy = np.diagonal(links, axis1=1, axis2=2).max(axis=0) + 7.0 * guess
-    d = np.array(config.feedback.gain)
-    rate = np.array(config.surface.gain) / 0.4
-    damping = (
-        d * 1.8 * rate * d / (heavy * 1.5 * rate * np.array(config.disturbance.gain))
-    )
+    law = settings_of_config(config)
+    d, rate = law.feedback.gain, law.surface.gain / 0.4
+    damping = d * 1.8 * rate * d / (heavy * 1.5 * rate * law.disturbance.gain)
     assert damping.min() > 1.7  # the rule knows twenty postures, these are others
 
 
 @pytest.mark.parametrize('preset', ['ur5e', 'ur5e_driver', 'panda', 'fr3'])
 def test_the_integral_is_weaker_beside_the_load_observer_of_a_torque_loop(preset):
     config = load_loop(preset).controller
-    rate = config.surface.gain[-2] / 0.4
-    share = config.disturbance.gain[-2] / (rate * config.feedback.gain[-2])
+    law = settings_of_config(config)
+    rate = law.surface.gain[-2] / 0.4
+    share = law.disturbance.gain[-2] / (rate * law.feedback.gain[-2])
     most = 0.15 if config.robot.torque_loop else 0.45
     assert share == pytest.approx(most, rel=1e-3)
 

@@ -375,10 +375,10 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     # Soft: with the delays of a busy computer, the gains for 1 kHz would shake the arm.
     at_rest = (
         '    arm: {gravity: 0.0}\n    reference: {type: hold}\n'
-        '    barrier.weight: [1.0, 1.0]\n    barrier.slope_limit: [9.0, 9.0]\n'
-        '    surface: {gain: [1.0, 1.0], mu: [1.0, 1.0]}\n'
-        '    feedback.gain: [1.0, 1.0]\n    disturbance.gain: [0.0, 0.0]\n'
-        '    learning.weight: 0.0\n'
+        '    two_link.barrier_weight: [1.0, 1.0]\n'
+        '    two_link.surface_gain: [1.0, 1.0]\n    two_link.mu: [1.0, 1.0]\n'
+        '    two_link.feedback_gain: [1.0, 1.0]\n    disturbance.gain: [0.0, 0.0]\n'
+        '    two_link.learning_weight: 0.0\n'
     )
     config = tmp_path / 'fifo.yaml'
     out = tmp_path / 'out'

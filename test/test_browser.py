@@ -42,7 +42,7 @@ def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp('pages')
     first = recorded_run.record(folder / 'one', 4.0)
     other = recorded_run.record(
-        folder / 'other', 4.0, **{'feedback.gain': [30.0, 10.0]}
+        folder / 'other', 4.0, **{'two_link.feedback_gain': [30.0, 10.0]}
     )
     write_report([read_bag(first)], folder / 'one.html')
     write_report([read_bag(first), read_bag(other)], folder / 'both.html')

@@ -37,7 +37,7 @@ from blf_dsc_controller.cli.result_folder import (
     make_folder,
 )
 
-HALF = {'learning.initial_estimate': [0.5, 0.16, 0.2]}
+HALF = {'two_link.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 1  # s
 SAMPLES = 1001
 

@@ -487,7 +487,7 @@ def test_chosen_lags_are_written_and_give_way_to_those_of_a_next_time():
 
 def test_arm_whose_damping_lags_is_measured_as_any_other():
     """Its margin as measured is that with the lag; what is chosen does not depend on it."""
-    late = change(CONFIG, {'feedback.damping_lag': 0.003})
+    late = change(CONFIG, {'feedback.joint_damping_lag': [0.003, 0.003]})
     (motion,) = plan(late, POSTURE[None])
     seen = commissioned(late, [simulated.measured(motion, ARM)])
     np.testing.assert_array_equal(seen.start.damping_lag, (0.003, 0.003))
@@ -570,7 +570,7 @@ def test_loop_of_ones_own_has_the_same_motions_and_gains():
     # as from a file: the law's own gains follow from those of the joints
     written = build(ControllerConfig, {**GIVEN, **result.parameters()})
     assert result.config == written
-    assert written.feedback.gain != CONFIG.feedback.gain
+    assert written.disturbance.gain != CONFIG.disturbance.gain
 
 
 def test_gains_of_the_law_in_a_file_give_way_to_those_that_were_chosen(tmp_path):
@@ -578,13 +578,12 @@ def test_gains_of_the_law_in_a_file_give_way_to_those_that_were_chosen(tmp_path)
     file = tmp_path / 'arm.yaml'
     file.write_text(
         '/**/blf_dsc_controller:\n  ros__parameters:\n'
-        '    feedback.gain: [1.0, 1.0]\n    barrier: {weight: [3.0, 3.0], bound: [0.3, 0.3]}\n'
+        '    disturbance.gain: [1.0, 1.0]\n    barrier: {bound: [0.3, 0.3]}\n'
     )
     wide = change(CONFIG, {'barrier.bound': [0.3, 0.3]})
     sections = files.of_commissioned(read(file), found()._replace(before=wide))
     given = sections['/**/blf_dsc_controller']
-    assert 'feedback.gain' not in given
-    assert 'barrier.weight' not in given
+    assert 'disturbance.gain' not in given
     assert given['feedback.joint_damping'] == found().config.feedback.joint_damping
     assert given['barrier.bound'] == [0.3, 0.3]
 
@@ -620,8 +619,7 @@ def test_gains_without_the_margin_are_no_parameters():
 
 def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
     # of the second, more digits than those of a bound that is widened
-    given = {'barrier.bound': [5e-4, 0.3049], 'barrier.funnel_rate': 1.0}
-    tight = change(CONFIG, given | {'barrier.initial_bound': [6e-4, 0.0]})
+    tight = change(CONFIG, {'barrier.bound': [5e-4, 0.3049]})
     run, config = simulated.measured(planned(), ARM)
     result = commissioned(tight, [(run, config)])
     bound = result.parameters()['barrier.bound']
@@ -630,15 +628,11 @@ def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
     assert needed[0] > 5e-4
     assert bound[0] == pytest.approx(1.1 * needed[0], rel=0.05)  # two digits
     assert bound[1] == 0.3049
-    assert result.config.barrier.initial_bound == (bound[0], 0.0)
     assert any('joint1' in each and 'widened' in each for each in sentences(result))
     assert (
         'barrier.bound'
         not in commissioned(
-            change(
-                CONFIG,
-                {'barrier.bound': [0.3, 0.3], 'barrier.initial_bound': [0.0] * 2},
-            ),
+            change(CONFIG, {'barrier.bound': [0.3, 0.3]}),
             [(run, config)],
         ).parameters()
     )
@@ -675,7 +669,6 @@ def moving():
         'reference.frequency': [2.0],
         'reference.phase': [0.0],
         'barrier.bound': [0.01, 0.01],  # rad
-        'barrier.initial_bound': [0.0, 0.0],
     }
     return change(CONFIG, values)
 
@@ -1043,10 +1036,10 @@ def test_an_arm_that_nearly_oscillates_is_measured_with_half_of_its_gains():
     reported = Oscillation(FIRST_STAMP, 'joint2', 25.0, 8.0, 'it oscillates')
     again = commissioning.plan_repeat(first, replace(run.run, oscillations=(reported,)))
     assert (first.share, again.share) == (1.0, 0.5)
-    assert again.config.feedback.gain == tuple(0.5 * stiff.damping)
-    assert (
-        commissioning.motion(POSTURE).config.feedback.gain == again.config.feedback.gain
-    )
+    repeated = commissioning.motion(POSTURE).config
+    for each in (again.config, repeated):
+        damping = settings_of_config(each).feedback.gain
+        np.testing.assert_allclose(damping, 0.5 * stiff.damping)
     chosen = commissioning.result([simulated.measured(again, plant)])
     assert chosen.has_margin
     assert chosen.start.damping == pytest.approx(stiff.damping)

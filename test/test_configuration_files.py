@@ -59,8 +59,8 @@ CHANGED = LoopConfig(
     build(
         ControllerConfig,
         {
-            'barrier.slope_limit': [1e300, 12345.678901234567],
-            'learning.bias': False,
+            'two_link.surface_gain': [1e300, 12345.678901234567],
+            'two_link.bias': False,
         },
     ),
     build(
@@ -452,11 +452,12 @@ def test_the_law_paper_with_all_choices_of_blf_dsc_is_that_law(preset):
         ('compensation', STATE),
         ('bumpless', 0),
         ('known_rate', 0),
+        ('change_detection', 0),
     ],
 )
 def test_each_choice_of_the_law_paper_is_as_printed_unless_it_is_given(name, printed):
     """On an arm from a URDF, for which `blf_dsc` knows the rate."""
-    usual = {'learning.weighing': False, **instead(known_rate=True)}
+    usual = instead(known_rate=True)
     for gains, as_printed in ((usual, False), (without(usual, f'gains.{name}'), True)):
         changes = {CONTROLLER: gains | {'disturbance.observer_bandwidth': 0.0}}
         settings = settings_of_config(load_loop('panda', changes).controller)
@@ -466,11 +467,12 @@ def test_each_choice_of_the_law_paper_is_as_printed_unless_it_is_given(name, pri
             'compensation': settings.compensation,
             'bumpless': settings.disturbance.bumpless,
             'known_rate': settings.surface.known_rate,
+            'change_detection': settings.excitation.change_detection,
         }
         assert (found[name] == printed) == as_printed
         assert settings.friction.bumpless == found['bumpless']
-        finds_changes = not (as_printed and name == 'prediction')
-        assert settings.excitation.change_detection == finds_changes
+        is_checked = not (as_printed and name in ('prediction', 'change_detection'))
+        assert found['change_detection'] == is_checked
 
 
 def without(values, name):

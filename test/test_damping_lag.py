@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damping that lags (`feedback.damping_lag`): in the law, and on arms whose gears give way."""
+"""Damping that lags (`feedback.joint_damping_lag`): in the law, and on elastic arms."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from blf_dsc_controller.supervision.retuning import apply_bumpless
 
 T = 0.001  # s
 LATE = 100.0  # s, when bounds have narrowed
-LAG = {'feedback.damping_lag': 0.003}
+LAG = {'feedback.joint_damping_lag': [0.003] * 6}
 HELD = {
     'reference.type': 'hold',
-    'learning.weight': 0.0,
-    'learning.adaptation_gain': [0.0] * 40,
+    'learning.enabled': False,
 }
 SHAKEN = 3  # the joint
 
@@ -95,12 +94,14 @@ def test_joints_have_the_torques_of_laws_that_have_their_lag_at_all_joints(confi
 
     some = torques(of_joints(0.003, 0.0, 0.005, 0.0, 0.0, 0.003))
     for lag, joints in ((0.003, [0, 5]), (0.0, [1, 3, 4]), (0.005, [2])):
-        alike = torques({'feedback.damping_lag': lag})
+        alike = torques({'feedback.joint_damping_lag': [lag] * 6})
         np.testing.assert_array_equal(some[:, joints], alike[:, joints])
         others = np.delete(np.arange(6), joints)
         assert (some[1:, others] != alike[1:, others]).any(axis=0).all()
     same = torques(of_joints(*(0.003,) * 6))
-    np.testing.assert_array_equal(same, torques({'feedback.damping_lag': 0.003}))
+    np.testing.assert_array_equal(
+        same, torques({'feedback.joint_damping_lag': [0.003] * 6})
+    )
 
 
 def test_the_lag_begins_anew_with_the_first_sample_of_a_start(config):
@@ -131,8 +132,8 @@ def test_gains_that_change_leave_no_part_of_a_jump_behind(config):
     for k in range(200):
         law.update(k * T, T, off)
     before = law.signals.xi2.copy()
-    faster = [1.2 * each for each in config.surface.mu]
-    apply_bumpless(law, change(config, {'surface.mu': faster}), 0.199, off)
+    wider = [1.2 * each for each in config.barrier.bound]
+    apply_bumpless(law, change(config, {'barrier.bound': wider}), 0.199, off)
     law.update(0.2, T, off)
     assert np.abs(law.signals.xi2 - before).min() > 1e-3
     np.testing.assert_allclose(law.state.feedback.late, law.signals.xi2, atol=1e-5)

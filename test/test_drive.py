@@ -27,7 +27,7 @@ from blf_dsc_controller.supervision.braking import braking_matrix
 from blf_dsc_controller.supervision.first_torque import _check_gravity, is_like
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.last_state import LastState
-from blf_dsc_controller.supervision.model_torque import friction_torque, gravity_torque
+from blf_dsc_controller.supervision.model_torque import gravity_torque
 from blf_dsc_controller.supervision.safe_torque import safe_torque
 from blf_dsc_controller.supervision.support import check_support
 
@@ -456,23 +456,6 @@ def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
 )
 def test_torque_is_like_gravity_by_direction_and_magnitude(torque, expected):
     assert is_like(np.array(torque), np.array([4.0, 40.0])) is expected
-
-
-def test_friction_of_an_estimate_is_that_of_its_columns():
-    given = {'learning.viscous': True, 'learning.coulomb': True}
-    settings = settings_of_config(build(ControllerConfig, given))
-    names = estimate_names(build(ControllerConfig, given))
-    estimate = np.arange(1.0, len(names) + 1.0)
-    dq = np.array([0.02, -0.5])
-    columns = dict(zip(names, estimate, strict=True))
-    expected = [
-        columns[f'viscous {joint}'] * speed
-        + columns[f'coulomb {joint}']
-        * np.tanh(speed / settings.columns.coulomb_velocity)
-        for joint, speed in zip(('joint1', 'joint2'), dq, strict=True)
-    ]
-    found = friction_torque(settings, estimate, dq)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize('bias', [True, False])

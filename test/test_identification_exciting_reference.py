@@ -23,7 +23,7 @@ from blf_dsc_controller.identification.exciting_reference import (
 from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
-SIGMA = ControllerConfig().learning.excitation_threshold
+SIGMA = 0.003
 
 
 @cache

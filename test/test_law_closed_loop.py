@@ -167,8 +167,6 @@ def test_sampled_loop_converges_to_the_continuous_one_at_first_order():
 
 
 LATCH = 6.79  # s
-FRICTION = {'disturbance.viscous': [0.3, 0.2], 'disturbance.coulomb': [0.5, 0.3]}
-COLUMNS = {'learning.viscous': True, 'learning.coulomb': True}
 
 
 def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate():
@@ -190,21 +188,10 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
     assert late > 0.1
 
 
-@pytest.mark.parametrize(
-    ('preset', 'bound'), [('recommended', 0.01e-3), ('noisy', 0.05e-3)]
-)
-def test_learned_friction_is_compensated(preset, bound):
-    with_columns = run_preset(30.0, preset=preset, plant=FRICTION, law=COLUMNS)
-    without = run_preset(30.0, preset=preset, plant=FRICTION)
-
-    assert with_columns.largest(15.0).max() < bound
-    assert without.largest(15.0).max() > 3.0 * bound
-
-
 GAINS = {
-    'learning.adaptation_gain': [0.5, 2.0, 1.5],
+    'two_link.adaptation_gain': [0.5, 2.0, 1.5],
     'disturbance.gain': [40.0, 10.0],
-    'barrier.weight': [800.0, 300.0],
+    'two_link.barrier_weight': [800.0, 300.0],
     'truth.phase': [0.0, 0.4],
 }
 
@@ -245,7 +232,7 @@ def test_terms_are_those_of_equation_29(law, own):
 
 def test_energies_of_estimates_that_are_not_adapted_or_unknown_do_not_count():
     frozen = {
-        'learning.adaptation_gain': [0.0, 1.0, 0.0],
+        'two_link.adaptation_gain': [0.0, 1.0, 0.0],
         'disturbance.gain': [0.0, 50.0],
     }
     for t, running, _ in samples('blf_dsc', **frozen):
@@ -314,12 +301,12 @@ def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
     told = change(config, {'gains.learning_weight': 7.0})
     assert (
         settings_of_config(told).adaptation.weight == 7.0
-    )  # not the 100 of learning.weight
+    )  # not the 100 of two_link.learning_weight
 
 
 FROZEN = {
-    'learning.initial_estimate': list(P),
-    'learning.adaptation_gain': [0.0] * 3,
+    'two_link.initial_estimate': list(P),
+    'two_link.adaptation_gain': [0.0] * 3,
     'disturbance.gain': [0.0] * 2,
 }
 
@@ -344,7 +331,11 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(gain, mu, weight):
     reference's acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
     With the known rate of beta2 neither is left, here of the law whose estimate is true and frozen.
     """
-    gains = {'surface.gain': gain, 'surface.mu': mu, 'barrier.weight': weight}
+    gains = {
+        'two_link.surface_gain': gain,
+        'two_link.mu': mu,
+        'two_link.barrier_weight': weight,
+    }
     changes = {name: [value] * 2 for name, value in gains.items()}
     loop = run_preset(8.0, preset='model_based', law=changes)
     rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
@@ -370,7 +361,7 @@ def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
 def test_settings_follow_the_configuration():
     """Learning waits for window and filters, tau_d + T_a of (26)."""
     given = {'learning.window': 0.75}
-    given |= {'learning.adaptation_gain': [1.5, 2.0, 3.0]}
+    given |= {'two_link.adaptation_gain': [1.5, 2.0, 3.0]}
     config = build(ControllerConfig, given)
     settings = settings_of_config(config)
     columns = len(columns_of(config))

@@ -17,11 +17,9 @@ from scipy.linalg import expm
 
 from benchmark.studies import load_study
 from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
-from blf_dsc_controller.law import friction, reversals
-from blf_dsc_controller.law.learning import measure_reversals
+from blf_dsc_controller.law import friction
 from blf_dsc_controller.law.state import sample_of
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.runs import run_chunk
@@ -49,7 +47,7 @@ ROWS = {
 }
 MIXTURES = ('panda, 0.76 kg in 0.5 s', 'ur5e, 1.26 kg put down again')
 """Rows whose first window is a mixture with a small residual."""
-UNCHECKED = {'learning.change_detection': False}
+UNCHECKED = {'gains.change_detection': False}
 
 
 def at_state(row):
@@ -178,17 +176,7 @@ def test_learned_friction_stays_friction():
     assert np.all((learned >= initial / 3.0) & (learned <= 3.0 * initial))
     assert np.any(learned == initial / 3.0)
 
-    planar = configured(
-        'recommended', 1.0, {'learning.coulomb': True, 'learning.viscous': True}
-    )
-    settings = controller_of(planar.controller).settings
-    assert np.all(settings.adaptation.least[-4:] == 0.0)
-    np.testing.assert_allclose(
-        settings.adaptation.most[-4:], [0.05 * 20.0 / 1.5] * 2 + [0.05 * 20.0] * 2
-    )
 
-
-COULOMB = {'learning.coulomb': True}
 BROKEN_BY_FRICTION = [
     ('monte_carlo_ur5e', 51),
     ('monte_carlo_ur5e', 274),
@@ -242,95 +230,13 @@ def test_friction_that_falls_costs_no_more_than_not_having_learned_it(joint, tim
     plant = {f'events.{name}': value for name, value in events.items()}
     plant |= {'events.payload': [], 'disturbance.coulomb': high.tolist()}
     largest = []
-    for learning in ({}, {'learning.weight': 0.0}):
+    for learning in ({}, {'learning.enabled': False}):
         loop = configured('ur5e_rigid', 18.0, learning, plant)
         record = simulate(loop.controller, loop.plant)
         assert not record.run().stops
         errors = np.abs(record.true_errors()[round(1e3 * time) :])
         largest.append(float(errors.max()))
     assert largest[0] < 1.05 * largest[1]
-
-
-def reversing_law():
-    """Return a law with columns of Coulomb friction whose window is full and latched."""
-    law = controller_of(configured('recommended', 1.0, COULOMB).controller)
-    law.state.latch.latched[0] = 1.0
-    law.state.window.rows[0] = law.settings.window.length
-    return law
-
-
-def close_reversal(law):
-    settings, state = law.settings.friction, law.state.friction
-    reversals.close(settings.reversals, state.reversals, 0, state.breakaway[0])
-
-
-def learned_friction(law):
-    """Return the Coulomb friction of its first joint [N m], and what breakaway adds to that."""
-    settings, state = law.settings.friction, law.state.friction
-    k = state.breakaway[0]
-    return reversals.learned(settings.reversals, state.reversals, 0, k)
-
-
-def reverse(law, coulomb, number):
-    """Show the law some reversals of its first joint with a Coulomb friction [N m]."""
-    settings, state = law.settings, law.state
-    for k in range(number):
-        close_reversal(law)
-        sign = (-1.0) ** k
-        for _ in range(300):
-            state.friction.shape_lags[0, 2, 0] = sign
-            state.row.filter2[0, -1] = coulomb * sign
-            measure_reversals(settings, state, law.signals, 0.001)
-
-
-@pytest.mark.parametrize(
-    ('rows', 'least', 'learns'), [(0.4, 0.0, False), (0.6, 0.0, True), (0.4, 0.1, True)]
-)
-def test_friction_is_measured_once_a_window_says_enough(rows, least, learns):
-    """It is half full, or a full one has been latched."""
-    law = reversing_law()
-    law.state.window.rows[0] = rows * law.settings.window.length
-    law.state.latch.least_residual[0] = least
-    reverse(law, 0.8, 5)
-    assert (
-        bool(
-            law.state.friction.reversals.shown.coulomb[0, 0]
-            == pytest.approx(0.8, abs=0.05)
-        )
-        == learns
-    )
-
-
-def test_friction_is_not_forgotten_at_rest():
-    """The sums age by what reversals tell, not by time."""
-    law = reversing_law()
-    settings, state = law.settings, law.state
-    reverse(law, 0.4, 20)
-    state.friction.column_lags[:] = 0.0
-    state.friction.torque_lags[:] = 0.0
-    state.friction.shape_lags[:] = 0.0
-    state.row.filter2[:] = 0.0
-    before = learned_friction(law)
-    assert before[0] == pytest.approx(0.4, abs=0.02)
-    for _ in range(3_000):
-        measure_reversals(settings, state, law.signals, 0.001)
-    assert learned_friction(law) == before
-    state.latch.latched[0] = 0.0
-    measure_reversals(settings, state, law.signals, 0.001)
-    assert state.friction.since_latch[0] == 0.0
-
-
-@pytest.mark.parametrize(
-    ('other', 'number', 'most'), [(0.8, 3, 0.02), (0.42, 40, 0.005)]
-)
-def test_the_last_two_reversals_overrule_older_ones(other, number, most):
-    """Friction that differs by less than what is unmodelled is averaged over eight or so."""
-    law = reversing_law()
-    reverse(law, 0.4, 30)
-    reverse(law, other, number)
-    close_reversal(law)
-    coulomb, _ = learned_friction(law)
-    assert coulomb == pytest.approx(other, abs=most)
 
 
 @pytest.mark.parametrize('seed', range(20))
@@ -491,16 +397,6 @@ def test_friction_that_grows_with_the_load_is_learned():
         rms.append(np.sqrt(np.mean(late**2)))
     assert largest[0] < 0.7 * largest[1]
     assert rms[0] < 0.85 * rms[1]
-
-
-def test_load_friction_needs_coulomb_friction():
-    given = {'learning.coulomb': False}
-    assert not load_loop(
-        'ur5e', {'blf_dsc_controller': given}
-    ).controller.learning.load_friction
-    given['learning.load_friction'] = True
-    with pytest.raises(BlfDscError, match=r'learning\.load_friction: got true without'):
-        load_loop('ur5e', {'blf_dsc_controller': given})
 
 
 def test_weak_ripple_that_is_listed_costs_nothing():

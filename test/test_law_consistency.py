@@ -88,16 +88,6 @@ def test_push_that_lasts_does_not_restart_learning_again_and_again():
     )
 
 
-def test_change_detection_has_no_effect_without_a_change():
-    """Bit for bit: consistency only decides which windows are latched."""
-    for preset in ('noisy', 'excitation', 'two_tone'):
-        assert run_preset(30.0, preset=preset).changes[-1] == 0.0
-    with_detection = run_preset(30.0)
-    without = run_preset(30.0, law={'learning.change_detection': False})
-    assert with_detection.changes[-1] == 0.0
-    np.testing.assert_array_equal(with_detection.torque, without.torque)
-
-
 def test_residual_matches_least_squares():
     controller = run_preset(8.0, NO_DISTURBANCE | FRICTION).controller
     settings = controller.settings

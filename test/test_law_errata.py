@@ -201,8 +201,8 @@ def test_erratum_24_varying_disturbance_adds_a_term_to_the_rate_of_the_lyapunov_
     """
     gain, T = 5.0, 1e-3
     known = {
-        'learning.initial_estimate': list(P),
-        'learning.adaptation_gain': [0.0] * 3,
+        'two_link.initial_estimate': list(P),
+        'two_link.adaptation_gain': [0.0] * 3,
     }
     law = EXACT | known | {'disturbance.gain': [gain, gain]}
     loop = run(configured('recommended', 8.0, law))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from paper_case import instead
 from plain_urdf_law import PlainArm, PlainUrdfLaw
 from random_arm import UR5E, UR5E_TEXT, pinocchio_model
 
@@ -24,7 +25,7 @@ FRICTION_FALLS = {
     'events.coulomb': [0.0, 0.0, 0.0, 0.0, -1.8, 0.0],
 }
 LAW = {
-    'learning.change_detection': False,
+    **instead(known_rate=True, change_detection=False),
     'robot.rotor_inertia': [0.4, 0.4, 0.4, 0.07, 0.07, 0.07],
 }
 WHOLE = {'feedback.inertia': 'whole'}
@@ -32,13 +33,12 @@ CASES = {
     'friction': WHOLE,
     'drives': WHOLE | {'robot.drive_compensates': 'gravity'},
     'ripple': WHOLE | {'learning.ripple_cycles': [20.0, 30.0]},
-    'rejection': WHOLE | {'learning.excitation_threshold': 1e-3},
+    'rejection': WHOLE,
     'joints, each on its own': {
         'feedback.inertia': 'none',
         'feedback.joint_stiffness': [600.0] * 3 + [150.0] * 3,
         'feedback.joint_damping': [40.0] * 3 + [8.0] * 3,
     },
-    'load friction': WHOLE | {'learning.load_friction': True},
 }
 
 

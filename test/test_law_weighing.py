@@ -10,8 +10,6 @@ from paper_case import configured, several
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.estimate import learned_arm
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.weighing import (
@@ -80,16 +78,6 @@ def test_change_makes_the_load_unknown_until_the_filters_have_settled(panda):
     assert (
         half[0] > 2.5 * half[-1]
     )  # friction may have changed since the hand was empty
-
-
-def test_no_torque_depends_on_it(panda):
-    without = record_of('panda_rigid', **{'learning.weighing': False})
-    torque, other = (
-        sample_columns(record.samples, record.controller.settings).torque
-        for record in (panda, without)
-    )
-    np.testing.assert_array_equal(torque, other)
-    assert not np.isfinite(weighed(without)[0]).any()
 
 
 CYCLE, CARRIED = 6.0, 3.0  # s, of pick and place, and with the load
@@ -164,15 +152,6 @@ def test_light_load_is_noticed_and_weighed():
     # What was known before is discarded.
     unknown = t[(t > 6.0) & ~np.isfinite(load[:, 0])]
     assert PICKED_UP < unknown[0] < PICKED_UP + 1.0
-
-
-def test_weighing_what_cannot_be_weighed_is_rejected():
-    given = {'law': 'paper'}
-    with pytest.raises(
-        ConfigurationError, match=r'weighing: got true with .*, but needs'
-    ):
-        configured('panda_rigid', 1.0, {'learning.weighing': True, **given})
-    assert not ControllerConfig().learning.weighing
 
 
 def test_bag_tells_what_was_held_in_the_table_and_on_the_page(panda, tmp_path):

@@ -15,18 +15,14 @@ from closed_loop_case import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from paper_case import NO_DISTURBANCE, configured, run
+from paper_case import configured, run
 from scipy.linalg import eigh
 from symbols import replaced
 
-from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law import (
     adaptation,
-    columns,
     excitation,
-    load_friction,
-    ripple,
     window,
 )
 from blf_dsc_controller.law.innovation import Prior
@@ -263,43 +259,6 @@ def test_column_rejection_is_independent_of_the_starting_direction(missing):
     assert (state.latch.active[p:].sum() < m - p) == (missing > 0.0)
 
 
-def test_columns_match_their_names():
-    learning = {
-        'learning.viscous': True,
-        'learning.coulomb': True,
-        'learning.load_friction': True,
-        'learning.frequencies': [1.5, 4.0],
-        'learning.ripple_cycles': [20.0, 30.0],
-    }
-    config = configured('recommended', 1.0, learning).controller
-    settings = controller_of(config).settings
-    t = 0.7
-    q = np.array([0.2, -0.5])
-    dq = np.array([0.3, -0.1])
-    rows = np.full((2, settings.m), np.nan)
-    columns.fill_columns(settings.columns, t, dq, rows)
-    tau = np.array([-3.0, 2.0])
-    load_friction.fill_measured(settings.columns, tau, dq, rows)
-    for i in range(2):
-        ripple.fill_ripple(settings.columns, i, q[i], rows)
-
-    rubs = np.tanh(dq / 0.01)
-    value = {'bias': np.ones(2), 'viscous': dq, 'coulomb': rubs}
-    value['load_friction'] = np.abs(tau) * rubs
-    for w in (1.5, 4.0):
-        value[f'sin {w:g} rad/s'] = np.full(2, np.sin(w * t))
-        value[f'cos {w:g} rad/s'] = np.full(2, np.cos(w * t))
-    for cycles in (20.0, 30.0):
-        value[f'sin {cycles:g} q'] = np.sin(cycles * q)
-        value[f'cos {cycles:g} q'] = np.cos(cycles * q)
-    names = estimate_names(config)[3:]
-    assert names == tuple(
-        f'{block} {joint}' for block in value for joint in config.joints
-    )
-    expected = np.hstack([np.diag(each) for each in value.values()])
-    np.testing.assert_allclose(rows[:, 3:], expected)
-
-
 def learned(preset, duration, learning, arm):
     """Estimates by name at the end of a run, and which columns are still estimated."""
     config = configured(preset, duration, learning, arm)
@@ -309,25 +268,6 @@ def learned(preset, duration, learning, arm):
         dict(zip(names, values[3:], strict=True))
         for values in (state.estimate, state.latch.active)
     ]
-
-
-def test_friction_columns_recover_friction():
-    """A sinusoidal reference distinguishes viscous from Coulomb friction by the torque's shape."""
-    true = {'viscous': [0.5, 0.2], 'coulomb': [0.3, 0.1]}
-    arm = NO_DISTURBANCE | {
-        f'disturbance.{name}': value for name, value in true.items()
-    }
-    learning = {
-        'learning.viscous': True,
-        'learning.coulomb': True,
-        'learning.excitation_threshold': 1e-4,
-    }
-    arm |= {'disturbance.coulomb_velocity': 0.01}
-    estimate, active = learned('recommended', 20.0, learning, arm)
-    assert all(active.values())
-    for name, values in (true | {'bias': (0.0, 0.0)}).items():
-        for joint, value in zip(('joint1', 'joint2'), values, strict=True):
-            assert estimate[f'{name} {joint}'] == pytest.approx(value, abs=2e-3)
 
 
 def test_same_columns_are_accepted_on_a_two_tone_reference():
@@ -344,7 +284,7 @@ def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
 
     What is rejected is removed from Phi and b altogether, not merely small.
     """
-    learning = {'learning.frequencies': [1.0], 'learning.bias': False}
+    learning = {'learning.frequencies': [1.0], 'two_link.bias': False}
     config = configured('recommended', 7.99, learning)  # ends with an evaluation of Phi
     law = run(config).controller
     names = estimate_names(config.controller)[3:]

@@ -42,7 +42,7 @@ EXAMPLES = {
         'at': 0.9,
     },
     'brake': {},
-    'parameters': {'parameters': {'feedback.gain': [1.0, 2.0]}},
+    'parameters': {'parameters': {'two_link.feedback_gain': [1.0, 2.0]}},
     'drive load': {'mass': 1.5, 'centre': [0.0, 0.0, 0.1]},
     'tare': {},
     'contact': {

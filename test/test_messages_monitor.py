@@ -33,7 +33,7 @@ from blf_dsc_controller.simulation.loop import simulate, write_bag
 LARGEST = np.linalg.eigvalsh([[2.12, 0.72], [0.72, 0.32]])[-1]  # kg m^2, of M stretched
 # (32) is for this form
 PAPER = instead(compensation='state', bumpless=False)
-LEAKY = EXACT | PAPER | {'disturbance.leakage': 0.02, 'disturbance.gain': [50.0, 80.0]}
+LEAKY = EXACT | PAPER | {'two_link.leakage': 0.02, 'disturbance.gain': [50.0, 80.0]}
 
 
 def settings(law):
@@ -63,21 +63,21 @@ def test_largest_inertia_is_that_of_the_stretched_arm():
 @pytest.mark.parametrize(
     ('law', 'rate'),
     [
-        ({'disturbance.leakage': 0.0}, 0.0),
+        ({'two_link.leakage': 0.0}, 0.0),
         ({'disturbance.gain': [0.0, 1.0]}, 0.0),
-        ({'learning.weight': 0.0}, 0.0),
+        ({'two_link.learning_weight': 0.0}, 0.0),
         ({'law': 'backstepping'}, 0.0),
         ({'truth.parameters': []}, 0.0),
         ({'gains.compensation': 'reference'}, 0.0),
         ({'gains.bumpless': True}, 0.0),
         ({}, 0.02 * 50.0),
-        ({'surface.gain': [0.3, 9.0]}, 0.3),
-        ({'learning.weight': 0.1}, 2.0 * 0.1 * 0.5 * 0.003 / (0.003 + 1e-5)),
+        ({'two_link.surface_gain': [0.3, 9.0]}, 0.3),
+        ({'two_link.learning_weight': 0.1}, 2.0 * 0.1 * 0.5 * 0.003 / (0.003 + 1e-5)),
         (
-            {'gains.update': 'gradient', 'learning.weight': 9.0},
+            {'gains.update': 'gradient', 'two_link.learning_weight': 9.0},
             2.0 * 9.0 * 0.5 * 0.003,
         ),
-        ({'feedback.gain': [9.0, 0.4]}, 2.0 * 0.4 / LARGEST),
+        ({'two_link.feedback_gain': [9.0, 0.4]}, 2.0 * 0.4 / LARGEST),
     ],
 )
 def test_decay_rate_is_the_smallest_of_the_four_in_equation_32(law, rate):
@@ -193,7 +193,7 @@ def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_pane
     tmp_path,
 ):
     """Run of 8 s from a bag, truth known, with a cosine column that the reference cannot excite."""
-    learning = {'learning.frequencies': [1.0], 'learning.bias': False}
+    learning = {'learning.frequencies': [1.0], 'two_link.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
     names = estimate_names(config.controller)
     for fresh in (config.controller, configured('model_based', 1.0).controller):

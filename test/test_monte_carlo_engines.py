@@ -300,22 +300,20 @@ def test_run_that_differs_from_its_stored_results_is_reported(whole_store, tmp_p
 
 @pytest.mark.usefixtures('blank_pictures')
 def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
-    text = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true\n    still: true')
+    text = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true')
     a_study = study(tmp_path, LOOP + text, runs=4)
     store = Store.create_or_open(tmp_path / 'pairs', a_study)
     results = whole(a_study)
     store.keep(range(4), results)
     reproduce(store, '2', make_folder(tmp_path / 'run'))
-    for name in ('', 'without_learning', 'other_noise', 'no_adaptation'):
+    for name in ('', 'without_learning', 'other_noise'):
         assert (tmp_path / 'run' / name / 'bag').is_dir()
         law = load_loop(tmp_path / 'run' / name / 'config.yaml').controller
-        assert (law.learning.weight == 0.0) is bool(name)
-        assert any(law.learning.adaptation_gain) is (name != 'no_adaptation')
+        assert law.learning.enabled is not bool(name)
 
     results['outcome'] = np.array(['kept', 'violated', 'kept', 'violated'])
     results['without.outcome'] = np.array(['kept', 'kept', 'violated', 'violated'])
     results['noise.outcome'] = np.array(['violated', 'violated', 'kept', 'kept'])
-    results['still.outcome'] = np.array(['violated', 'kept', 'kept', 'kept'])
     results['noise.first_violation_s'] = np.array([0.1, 0.25, np.nan, np.nan])
     results['without.first_violation_s'] = np.array([np.nan, np.nan, 0.25, 0.25])
     for joint in ('joint1', 'joint2'):
@@ -338,7 +336,6 @@ def test_pairs_are_compared_and_exceptions_are_reproduced(tmp_path, capsys):
     store.keep(range(4), results)
     printed = format_report(summarize(a_study, store.results()), store.folder)
     assert 'broken only with / only without: 1 / 1' in printed
-    assert 'adaptation: bound kept 2 / 3, broken only 2 / 1' in printed
     assert 'bound broken only with learning: 1' in printed
     assert 'error above 1.3 times that without: 1, 0' in printed
     assert (

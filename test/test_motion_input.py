@@ -177,7 +177,7 @@ def test_motion_sent_while_the_reference_is_faster_is_not_rejected(
     seen = np.abs(moved(rig, 1.5)[:, 1])
     limits = rig.config.limits
     allowed = scale * np.array(limits.velocity)
-    gained = 0.5 * ddq * np.abs(ddq) / (scale * np.array(limits.largest_jerk))
+    gained = 0.5 * ddq * np.abs(ddq) / (scale * np.array(limits.jerk))
     begun = np.maximum(np.abs(dq), np.abs(dq + gained))
     assert (seen <= np.maximum(allowed, begun) * (1.0 + 1e-6)).all()
     rig.inputs.take_stop()

@@ -321,7 +321,6 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
             'contact.enabled': True,
             'contact.reaction': reaction,
             'barrier.bound': [0.02] * joints,
-            'barrier.initial_bound': [0.0] * joints,
             'limits.acceleration': [15.0] * joints,  # rad/s^2
             'reference.amplitude': amplitude,
         },

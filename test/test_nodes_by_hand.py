@@ -167,11 +167,11 @@ def test_single_live_state_is_started_from_as_its_sender_waits_for_a_torque(ros)
 @pytest.mark.parametrize(
     ('name', 'value', 'begin', 'end'),
     [
-        ('feedback.gain', [30.0, 10.0], '', ''),
+        ('two_link.feedback_gain', [30.0, 10.0], '', ''),
         (
-            'feedback.gain',
+            'two_link.feedback_gain',
             [4000.0, 15.0],
-            'feedback.gain: K_p over the inertia is ',
+            'two_link.feedback_gain: K_p over the inertia is ',
             '; to use it anyway, start the node with it',
         ),
         (

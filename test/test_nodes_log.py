@@ -184,7 +184,7 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     commands = ros.listen(topics.COMMANDS)
     given = {
         'safety.torque': 'hold_gravity',
-        'learning.initial_estimate': [1.0, 0.32, 0.4],
+        'two_link.initial_estimate': [1.0, 0.32, 0.4],
     }
     clock = FakeClock()
     arm, law = ros.loop(PLAIN, given, clock=clock)
@@ -245,7 +245,7 @@ def test_every_lifecycle_way_out_leaves_the_safe_torque(ros, way, event):
 def test_rejected_columns_are_logged_and_diagnosed_with_the_reason(ros, log):
     """On the paper's reference, cos t on both joints is indistinguishable from m2 l2^2."""
     diagnostics = ros.listen(topics.DIAGNOSTICS)
-    cosine = {'learning.frequencies': [1.0], 'learning.bias': False}
+    cosine = {'learning.frequencies': [1.0], 'two_link.bias': False}
     ros.add(ControllerNode, cosine, namespace='rejected')
     arm = ros.add(
         PlantNode, {'mode': 'lockstep', 'duration': 7.0}, namespace='rejected'

@@ -306,7 +306,7 @@ def assert_runs(ros, arm, law, samples=60):
 
 def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
     waiting = {'wait_for_subscribers': 1}
-    arm, _ = ros.loop(waiting, waiting | {'telemetry__enabled': False})
+    arm, _ = ros.loop(waiting, waiting)
     outputs = topics.JOINT_STATES, topics.TRUTH, topics.COMMANDS
     listener = ros.add(partial(Node, 'listener'))
     for topic in outputs:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from threading import Event
 
 import numpy as np
@@ -209,23 +208,6 @@ def test_header_stamp_sets_the_start_of_a_trajectory(ros):
     np.testing.assert_allclose(reference_at(4.0), two_tones(1.0, 0.0), atol=1e-9)
     np.testing.assert_allclose(reference_at(2.0)[0], [1.8686, 1.2713], atol=1e-4)
     assert phase(law) is blf.Phase.TRACKING
-
-
-def test_narrowing_bound_is_published_with_every_tenth_sample(ros):
-    bounds = ros.listen(replace(topics.BOUND, requested=topics.STREAM))
-    arm, _ = ros.loop(
-        None, {'barrier__initial_bound': [0.02, 0.01], 'barrier__funnel_rate': 5.0}
-    )
-    ros.run(arm, 300)
-    ros.until(lambda: len(bounds) >= 30)
-    t = np.arange(0, 300, 10) * 1e-3
-    published = np.array([message.position for message in bounds[:30]])
-    np.testing.assert_allclose(
-        published[:, 0], 0.002 + 0.018 * np.exp(-5.0 * t), rtol=1e-12
-    )
-    np.testing.assert_allclose(
-        published[:, 1], 0.002 + 0.008 * np.exp(-5.0 * t), rtol=1e-12
-    )
 
 
 @pytest.mark.parametrize('fields', [1, 3])

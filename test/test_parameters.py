@@ -7,6 +7,7 @@ Policy; viewers.
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -41,9 +42,10 @@ from blf_dsc_controller.nodes.plant_node import PlantNode
 @pytest.mark.parametrize('name', NODES)
 def test_node_without_overrides_has_the_defaults(bare_node, name):
     node, cls = bare_node(name), NODES[name]
-    assert declare(node, cls) == cls()
-    assert read(node, cls) == cls()
-    for parameter in parameters(cls):
+    config = declare(node, cls)
+    assert config == build(cls, {})
+    assert read(node, type(config)) == config
+    for parameter in parameters(type(config)):
         assert node.get_parameter(parameter.name).type_.name == parameter.ros_type
 
 
@@ -132,10 +134,9 @@ class Tuned:
         self.node = bare_node('blf_dsc_controller')
         self.applied = []
         self.problems = []
-        declare(self.node, ControllerConfig)
-        on_change(
-            self.node, ControllerConfig, self.applied.append, lambda _: self.problems
-        )
+        self.begun = declare(self.node, ControllerConfig)
+        cls = type(self.begun)
+        on_change(self.node, cls, self.applied.append, lambda _: self.problems)
 
     def request(self, **given):
         """Send one atomic request; `__` stands for the dot."""
@@ -145,7 +146,7 @@ class Tuned:
     @property
     def config(self):
         """The configuration that ROS holds now."""
-        return read(self.node, ControllerConfig)
+        return read(self.node, type(self.begun))
 
 
 @pytest.fixture
@@ -154,29 +155,28 @@ def tuned(bare_node):
 
 
 def test_valid_changes_are_passed_on_once_each_as_a_whole_configuration(tuned):
-    assert tuned.request(feedback__gain=[70.0, 30.0], learning__weight=2.0).successful
+    assert tuned.request(
+        two_link__feedback_gain=[70.0, 30.0], two_link__learning_weight=2.0
+    ).successful
     expected = change(
-        ControllerConfig(), {'feedback.gain': (70.0, 30.0), 'learning.weight': 2.0}
+        tuned.begun,
+        {'two_link.feedback_gain': (70.0, 30.0), 'two_link.learning_weight': 2.0},
     )
     assert tuned.applied == [expected]
     assert tuned.config == expected
-    tuned.request(disturbance__leakage=0.5)
-    assert tuned.applied == [expected, change(expected, {'disturbance.leakage': 0.5})]
+    tuned.request(two_link__leakage=0.5)
+    assert tuned.applied == [expected, change(expected, {'two_link.leakage': 0.5})]
 
 
 @pytest.mark.parametrize(
     ('given', 'message'),
     [
         (
-            {'feedback__gain': [1.0]},
-            'feedback.gain: got 1, but 2 entries are needed (2 of joints)',
-        ),
-        (
-            {'learning__radius': 0.1},
-            'learning.radius: got 0.1 kg m^2, but learning.initial_est',
+            {'two_link__feedback_gain': [1.0]},
+            'two_link.feedback_gain: got 1, but 2 entries are needed (2 of joints)',
         ),
         # ROS itself rejects this, by the descriptor of the parameter.
-        ({'learning__weight': 1}, 'Wrong parameter type, expected'),
+        ({'two_link__learning_weight': 1}, 'Wrong parameter type, expected'),
     ],
 )
 def test_invalid_change_is_rejected_with_the_reason_and_none_of_it_applied(
@@ -186,17 +186,19 @@ def test_invalid_change_is_rejected_with_the_reason_and_none_of_it_applied(
     assert not result.successful
     assert result.reason.startswith(message)
     assert tuned.applied == []
-    assert tuned.config == ControllerConfig()
+    assert tuned.config == tuned.begun
 
 
 def test_changes_that_are_valid_only_together_are_applied_together(tuned):
-    assert not tuned.request(barrier__weight=[3e4, 3e4]).successful
+    lower = [2.0 * math.pi + 0.1] * 2
+    assert not tuned.request(limits__position_lower=lower).successful
+    upper = [8.0, 8.0]
     assert tuned.request(
-        barrier__weight=[3e4, 3e4], barrier__slope_limit=[5e4, 5e4]
+        limits__position_lower=lower, limits__position_upper=upper
     ).successful
-    assert tuned.applied[-1].barrier.weight == (3e4, 3e4)
-    # Now the limit is validated against the current weight, not against the first one.
-    assert not tuned.request(barrier__slope_limit=[2.5e4, 2.5e4]).successful
+    assert tuned.applied[-1].limits.position_upper == (8.0, 8.0)
+    # Now it is validated against the current limit, not against the first one.
+    assert not tuned.request(limits__position_upper=[6.0, 6.0]).successful
 
 
 def test_node_can_reject_a_valid_configuration_of_its_own_parameters_only(tuned):

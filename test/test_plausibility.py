@@ -173,16 +173,12 @@ def test_both_nodes_insist_by_one_list(tmp_path):
     assert loop.plant.sensor.resolution == 0.1
 
 
-FUNNEL = {'barrier.initial_bound': each(0.5), 'barrier.funnel_rate': 1.0}
-
-
 @pytest.mark.parametrize(
     ('given', 'words'),
     [
         # Of the six joints, the widest may err by 0.73 rad.
         ({'barrier.tool_angle_bound': 1.5}, 'barrier.tool_angle_bound: .* give less'),
         ({'barrier.bound': each(0.5)}, 'barrier.bound: 0.5 rad is 28.6 degrees'),
-        (FUNNEL, 'barrier.initial_bound: 0.5 rad is 28.6 degrees'),
         ({'safety.state_timeout': 40.0}, 'safety.state_timeout: in 40 s .* Give 0.04'),
         ({'safety.stop_ramp': 500.0}, 'safety.stop_ramp: in 500 s .* in ms'),
     ],

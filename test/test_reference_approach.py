@@ -268,16 +268,6 @@ def test_waypoints_are_read_point_by_point_and_passed_at_their_times():
     np.testing.assert_array_equal(motion[[0, 2, 3], 1], 0.0)
 
 
-def test_new_bound_is_validated_by_its_present_width():
-    rig = Rig({'barrier.initial_bound': [0.02, 0.02], 'barrier.funnel_rate': 1.0})
-    rig.step(60)
-    guard = rig.guard
-    narrow = {'barrier.bound': [0.1 * np.abs(guard.controller.sample.xi1).max()] * 2}
-    assert guard.problems(blf.change(guard.config, narrow)) == []
-    still = {'barrier.initial_bound': [0.0, 0.0], 'barrier.funnel_rate': 0.0}
-    assert guard.problems(blf.change(guard.config, narrow | still))
-
-
 @pytest.mark.parametrize('at', [120.0, -2.0 * np.pi - 0.11])
 def test_arm_far_beyond_its_limits_is_not_held(at):
     """For example, an arm that reports degrees."""

@@ -122,7 +122,6 @@ def eventful():
             **DAMPED,
             'safety.watchdog': 'on',
             'limits.acceleration': [40.0, 40.0],
-            'limits.jerk': [100.0, 100.0],
         }
     )
     rig.step(50)
@@ -153,7 +152,7 @@ def eventful():
     assert stretched.motion.note
     rig.guard.motions.adopt(stretched)
     rig.step(50)
-    rig.guard.retune(change(rig.config, {'feedback.gain': (50.0, 25.0)}))
+    rig.guard.retune(change(rig.config, {'two_link.feedback_gain': (50.0, 25.0)}))
     rig.step(50)
     rig.guard.deactivate()
     rig.step(30)

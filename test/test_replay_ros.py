@@ -75,7 +75,7 @@ def test_trajectories_and_gain_change_replay_where_they_took_effect(tmp_path):
     sent = trajectory(JOINTS, np.zeros(2), duration=1.0)
     assert send(run.ros, run.law, sent) == ''
     run.run(300)
-    run.change('feedback.gain', [50.0, 25.0])
+    run.change('two_link.feedback_gain', [50.0, 25.0])
     run.run(200)
     begin = run.law.guard.reference.last_stamp + SECOND // 4
     later = trajectory(

@@ -141,7 +141,7 @@ def test_restarted_controller_says_that_the_arm_still_moves():
 def test_start_that_was_planned_from_rest_is_not_used_elsewhere_or_in_motion():
     """It would begin with an error of three quarters of the bound, or with a jerk."""
     bound = 0.05
-    ready = {'barrier.bound': [bound] * 6, 'barrier.initial_bound': [0.0] * 6}
+    ready = {'barrier.bound': [bound] * 6}
     for away, speed in ((0.0, 0.0), (0.75 * bound, 0.0), (0.0, 0.4)):
         arm = Scenario('ur5e', ready | {'reference.type': 'hold'})
         q = arm.plant.measure()[:6].copy()

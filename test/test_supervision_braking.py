@@ -76,7 +76,7 @@ def test_damping_that_is_held_for_a_gap_reverses_no_motion_of_the_model(
 
 def test_without_an_estimate_each_joint_brakes_alone():
     unknown = settings_of_config(
-        change(ControllerConfig(), {'learning.initial_estimate': [0.0, 0.0, 0.0]})
+        change(ControllerConfig(), {'two_link.initial_estimate': [0.0, 0.0, 0.0]})
     )
     D = braking_matrix(unknown, np.array([2.0, 1.0]), np.zeros(2))
     np.testing.assert_array_equal(D, [[2.0, 0.0], [0.0, 1.0]])

@@ -114,7 +114,7 @@ def test_velocities_of_an_arm_that_measures_none_go_on_where_a_reading_is_repeat
 HOLDING = {'safety.torque': 'hold_gravity'}
 QUIET = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 P = np.array([1.0, 0.32, 0.4])
-LEARNED = HOLDING | {'learning.initial_estimate': P.tolist()}
+LEARNED = HOLDING | {'two_link.initial_estimate': P.tolist()}
 NAN = np.full(2, np.nan)
 FIRST = {
     'unreadable': lambda _: b'',

@@ -130,7 +130,7 @@ def test_brakes_are_found_on_any_bound_and_through_the_noise_of_the_encoders(bou
 
 def test_commands_without_effect_stop_the_arm_with_the_model_from_before():
     """Brakes, or an inactive effort controller: the law would learn its own commands."""
-    given = {'learning.initial_estimate': P, 'safety.torque': 'hold_gravity'}
+    given = {'two_link.initial_estimate': P, 'safety.torque': 'hold_gravity'}
     arm = Scenario('recommended', given, plant=QUIET)
     arm.run(0.04)
     held = arm.plant.state.copy()
@@ -152,7 +152,7 @@ def test_constant_command_that_does_not_reach_the_arm_shows_only_in_its_effort(
     effort, stops
 ):
     """An inactive effort controller, on an arm that its drives hold."""
-    hold = {'reference.type': 'hold', 'learning.initial_estimate': P}
+    hold = {'reference.type': 'hold', 'two_link.initial_estimate': P}
     arm = Scenario('recommended', hold | {'robot.effort': effort}, plant=QUIET)
     arm.run(0.1)
     brakes = frozen('q', 'dq')
@@ -234,8 +234,8 @@ def test_weak_drives_are_named_where_no_effort_shows_what_they_give(
 def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     """A drive that is stuck: what is observed of its motion is no load."""
     given = {
-        'learning.initial_estimate': P,
-        'learning.weight': 0.0,
+        'two_link.initial_estimate': P,
+        'two_link.learning_weight': 0.0,
         'safety.torque': 'hold_gravity',
         'safety.damping': [1e-3, 1e-3],
     }

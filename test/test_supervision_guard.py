@@ -15,8 +15,11 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.reference.trajectory import Trajectory
 
 P = np.array([1.0, 0.32, 0.4])
-KNOWN = {'learning.initial_estimate': P.tolist(), 'learning.weight': 0.0}
-HALF = {'learning.initial_estimate': (0.5 * P).tolist(), 'learning.weight': 0.0}
+KNOWN = {'two_link.initial_estimate': P.tolist(), 'two_link.learning_weight': 0.0}
+HALF = {
+    'two_link.initial_estimate': (0.5 * P).tolist(),
+    'two_link.learning_weight': 0.0,
+}
 HOLDING = {'safety.torque': 'hold_gravity'}
 QUIET = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 LEAVE = {
@@ -85,7 +88,7 @@ def test_arm_that_leaves_command_rests_although_its_model_may_be_wrong(
 
     With zero torque the arm falls by 1.5 rad.
     """
-    estimate = {'learning.initial_estimate': (factor * P).tolist()}
+    estimate = {'two_link.initial_estimate': (factor * P).tolist()}
     arm = arm_of(KNOWN | HOLDING | estimate, QUIET)
     before = arm.run(0.5)
     assert (before.speed[-1] > 0.1).all()
@@ -102,7 +105,7 @@ def test_arm_that_leaves_command_rests_although_its_model_may_be_wrong(
 
 def test_reset_of_a_stopped_arm_forgets_what_it_learned_and_drops_nothing():
     """Half of gravity was learned: the load that is carried on grows by what is forgotten."""
-    arm = arm_of(HALF | HOLDING | {'learning.weight': 1.0}, QUIET)
+    arm = arm_of(HALF | HOLDING | {'two_link.learning_weight': 1.0}, QUIET)
     arm.run(9.0)
     learned = arm.controller.estimates
     assert learned['m2*l1*l2'] == pytest.approx(0.4, rel=0.15)
@@ -272,10 +275,10 @@ def test_start_that_was_planned_before_other_limits_is_planned_again():
 # Other parameters in motion.
 
 NEW_GAINS = [
-    {'feedback.gain': [120.0, 40.0]},
-    {'surface.gain': [300.0, 75.0]},
-    {'surface.mu': [40.0, 10.0]},
-    {'barrier.weight': [5000.0, 200.0]},
+    {'two_link.feedback_gain': [120.0, 40.0]},
+    {'two_link.surface_gain': [300.0, 75.0]},
+    {'two_link.mu': [40.0, 10.0]},
+    {'two_link.barrier_weight': [5000.0, 200.0]},
     {'barrier.bound': [0.004, 0.0015]},
 ]
 
@@ -306,7 +309,6 @@ def test_gain_change_is_bumpless(given, samples, most):
 REFUSED = [
     ({'barrier.bound': [1e-6, 0.002]}, 'barrier.bound: joint1 is'),
     ({'torque.limit': [20.0, 2.0]}, 'torque.limit: joint2 is held with'),
-    ({'learning.radius': 0.565}, 'learning.radius: the norm of the estimate is'),
 ]
 
 
@@ -326,14 +328,14 @@ def test_gains_that_a_running_law_cannot_adopt_are_refused(phase, given, message
 def test_correction_of_the_estimate_that_would_diverge_is_refused_once_it_is_made():
     quick = {
         'learning.window': 0.2,
-        'learning.excitation_threshold': 1e-12,
+        'two_link.excitation_threshold': 1e-12,
     }
     arm = arm_of(quick)
-    heavy = {'learning.weight': 2e5}
+    heavy = {'two_link.learning_weight': 2e5}
     arm.run(0.8)
     (problem,) = arm.change(heavy)
-    assert problem.startswith('learning.weight: the Newton step')
-    arm.restart(quick | {'learning.excitation_threshold': 1e9})
+    assert problem.startswith('two_link.learning_weight: the Newton step')
+    arm.restart(quick | {'two_link.excitation_threshold': 1e9})
     arm.run(0.4)
     assert arm.change(heavy) == []
 
@@ -342,7 +344,7 @@ def test_retuning_leaves_a_joint_without_integrator_without_a_disturbance():
     """It would keep it for ever: the torque of that joint steps instead."""
     arm = arm_of({'disturbance.gain': [0.0, 100.0]})
     arm.run(0.06)
-    arm.change({'feedback.gain': [30.0, 10.0]})
+    arm.change({'two_link.feedback_gain': [30.0, 10.0]})
     arm.run(arm.T)
     assert next(iter(arm.controller.disturbance.values())) == 0.0
 

@@ -8,6 +8,7 @@ import pytest
 from scenario import Scenario, carrying, changed, frozen
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.factory.gains import law_gains
 
 LOAD = carrying(2.0)  # of which nobody knows
 HOLD = {'reference.type': 'hold'}
@@ -34,7 +35,7 @@ def holding(arm):
 def damping(arm):
     """Return the damping (n,) [N m] of the velocities that are measured: encoders step."""
     _, dq, _ = arm.plant.measure().reshape(3, -1)
-    return np.array(arm.config.feedback.gain) * np.abs(dq)
+    return law_gains(arm.config).feedback * np.abs(dq)
 
 
 def carried(arm):

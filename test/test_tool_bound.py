@@ -29,6 +29,7 @@ from blf_dsc_controller.configuration.schema import build, change, flatten
 from blf_dsc_controller.configuration.tool_bound import certified, tool_of
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages.topics import TOOL
 from blf_dsc_controller.replay.verify import verify
@@ -216,7 +217,7 @@ def test_tones_of_a_reference_add_up_to_the_region_that_it_needs():
 def test_joint_bounds_follow_from_the_bound_at_the_tool(name):
     loop = preset(name, **{'barrier.tool_bound': 0.003})
     config = loop.controller
-    assert config.barrier.widest == config.barrier.bound  # from the start on
+    assert law_gains(config).initial_bound == config.barrier.bound
     position, angle = certified(config)
     assert 0.99 * 0.003 < position <= 0.003
     # along the reference, at most 1.51 times the worst there
@@ -359,7 +360,6 @@ def tracked():
     """A Panda that tracks with its tool within 3 mm, once its bound has narrowed."""
     given = {
         'barrier.tool_bound': 0.003,
-        'barrier.initial_bound': [0.01] * 7,
         'telemetry.decimation': 1,
     }
     loop = preset('panda_rigid', **given)

@@ -84,14 +84,6 @@ def test_units_are_those_of_the_urdf():
             'got -2 rad for turning, but it must be above limits.position_lower, -1 rad',
         ),
         (
-            {'barrier.bound': [0.1, 0.1], 'barrier.initial_bound': [0.0, 0.05]},
-            'got 0.05 m for sliding, .* at least barrier.bound, 0.1 m',
-        ),
-        (
-            {'barrier.weight': [0.5, 4.0], 'barrier.slope_limit': [9.0, 3.0]},
-            'got 3 N/m for sliding, but it must be above barrier.weight, 4 N/m',
-        ),
-        (
             {'torque.limit': [40.0, 90.0]},
             'got 90 N for sliding, but the URDF gives its drive 40 N;',
         ),

@@ -117,21 +117,25 @@ def linear(gains: JointGains, inertia: Floats, postures: int) -> Feedback:
     )
 
 
-def law_gains(gains: JointGains, inertia: Floats) -> dict[str, Floats]:
-    """Return the gains (n,) of the law, by the dotted name of their parameter.
+class Barriers(NamedTuple):
+    """Gains (n,) of barrier and surface."""
 
-    `inertia` (n,) [kg m^2] is the largest of each joint.
-    """
+    weight: Floats  # w, N m/rad
+    slope_limit: Floats  # N m/rad
+    surface: Floats  # K, 1/s
+    mu: Floats  # 1/s
+
+
+def barriers(gains: JointGains) -> Barriers:
+    """Return what follows from the gains of joints."""
     rate, damping = gains.rate, gains.damping
     barrier_gain, linear_gain = _FILTERED
-    return {
-        'surface.gain': barrier_gain * rate,
-        'surface.mu': linear_gain * rate,
-        'feedback.gain': damping,
-        'barrier.weight': _BARRIER * rate * damping,
-        'barrier.slope_limit': _STEEPEST * rate * damping,
-        'disturbance.gain': gains.integral(inertia),
-    }
+    return Barriers(
+        weight=_BARRIER * rate * damping,
+        slope_limit=_STEEPEST * rate * damping,
+        surface=barrier_gain * rate,
+        mu=linear_gain * rate,
+    )
 
 
 def funnel_rate(gains: JointGains) -> float:

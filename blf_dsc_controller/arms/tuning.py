@@ -31,8 +31,8 @@ from blf_dsc_controller.arms.joint_gains import (
     BESIDE,
     SURFACE,
     JointGains,
+    barriers,
     funnel_rate,
-    law_gains,
 )
 from blf_dsc_controller.arms.known_gears import GearedArm, Gears
 from blf_dsc_controller.arms.linear_loop import Feedback, Timing
@@ -110,70 +110,104 @@ class Design(NamedTuple):
         )
 
 
-def gains_of(arm: Design, bound: np.ndarray | None) -> Mapping[str, Value]:
-    """Return gains and limits by the dotted name of their parameter.
+class Gains(NamedTuple):
+    """Gains of the law (28) that follow from an arm."""
 
-    `bound` (n,) [rad] is the one that is given, or None.
-    """
+    sag: tuple[float, ...]  # (n,) rad, at the start, by gravity that the model lacks
+    funnel_rate: float  # 1/s, at which a bound of that sag narrows
+    weight: tuple[float, ...]  # (n,) w, N m/rad
+    slope_limit: tuple[float, ...]  # (n,) N m/rad
+    surface: tuple[float, ...]  # (n,) K, 1/s
+    mu: tuple[float, ...]  # (n,) 1/s
+    feedback: tuple[float, ...]  # (n,) K_p, N m s/rad
+    damping_rate: float  # omega_v, 1/s
+    integral: tuple[float, ...]  # (n,) gamma, N m/rad
+    adaptation: float  # Gamma, in units of the prior's covariance
+
+
+def gains_of(arm: Design) -> Gains:
+    """Return the gains of the law for an arm."""
     if arm.joints is None:
-        return _of_arm(arm) | _through_inertia(arm, bound)
-    gains = arm.joints.scaled(arm.stiffness)
-    return _of_arm(arm) | _of_joints(arm, gains, bound)
+        return _through_inertia(arm)
+    return _of_joints(arm, arm.joints.scaled(arm.stiffness))
 
 
-def _through_inertia(arm: Design, bound: np.ndarray | None) -> dict[str, Value]:
+def defaults_of(arm: Design) -> Mapping[str, Value]:
+    """Return what follows from an arm, by the dotted name of its parameter."""
+    n = len(arm.chain.joints)
+    gains = gains_of(arm)
+    if arm.joints is None:
+        bound = (float(f'{_BOUND / arm.stiffness**2:.4g}'),) * n
+    else:
+        bound = _listed(np.maximum(gains.sag, _BOUND))
+    return _of_arm(arm) | {
+        'feedback.inertia': 'whole' if arm.joints is None else 'none',
+        'barrier.bound': bound,
+        'disturbance.gain': gains.integral,
+    }
+
+
+def _through_inertia(arm: Design) -> Gains:
     """Return the gains of feedback through the inertia matrix."""
     n = len(arm.chain.joints)
     fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
     rate = arm.stiffness * fastest
-    usual_bound = float(f'{_BOUND / arm.stiffness**2:.4g}')
     postures = arm.over_postures()
     m = postures.free_inertia
-    sag = _SAG * postures.gravity / (m * rate**2)
     integral = _INTEGRAL * m * rate**2
-    Gamma = adaptation_gain(integral, postures.gravity)
-    zeros = (0.0,) * n
-    return {
-        'feedback.inertia': 'whole',
-        'barrier.bound': (usual_bound,) * n,
-        'barrier.initial_bound': _listed(
-            np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
-        ),
-        'barrier.funnel_rate': float(f'{rate / 20.0:.4g}'),
-        'barrier.weight': _listed(_BARRIER * m * rate**2),
-        'barrier.slope_limit': _listed(1.5 * m * rate**2),
-        'surface.gain': (_SURFACE[0] * rate,) * n,
-        'surface.mu': (_SURFACE[1] * rate,) * n,
-        'feedback.gain': zeros,
-        'feedback.damping_rate': _DAMPING * rate,
-        'disturbance.gain': _listed(integral),
-        'learning.adaptation_gain': (Gamma,) * arm.parameters.model.p,
-    }
+    return Gains(
+        sag=tuple((_SAG * postures.gravity / (m * rate**2)).tolist()),
+        funnel_rate=float(f'{rate / 20.0:.4g}'),
+        weight=_listed(_BARRIER * m * rate**2),
+        slope_limit=_listed(1.5 * m * rate**2),
+        surface=(_SURFACE[0] * rate,) * n,
+        mu=(_SURFACE[1] * rate,) * n,
+        feedback=(0.0,) * n,
+        damping_rate=_DAMPING * rate,
+        integral=_listed(integral),
+        adaptation=adaptation_gain(integral, postures.gravity),
+    )
 
 
-def _of_joints(
-    arm: Design, gains: JointGains, bound: np.ndarray | None
-) -> dict[str, Value]:
+def _of_joints(arm: Design, gains: JointGains) -> Gains:
     """Return the gains of joints, each on its own."""
     postures = arm.over_postures()
     pushed = postures.gravity + _PUSH * arm.efforts + arm.friction
     sag = np.minimum(_SAG * pushed / gains.stiffness, WIDEST)
-    usual_bound = np.maximum(sag, _BOUND)
-    start = np.where(sag > (usual_bound if bound is None else bound), sag, 0.0)
     heaviest = (postures.inertia + arm.unknown_rotors) / _HEAVIEST
     inertia = np.maximum(postures.inertia, heaviest)
     beside = gains._replace(share=BESIDE).integral(inertia)
-    Gamma = adaptation_gain(beside, postures.gravity)
-    law = {name: _listed(each) for name, each in law_gains(gains, inertia).items()}
-    return {
-        **law,
-        'feedback.inertia': 'none',
-        'barrier.bound': _listed(usual_bound),
-        'barrier.initial_bound': _listed(start),
-        'barrier.funnel_rate': float(f'{funnel_rate(gains):.4g}'),
-        'feedback.damping_rate': 0.0,
-        'learning.adaptation_gain': (Gamma,) * arm.parameters.model.p,
-    }
+    law = barriers(gains)
+    return Gains(
+        sag=tuple(sag.tolist()),
+        funnel_rate=float(f'{funnel_rate(gains):.4g}'),
+        weight=_listed(law.weight),
+        slope_limit=_listed(law.slope_limit),
+        surface=_listed(law.surface),
+        mu=_listed(law.mu),
+        feedback=_listed(gains.damping),
+        damping_rate=0.0,
+        integral=_listed(gains.integral(inertia)),
+        adaptation=adaptation_gain(beside, postures.gravity),
+    )
+
+
+def initial_bound(gains: Gains, bound: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the bound (n,) [rad] at the start: wider where a joint sags past its `bound`."""
+    sag = np.array(gains.sag)
+    wide = _listed(np.where(sag > bound, sag, 0.0))
+    return tuple(start or each for start, each in zip(wide, bound, strict=True))
+
+
+def initial_estimate(arm: Design) -> tuple[float, ...]:
+    """Return P^(0) (p,) by the description of an arm."""
+    return _listed(arm.parameters.of(arm.chain.inertias, arm.rotors))
+
+
+def radius(arm: Design) -> float:
+    """Return the radius of the ball that P^ stays in: ten times the arm, or its payload."""
+    P = arm.parameters.of(arm.chain.inertias, arm.rotors)
+    return 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload)
 
 
 def linear_surface_gains(arm: Design) -> Mapping[str, Value]:
@@ -212,7 +246,6 @@ def _of_arm(arm: Design) -> dict[str, Value]:
     """Return what does not depend on the feedback: limits, learning, safety."""
     zeros = (0.0,) * len(arm.chain.joints)
     return {
-        'feedback.robust_gain': zeros,
         'truth.constant': zeros,
         'truth.amplitude': zeros,
         'truth.frequency': (1.0,) * len(zeros),
@@ -255,17 +288,9 @@ def _limits_of(arm: Design) -> dict[str, Value]:
 
 def _learning_of(arm: Design) -> dict[str, Value]:
     """Return what learning needs: where it begins, how far it goes, and its filters."""
-    P = arm.parameters.of(arm.chain.inertias, arm.rotors)
-    floor = _UNMODELLED * arm.efforts
     return {
-        'learning.initial_estimate': _listed(P),
-        'learning.radius': 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload),
         'learning.window': _WINDOW,
-        'learning.excitation_threshold': 1e-9,
-        'learning.residual_floor': _listed(floor),
-        'learning.bias': False,
-        'learning.viscous': True,
-        'learning.coulomb': True,
+        'learning.residual_floor': _listed(_UNMODELLED * arm.efforts),
     }
 
 

@@ -347,12 +347,12 @@ def _contacts(content: Content, events: Iterable[Event]) -> tuple[Contact, ...] 
 
 
 def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether the law ever used the prediction error; true if unknown."""
+    """Return whether the law ever learned; true if unknown."""
     laws = {values['law'] for values in settings if 'law' in values}
-    weights = [
-        each['learning.weight'] for each in settings if 'learning.weight' in each
+    switches = [
+        each['learning.enabled'] for each in settings if 'learning.enabled' in each
     ]
-    return laws <= set(OWN) and any(weights or [1.0])
+    return laws <= set(OWN) and any(switches or [True])
 
 
 class TorqueError(BlfDscError):

@@ -60,7 +60,6 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.progress import announce_reading, print_notice, steps
 from blf_dsc_controller.supervision.digits import largest_error
 from blf_dsc_controller.supervision.expected_errors import expected_errors
-from blf_dsc_controller.supervision.gear_warnings import softer_by
 
 Runs = list[tuple[str, Measured]]
 """Runs with their names."""
@@ -259,12 +258,11 @@ def _check_in_motors(config: ControllerConfig) -> None:
     """
     over_bus = 'but a commissioning measures with torques over the bus'
     if expected_errors(config, settings_of_config(config)).is_endless:
-        softer = softer_by(config)
         raise BlfDscError(
             f'drive.feedback: got motor, {over_bus}, where these gains make errors grow from '
             'sample to sample, and would shake the arm. Motors bear more: keep the gains that the '
-            f'maker runs in them, without a commissioning; or lower {softer}, to measure what the '
-            'arm bears over the bus'
+            f'maker runs in them, without a commissioning; or lower feedback.stiffness, to measure '
+            'what the arm bears over the bus'
         )
     print_notice(
         f'warning: drive.feedback is motor, {over_bus}, and chooses gains that the arm bears '

@@ -32,6 +32,7 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.configuration.plant import PlantConfig, Truth
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints, plan_start
 from blf_dsc_controller.reference.turns import reference_near
@@ -167,7 +168,7 @@ def _turned_reference(config: LoopConfig) -> str:
         np.array(values)[order]
         for values in (plant.initial.position, plant.initial.velocity)
     )
-    plan_start(controller, np.array(controller.barrier.widest), q, dq)
+    plan_start(controller, np.array(law_gains(controller).initial_bound), q, dq)
     return reference_near(controller, q)[1]
 
 

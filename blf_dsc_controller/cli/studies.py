@@ -16,7 +16,6 @@ from blf_dsc_controller.analysis.output import write_json
 from blf_dsc_controller.cli.result_folder import make_folder
 from blf_dsc_controller.cli.run import notes_on_ideal_arm
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.studies import laws, report, runs
 from blf_dsc_controller.studies.monte_carlo import load_study
@@ -28,16 +27,11 @@ _PAUSE_IN_A_LOG = 10.0  # s between two lines
 
 def arms(options: Namespace) -> None:
     """Tune and run every law on URDF arms, write figures.json and print the table."""
-    names = laws.chosen_laws(options.laws)  # before there is a folder
+    laws.chosen_laws(options.laws)  # before there is a folder
     for config in options.config:
         loop = laws.trial(config, 0)
         for note in notes_on_ideal_arm(loop):
             print_notice(f'note: {config}: {note}')
-        problems = (laws.unsuitable(each, loop.controller) for each in names)
-        for problem in filter(None, problems):
-            if options.laws:
-                raise BlfDscError(f'--config {config}, {problem}')
-            print_notice(f'note: left out of {config}: {problem}')
     folder = make_folder(options.out)
     with announced_compilation(print_notice):
         found = laws.compare(folder, options.config, options.laws)

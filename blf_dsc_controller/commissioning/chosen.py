@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.arms.tuning import gains_of
+from blf_dsc_controller.arms.tuning import defaults_of
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.plausibility import (
     widest_at_tool,
@@ -26,19 +26,8 @@ from blf_dsc_controller.supervision.expected_errors import ENDLESS, expected_err
 
 Floats = NDArray[np.float64]
 
-FOLLOWED = (
-    'surface.gain',
-    'surface.mu',
-    'feedback.gain',
-    'feedback.damping_rate',
-    'barrier.weight',
-    'barrier.slope_limit',
-    'disturbance.gain',
-)
-"""Gains of the law that are always those of the joints, whatever a file gives."""
-
-# with a bound at the tool, these follow from that one and not from gains
-_BOUNDS = 'barrier.bound', 'barrier.initial_bound'
+INTEGRAL = 'disturbance.gain'
+"""It is always that of the joints, whatever a file gives."""
 
 _SOFT = 'noise or friction hide the response: measure again with a larger --torque or --travel'
 
@@ -77,33 +66,22 @@ def _with_gains(
 ) -> ControllerConfig:
     """Return a configuration with values, and what follows from them but for the bounds."""
     arm, _ = design_of(config)
-    given = _given_bound(config)
-    before = gains_of(arm, given)
+    before = defaults_of(arm)
     of_arm = {
         name: value
         for name, value in values.items()
         if name.startswith(('robot.', 'feedback.joint_'))
     }
     known, _ = design_of(change(config, {**of_arm, 'feedback.stiffness': 1.0}))
-    if 'barrier.bound' in values:
-        given = np.array(values['barrier.bound'], float)
-    after = gains_of(known, given)
     present = flatten(config)
-    by_tool = _BOUNDS if config.barrier.bounds_tool else ()
     followed = {
         name: value
-        for name, value in after.items()
-        if name in FOLLOWED
-        or (name in present and present[name] == before[name] and name not in by_tool)
+        for name, value in defaults_of(known).items()
+        if name == INTEGRAL or (name in present and present[name] == before[name])
     }
+    if config.barrier.bounds_tool:  # from which those of the joints follow
+        followed.pop('barrier.bound', None)
     return change(config, {**followed, **values})
-
-
-def _given_bound(config: ControllerConfig) -> Floats | None:
-    """Return the bounds of the joints (n,) [rad]; None: those that follow from their gains."""
-    bound = config.barrier.bound
-    usual = gains_of(design_of(config)[0], None)['barrier.bound']
-    return None if bound == usual else np.array(bound)
 
 
 def _follow_from_tool(config: ControllerConfig) -> bool:
@@ -115,7 +93,7 @@ def _follow_from_tool(config: ControllerConfig) -> bool:
 def _bounds_of_tool(config: ControllerConfig) -> tuple[float, ...]:
     """Return the bounds (n,) [rad] of the joints that follow from one at the tool."""
     arm, _ = design_of(config)
-    bounds = joint_bounds(flatten(config), config.robot, arm.chain, arm.parameters)
+    bounds = joint_bounds(flatten(config), config.robot, arm)
     return config.barrier.bound if bounds is None else bounds
 
 
@@ -126,7 +104,7 @@ def capped_stop_damping(config: ControllerConfig, damping: Floats) -> dict[str, 
     measured inertia.  Empty, if the configuration gives the damping of a stop.
     """
     arm, _ = design_of(config)
-    usual = gains_of(arm, np.array(config.barrier.bound))['safety.damping']
+    usual = defaults_of(arm)['safety.damping']
     if config.safety.damping != usual:
         return {}
     return {'safety.damping': tuple(np.minimum(usual, damping).tolist())}
@@ -136,8 +114,7 @@ def widened_bounds(config: ControllerConfig) -> dict[str, Value]:
     """Return bounds that are wide enough for the errors to expect, by dotted name; empty: all are.
 
     Friction may act while a load is picked up, so the errors of both add.  Where the bounds of
-    the joints follow from a bound at the tool, that one is widened.  A funnel that is given begins
-    at these bounds at least; others follow.
+    the joints follow from a bound at the tool, that one is widened.
 
     Raises BlfDscError if a joint or the tool would need a bound so wide that it bounds nothing, or
     if the bounds of the joints are given beside one at the tool, and are too narrow.
@@ -151,14 +128,7 @@ def widened_bounds(config: ControllerConfig) -> dict[str, Value]:
     if barrier.bounds_tool:
         return _widened_at_tool(config, least)
     wide = np.maximum(barrier.bound, [float(f'{each:.2g}') for each in least])
-    values: dict[str, Value] = {'barrier.bound': tuple(wide.tolist())}
-    arm, _ = design_of(config)
-    usual = gains_of(arm, _given_bound(config))['barrier.initial_bound']
-    if barrier.initial_bound != usual:
-        starts = np.array(barrier.initial_bound)
-        starts = np.where(starts > 0.0, np.maximum(starts, wide), 0.0)
-        values['barrier.initial_bound'] = tuple(starts.tolist())
-    return values
+    return {'barrier.bound': tuple(wide.tolist())}
 
 
 def _widened_at_tool(config: ControllerConfig, least: Floats) -> dict[str, Value]:

@@ -140,7 +140,7 @@ class Commissioned(NamedTuple):
             of_arm['robot.rotor_inertia'] = _rounded(self.rotors)
         if self.coulomb is not None:
             of_arm['robot.coulomb'] = _rounded(self.coulomb)
-        if self.has_lags or any(self.before.feedback.lags):
+        if self.has_lags or any(self.before.feedback.joint_damping_lag):
             of_arm['feedback.joint_damping_lag'] = _rounded(
                 np.asarray(gains.damping_lag)
             )

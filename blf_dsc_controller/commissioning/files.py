@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from blf_dsc_controller.commissioning.chosen import FOLLOWED
+from blf_dsc_controller.commissioning.chosen import INTEGRAL
 from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.configuration.files import Section
@@ -45,7 +45,7 @@ def of_commissioned(
     given = {'/**': of_robot, f'/**/{CONTROLLER}': own}
     if rotors is not None:
         given[f'/**/{PLANT}'] = {'truth.rotor_inertia': rotors.tolist()}
-    return _with(sections, given, removed=(*FOLLOWED, 'truth.rotor_factor'))
+    return _with(sections, given, removed=(INTEGRAL, 'truth.rotor_factor'))
 
 
 def with_ripple(

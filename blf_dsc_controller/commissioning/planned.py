@@ -133,7 +133,7 @@ def measuring_gains(config: ControllerConfig) -> JointGains:
     """Return the gains with which an arm is measured."""
     arm, _ = design_of(config)
     gains = arm.joints or unknown_arm(arm.rotors)
-    lag = np.array(config.feedback.lags)
+    lag = np.array(config.feedback.lags(len(config.joints)))
     return gains.scaled(arm.stiffness)._replace(damping_lag=lag, share=BESIDE)
 
 

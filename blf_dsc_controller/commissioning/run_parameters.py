@@ -10,6 +10,7 @@ from blf_dsc_controller.arms.joint_gains import BESIDE
 from blf_dsc_controller.arms.tuning import gains_of
 from blf_dsc_controller.commissioning.motion import Excitation
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
+from blf_dsc_controller.factory.gains import law_gains
 
 Floats = NDArray[np.float64]
 
@@ -24,14 +25,12 @@ def shaking_parameters(
     The law learns nothing, so that it is the same at the end as at the beginning.  Torques limit
     the motion, not accelerations: those of fast tones are high, but hardly move a light wrist.
     """
-    count = len(config.learning.initial_estimate)
     limit = np.maximum(config.limits.acceleration, excitation.acceleration)
     return (
         undisturbed_parameters(config)
         | excitation.reference(posture)
         | {
-            'learning.weight': 0.0,
-            'learning.adaptation_gain': [0.0] * count,
+            'learning.enabled': False,
             'limits.acceleration': limit.tolist(),
             'safety.oscillation': 'warn',  # it is measured again with half of the gains
         }
@@ -44,14 +43,12 @@ def undisturbed_parameters(config: ControllerConfig) -> dict[str, object]:
     The bounds are wide, loads are not declared, and a contact stops an arm that would react to it.
     The integral is slow, since coarse encoders make a quick one swing.
     """
-    barrier = config.barrier
-    wide = np.maximum(np.maximum(barrier.bound, barrier.initial_bound), _WIDE_BOUND)
+    wide = np.maximum(law_gains(config).initial_bound, _WIDE_BOUND)
     values: dict[str, object] = {
         'barrier.bound': wide.tolist(),
-        'barrier.initial_bound': [0.0] * len(wide),
         'disturbance.gain': _slow_integral(config).tolist(),
     }
-    if barrier.bounds_tool:
+    if config.barrier.bounds_tool:
         values |= {'barrier.tool_bound': 0.0, 'barrier.tool_angle_bound': 0.0}
     if config.load.tell_drive:
         values |= {'load.tell_drive': False, 'load.service': ''}
@@ -67,5 +64,5 @@ def _slow_integral(config: ControllerConfig) -> Floats:
     if arm.joints is None:
         return usual
     beside = arm._replace(joints=arm.joints._replace(share=BESIDE))
-    slow = np.asarray(gains_of(beside, None)['disturbance.gain'], float)
+    slow = np.array(gains_of(beside).integral)
     return np.asarray(np.minimum(usual, slow))

@@ -44,25 +44,17 @@ def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
     if not given.get('robot.urdf'):
         return {}
     robot, chain = given_robot(given)
-    base = parameters_of(robot, chain)
-    arm = _design(given, robot, chain, base)
-    bound = given.get('barrier.bound')
-    bounds_tool = tool_bound.is_given(given)
-    if bound is None and bounds_tool:
-        usual = tuning.gains_of(arm, None)
-        bound = tool_bound.joint_bounds({**usual, **given}, robot, chain, base)
-    followed = {} if bound is None else {'barrier.bound': bound}
-    if bounds_tool:  # which holds from the start on
-        followed['barrier.initial_bound'] = (0.0,) * len(chain.joints)
-    is_whole = bound is not None and len(bound) == len(chain.joints)
+    arm = used_design(given, robot, chain, parameters_of(robot, chain))
+    usual = tuning.defaults_of(arm)
+    if 'barrier.bound' not in given and tool_bound.is_given(given):
+        bound = tool_bound.joint_bounds({**usual, **given}, robot, arm)
+        if bound is not None:
+            usual = {**usual, 'barrier.bound': bound}
     return {
         **described(robot, chain),
-        'learning.weighing': has_exact_rows(given),
         'feedback.stiffness': arm.stiffness,
         'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
-        'learning.load_friction': _has_load_friction(given, robot, arm),
-        **tuning.gains_of(arm, np.array(bound) if is_whole else None),
-        **followed,
+        **usual,
         **_gains_of_law(given, arm),
     }
 
@@ -77,7 +69,7 @@ def _gains_of_law(given: Mapping[str, Any], arm: tuning.Design) -> dict[str, Val
     return {f'{GROUP}.{name}': usual[name] for name in names & usual.keys()}
 
 
-def _design(
+def used_design(
     given: Mapping[str, Any], robot: Robot, chain: Chain, base: BaseParameters
 ) -> tuning.Design:
     """Return what the gains follow from: as given, by known gears, or of an unknown arm."""
@@ -126,16 +118,6 @@ def _observer_bandwidth(
     is_own = given.get('law', LAWS[0]) in OWN and has_exact_rows(given)
     is_soft = arm.joints is not None
     return _OBSERVER if has_sensors and is_own and is_soft else 0.0
-
-
-def _has_load_friction(
-    given: Mapping[str, Any], robot: Robot, arm: tuning.Design
-) -> bool:
-    """Whether friction that grows with the load is learned: a torque loop hides it."""
-    is_own = given.get('law', LAWS[0]) in OWN and has_exact_rows(given)
-    has_friction = given.get('learning.coulomb', True)
-    is_soft = arm.joints is not None
-    return bool(is_own and is_soft and has_friction and not robot.torque_loop)
 
 
 def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:

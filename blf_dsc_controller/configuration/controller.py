@@ -17,10 +17,14 @@ from blf_dsc_controller.configuration import (
     law_file,
     plausibility,
     tool_bound,
+    two_link,
 )
-from blf_dsc_controller.configuration.arm_defaults import followed_by, stated_design
+from blf_dsc_controller.configuration.arm_defaults import (
+    followed_by,
+    stated_design,
+    used_design,
+)
 from blf_dsc_controller.configuration.controller_groups import (
-    ArmGeometry,
     Barrier,
     CommissionedGains,
     Contact,
@@ -29,7 +33,6 @@ from blf_dsc_controller.configuration.controller_groups import (
     Feedback,
     Learning,
     Safety,
-    Surface,
     Telemetry,
     Torque,
     sizing,
@@ -70,12 +73,10 @@ class ControllerConfig(ArmConfig):
         f'control law: {", ".join(LAWS)}, or a Python file that defines one',
         kept=law_file.kept,
     )
-    arm: ArmGeometry = ArmGeometry()
     reference: Reference = Reference()
     approach: Approach = Approach()
     limits: MotionLimits = MotionLimits()
     barrier: Barrier = Barrier()
-    surface: Surface = Surface()
     feedback: Feedback = Feedback()
     disturbance: DisturbanceEstimate = DisturbanceEstimate()
     torque: Torque = Torque()
@@ -94,7 +95,8 @@ class ControllerConfig(ArmConfig):
         """
         law = given.get('law', LAWS[0])
         gains = gains_of(law) if isinstance(law, str) else None
-        return _with_groups(gains, knows=known_arm.is_asked_for(given))
+        knows = known_arm.is_asked_for(given)
+        return _with_groups(gains, knows=knows, planar=not given.get('robot.urdf'))
 
     @property
     def model(self) -> Literal['two_link', 'urdf']:
@@ -121,10 +123,6 @@ class ControllerConfig(ArmConfig):
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other and against the model."""
         needed, count = self._sizes()
-        misfits = list(self._weighing_problems())
-        if misfits:
-            yield from misfits
-            return
         yield from self._drive_load_problems()
         yield from self._contact_problems()
         yield from self._observer_problems()
@@ -132,13 +130,11 @@ class ControllerConfig(ArmConfig):
         yield from self.arm_problems(f'model {self.model}', needed)
         yield from self.reference.problems()
         yield from self.limits.problems(self.joints, self.units)
-        yield from self.barrier.problems(self.joints, self.units)
         yield from tool_bound.problems(self)
-        radius = self.learning.radius
         known = known_arm.known_arm(self)
         if known:
-            yield from known.problems(self.law, self.model, count, radius)
-        yield from self.learning.problems(self.sample_time, self.model, count)
+            yield from known.problems(self.law, self.model, count)
+        yield from self.learning.problems(self.sample_time)
         yield from plausibility.problems_of_controller(self)
 
     def _sizes(self) -> tuple[int | None, int]:
@@ -146,17 +142,20 @@ class ControllerConfig(ArmConfig):
         if self.model == 'urdf':
             base = parameters_of(self.robot, self.robot.chain(self.joints))
             return None, base.model.p
-        model = arm_model(self.arm.l1, self.arm.gravity)
+        given = two_link.two_link(self)
+        model = arm_model(given.l1, given.gravity)
         return model.n, model.p
 
-    def _weighing_problems(self) -> Iterator[str]:
-        """Check that the load in the tip can be weighed."""
-        can_weigh = self.model == 'urdf' and self._has_exact_rows()
-        if self.learning.weighing and not can_weigh:
-            yield (
-                f'learning.weighing: got true with model {self.model} and {self._rows()}, but '
-                f'needs robot.urdf{_FILTERED}'
-            )
+    @property
+    def weighs(self) -> bool:
+        """Whether what `robot.tip` holds is weighed: by exact rows of an arm from a URDF."""
+        return self.model == 'urdf' and self._has_exact_rows()
+
+    @property
+    def learns_load_friction(self) -> bool:
+        """Whether friction that grows with the load is learned: a torque loop hides it."""
+        is_soft = self.law in OWN and self.feedback.inertia == 'none'
+        return self.weighs and is_soft and not self.robot.torque_loop
 
     def _has_exact_rows(self) -> bool:
         """Whether loads and contacts show in the rows that the law learns from."""
@@ -169,14 +168,14 @@ class ControllerConfig(ArmConfig):
 
     def _drive_load_problems(self) -> Iterator[str]:
         """Check that the load can be declared to the drives, and how."""
-        load, learning = self.load, self.learning
+        load = self.load
         compensates = self.robot.drive_compensates != 'none'
-        if load.tell_drive and not (learning.weighing and compensates):
+        if load.tell_drive and not (self.weighs and compensates):
             yield (
-                f'load.tell_drive: got true with learning.weighing '
-                f'{str(learning.weighing).lower()} and robot.drive_compensates '
-                f'{self.robot.drive_compensates}, but needs a load that is weighed and drives that '
-                'compensate gravity'
+                f'load.tell_drive: got true with model {self.model}, {self._rows()} and '
+                f'robot.drive_compensates {self.robot.drive_compensates}, but needs a load that is '
+                f'weighed, by robot.urdf and {LAWS[0]}{_FILTERED}, and drives that compensate '
+                'gravity'
             )
         if load.service and not load.tell_drive:
             yield (
@@ -230,24 +229,17 @@ class ControllerConfig(ArmConfig):
             yield (
                 f'feedback.stiffness: got {feedback.stiffness:g} with model {self.model}, but only '
                 'the gains of an arm from a URDF follow from it: leave it at 1, and lower '
-                'feedback.gain and surface.gain'
+                'two_link.feedback_gain and two_link.surface_gain'
             )
         if feedback.inertia == 'whole' and feedback.stiffness > 1.0:
             yield (
                 f'feedback.stiffness: got {feedback.stiffness:g} with feedback.inertia whole, but '
                 'the delay of the loop allows at most 1'
             )
-        if feedback.inertia == 'none' and feedback.damping_rate > 0.0:
+        if any(feedback.joint_damping_lag) and feedback.inertia == 'whole':
             yield (
-                f'feedback.damping_rate: got {feedback.damping_rate:g} 1/s, which acts through '
-                'the inertia matrix, with feedback.inertia none: give feedback.joint_damping'
-            )
-        if any(feedback.lags) and feedback.damping_rate > 0.0:
-            name = 'joint_damping_lag' if feedback.joint_damping_lag else 'damping_lag'
-            yield (
-                f'feedback.{name}: got {max(feedback.lags):g} s, which is the lag of '
-                f'feedback.gain alone, with a feedback.damping_rate of {feedback.damping_rate:g} '
-                '1/s: set one of them to 0'
+                f'feedback.joint_damping_lag: got {max(feedback.joint_damping_lag):g} s with '
+                'feedback.inertia whole, whose damping has no lag: set it to 0'
             )
         yield from self._joint_gain_problems()
 
@@ -274,6 +266,18 @@ class ControllerConfig(ArmConfig):
             )
 
 
+def law_gains_of(config: ControllerConfig) -> tuning.Gains:
+    """Return the gains of the law for an arm from a URDF."""
+    return tuning.gains_of(used_design_of(config))
+
+
+def used_design_of(config: ControllerConfig) -> tuning.Design:
+    """Return what the gains of an arm from a URDF follow from: its gears, if nothing is given."""
+    chain = config.robot.chain(config.joints)
+    base = parameters_of(config.robot, chain)
+    return used_design(flatten(config), config.robot, chain, base)
+
+
 def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
     """Return what the gains of an arm from a URDF follow from, and its gears, if known."""
     chain = config.robot.chain(config.joints)
@@ -282,9 +286,13 @@ def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
 
 
 @functools.cache
-def _with_groups(gains: type | None, *, knows: bool) -> type[ControllerConfig]:
-    """Return the configuration with the group of gains of a law, and that of known data."""
+def _with_groups(
+    gains: type | None, *, knows: bool, planar: bool
+) -> type[ControllerConfig]:
+    """Return the configuration with the gains of a law, known data, and those of two links."""
     groups: dict[str, type] = {}
+    if planar:
+        groups[two_link.GROUP] = two_link.TwoLink
     if knows:
         groups[known_arm.GROUP] = known_arm.KnownArm
     if gains:

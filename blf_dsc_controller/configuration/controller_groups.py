@@ -8,10 +8,10 @@ The gains are those of the control laws (28) and (35), and of composite learning
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Literal
 
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
@@ -19,7 +19,6 @@ from blf_dsc_controller.configuration.schema import (
     parameter,
     positive,
 )
-from blf_dsc_controller.run import JointUnits
 
 _of_tool = partial(
     non_negative,
@@ -122,17 +121,6 @@ class Telemetry:
 
 
 @dataclass(frozen=True)
-class ArmGeometry:
-    """Known geometry in the regressor.
-
-    The masses and the length of the second link are learned.
-    """
-
-    l1: float = in_window(1.0, 'length of the first link', 'm', 'l1', above=0.0)
-    gravity: float = in_window(9.8, 'gravity; 0 for a horizontal arm', 'm/s^2', 'g')
-
-
-@dataclass(frozen=True)
 class Barrier:
     """Bound on the tracking error, and the barrier that enforces it."""
 
@@ -147,82 +135,11 @@ class Barrier:
         'bound on the angle error of robot.tip, from which `bound` follows; 0: none',
         'rad',
     )
-    initial_bound: PerJoint = non_negative(
-        (0.0, 0.0),
-        'initial bound of a funnel that narrows to `bound`; 0: constant',
-        'rad',
-        'k_0',
-    )
-    funnel_rate: float = non_negative(
-        0.0, 'rate at which the funnel narrows', '1/s', 'a'
-    )
-    weight: PerJoint = positive(
-        (1000.0, 1000.0),
-        'stiffness of the barrier at zero error; 1 in the paper',
-        'N m/rad',
-        'w',
-    )
-    slope_limit: PerJoint = positive(
-        (2e4, 2e4),
-        'stiffness at which the barrier continues linearly',
-        'N m/rad',
-        'S_lim',
-    )
 
     @property
     def bounds_tool(self) -> bool:
         """Whether there is a bound at the tool."""
         return self.tool_bound > 0.0 or self.tool_angle_bound > 0.0
-
-    @property
-    def widest(self) -> tuple[float, ...]:
-        """Bound of each joint at the start [rad]."""
-        return tuple(
-            initial or bound
-            for initial, bound in zip(self.initial_bound, self.bound, strict=True)
-        )
-
-    def problems(
-        self, joints: tuple[str, ...], units: Sequence[JointUnits]
-    ) -> Iterator[str]:
-        """Check the weight against the slope limit, and the bounds of the funnel."""
-        for joint, given, weight, limit in zip(
-            joints, units, self.weight, self.slope_limit, strict=True
-        ):
-            unit = given.of('N m/rad')
-            if limit <= weight:
-                yield (
-                    f'barrier.slope_limit: got {limit:g} {unit} for {joint}, but it must be above '
-                    f'barrier.weight, {weight:g} {unit}'
-                )
-        for joint, (unit, _, _), initial, bound in zip(
-            joints, units, self.initial_bound, self.bound, strict=True
-        ):
-            if 0.0 < initial < bound:
-                yield (
-                    f'barrier.initial_bound: got {initial:g} {unit} for {joint}, but it must be 0 '
-                    f'(no funnel) or at least barrier.bound, {bound:g} {unit}'
-                )
-        if self.funnel_rate == 0.0 and self.widest != self.bound:
-            yield (
-                'barrier.funnel_rate: got 0 1/s, but barrier.initial_bound must narrow to '
-                'barrier.bound: give the rate'
-            )
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Virtual control (15), (18) and the surface filter (13)."""
-
-    gain: PerJoint = non_negative(
-        (150.0, 150.0), 'gain of the virtual control on the tracking error', '1/s', 'K'
-    )
-    mu: PerJoint = non_negative(
-        (20.0, 20.0),
-        'gain of the virtual control that remains at the bound',
-        '1/s',
-        'mu',
-    )
 
 
 @dataclass(frozen=True)
@@ -232,7 +149,7 @@ class Feedback:
     inertia: Literal['none', 'surface', 'whole'] = _at_start(
         'surface',
         'what of the feedback acts through the inertia matrix of '
-        'learning.initial_estimate: none of it, so that each joint has gains of its own '
+        'P^(0): none of it, so that each joint has gains of its own '
         '(default for a URDF), the rate of the surface filter (paper), or the whole',
     )
     joint_stiffness: PerJoint = _from_urdf(
@@ -249,37 +166,18 @@ class Feedback:
         'of the gains relative to what the delay allows, at most 1',
         read_only=_FOLLOWED,
     )
-    gain: PerJoint = non_negative(
-        (60.0, 20.0), 'gain on the velocity error', 'N m s/rad', 'K_p'
-    )
-    damping_lag: float = non_negative(
-        0.0,
-        'lag of the damping by gain; 0: none. A few ms where gears give way and encoders '
-        'are at the links',
-        's',
-        read_only='it sets the size of the state of the law',
-    )
     joint_damping_lag: PerJoint = non_negative(
         (),
-        'the same of each joint, instead of damping_lag; empty: damping_lag of all',
+        'lag of the damping of each joint; empty: none. A few ms where gears give way and '
+        'encoders are at the links',
         's',
         read_only='it sets the size of the state of the law',
         omittable=True,
     )
-    damping_rate: float = non_negative(
-        0.0,
-        'rate of damping, scaled by the inertia of learning.initial_estimate',
-        '1/s',
-        'omega_v',
-    )
-    robust_gain: PerJoint = non_negative(
-        (0.0, 0.0), 'robust term d2 |xi1| sat(xi2/b)', 'N m/rad', 'd2'
-    )
 
-    @property
-    def lags(self) -> tuple[float, ...]:
-        """Lag of the damping of each joint [s]."""
-        return self.joint_damping_lag or (self.damping_lag,) * len(self.gain)
+    def lags(self, n: int) -> tuple[float, ...]:
+        """Return the lag of the damping of each of n joints [s]."""
+        return self.joint_damping_lag or (0.0,) * n
 
 
 @dataclass(frozen=True)
@@ -291,9 +189,6 @@ class DisturbanceEstimate:
         'adaptation gain of the disturbance estimate; 0: no estimate',
         'N m/rad',
         'gamma',
-    )
-    leakage: float = non_negative(
-        0.0, 'leakage of the disturbance estimate', 'rad/(N m s)', 'eta'
     )
     observer_bandwidth: float = non_negative(
         0.0,
@@ -325,39 +220,18 @@ class Torque:
     )
 
 
-def misfits(
-    name: str, P: tuple[float, ...], model: str, count: int, radius: float
-) -> Iterator[str]:
-    """Check that parameters P are those of a model, and inside the ball."""
+def misfits(name: str, P: tuple[float, ...], model: str, count: int) -> Iterator[str]:
+    """Check that parameters P are those of a model."""
     if len(P) != count:
         yield f'{name}: got {len(P)}, but model {model} has {count} parameters'
-    if (norm := math.hypot(*P)) >= radius:
-        yield (
-            f'learning.radius: got {radius:g} kg m^2, but {name} has a norm of {norm:.6g} kg m^2 '
-            'and would be shrunk to the ball: the radius must be larger'
-        )
 
 
 @dataclass(frozen=True)
 class Learning:
     """Composite learning of the parameters P and of the disturbance columns."""
 
-    initial_estimate: tuple[float, ...] = _at_start(
-        (0.5, 0.16, 0.2),
-        'initial estimate of (m1+m2)*l1^2, m2*l2^2, m2*l1*l2',
-        'kg m^2',
-        'P^(0)',
-    )
-    adaptation_gain: Annotated[tuple[float, ...], 'learning.initial_estimate'] = (
-        non_negative((0.5, 0.5, 0.5), 'diagonal of the adaptation gain', symbol='Gamma')
-    )
-    weight: float = non_negative(
-        100.0, 'weight of the prediction error; 0: no learning from it', symbol='kappa'
-    )
-    excitation_threshold: float = positive(
-        0.003,
-        'minimum eigenvalue of the excitation matrix of an excited window',
-        symbol='sigma',
+    enabled: bool = parameter(
+        True, 'learn the arm while it moves; false: keep what is known of it'
     )
     window: float = sizing(
         2.0 * math.pi,
@@ -365,15 +239,6 @@ class Learning:
         's',
         'tau_d',
         above=0.0,
-    )
-    bias: bool = sizing(True, 'also estimate a constant disturbance of each joint')
-    viscous: bool = sizing(False, 'also estimate the viscous friction of each joint')
-    coulomb: bool = sizing(False, 'also estimate the Coulomb friction of each joint')
-    load_friction: bool = sizing(
-        False,
-        'also estimate the share of the torque in its gear by which the Coulomb friction of each '
-        'joint grows; needs learning.coulomb. True by default where an arm from a URDF has gains '
-        'of joints and no torque loop',
     )
     frequencies: tuple[float, ...] = sizing(
         (),
@@ -389,30 +254,14 @@ class Learning:
         above=0.0,
         omittable=True,
     )
-    radius: float = positive(
-        3.0, 'radius of the projection ball of P^', 'kg m^2', 'omega_a'
-    )
-    change_detection: bool = sizing(
-        True, 'discard a window that torques contradict, because the arm has changed'
-    )
     residual_floor: PerJoint = positive(
         (0.07, 0.07),
         'rms unmodelled torque that is not treated as a change of the arm',
         'N m',
     )
-    weighing: bool = sizing(
-        False,
-        'weigh what has been added to robot.tip since the first window (arm '
-        'from a URDF)',
-    )
 
-    def problems(self, sample_time: float, model: str, count: int) -> Iterator[str]:
-        """Check the window's size, the columns, and the initial estimate against model and ball."""
-        if self.load_friction and not self.coulomb:
-            yield (
-                'learning.load_friction: got true without learning.coulomb, with which it changes '
-                'sign: write learning.coulomb: true, or learning.load_friction: false'
-            )
+    def problems(self, sample_time: float) -> Iterator[str]:
+        """Check the window's size."""
         samples = self.window / sample_time
         (fewest, most) = _SAMPLES
         if not fewest - 0.5 <= samples <= most + 0.5:
@@ -423,13 +272,6 @@ class Learning:
             if sample_time >= _SLOW:
                 text += f'; if sample_time is in ms, give {1e-3 * sample_time:g}'
             yield text
-        yield from misfits(
-            'learning.initial_estimate',
-            self.initial_estimate,
-            model,
-            count,
-            self.radius,
-        )
 
 
 @dataclass(frozen=True)
@@ -437,8 +279,7 @@ class DeclaredLoad:
     """Whether the weighed load is declared to drives that compensate gravity, and how."""
 
     tell_drive: bool = sizing(
-        False,
-        'declare the load of learning.weighing to the drives, once it is known well',
+        False, 'declare the weighed load to the drives, once it is known well'
     )
     service: str = sizing(
         '',
@@ -477,7 +318,7 @@ class Contact:
     )
     loads: bool = parameter(
         True,
-        'with learning.weighing: what a load at the tip could explain is not a contact',
+        'what a load at the tip could explain is not a contact',
     )
 
 

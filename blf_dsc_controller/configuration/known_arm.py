@@ -7,7 +7,6 @@ knows it of a real arm.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -41,17 +40,12 @@ class KnownArm:
     )
     phase: PerJoint = _known((0.0, 0.0), 'phase of the sinusoid', 'rad')
 
-    def problems(
-        self, law: str, model: str, count: int, radius: float
-    ) -> Iterator[str]:
-        """Check that the parameters fit model and ball, and are given if required."""
+    def problems(self, law: str, model: str, count: int) -> Iterator[str]:
+        """Check that the parameters fit the model, and are given if required."""
         if law == 'model_based' and not self.parameters:
             yield 'truth.parameters: got none, but the law model_based needs them'
         if self.parameters:
-            largest = radius if law == 'model_based' else math.inf
-            yield from misfits(
-                'truth.parameters', self.parameters, model, count, largest
-            )
+            yield from misfits('truth.parameters', self.parameters, model, count)
 
 
 NAMES = frozenset(f'{GROUP}.{param.name}' for param in parameters(KnownArm))

@@ -38,6 +38,11 @@ class Paper:
         'let the disturbance estimate offset the torque that the prediction error adds; '
         'false: (30)',
     )
+    change_detection: bool = parameter(
+        False,
+        'discard a window that torques contradict, because the arm has changed',
+        read_only='the data in the excitation window depend on it',
+    )
     known_rate: bool = parameter(
         False,
         'tell the surface filter the rate of the virtual control, by the reference and the '
@@ -58,6 +63,19 @@ class LinearSurface:
         'gain of the linear surface alpha2 = dqr - lambda_s z1',
         '1/s',
         'lambda_s',
+    )
+    feedback_gain: PerJoint = non_negative(
+        (),
+        'gain on the surface; empty: that of blf_dsc',
+        'N m s/rad',
+        'K_c',
+        omittable=True,
+    )
+    adaptation_gain: tuple[float, ...] = non_negative(
+        (),
+        'diagonal of the adaptation gain of P; empty: that of blf_dsc',
+        symbol='Gamma',
+        omittable=True,
     )
     learning_weight: float = non_negative(
         0.0,

@@ -95,24 +95,17 @@ class MotionLimits:
     )
     velocity: PerJoint = positive((1.5, 1.5), 'largest velocity', 'rad/s')
     acceleration: PerJoint = positive((2.0, 2.0), 'largest acceleration', 'rad/s^2')
-    jerk: PerJoint = positive(
-        (),
-        'largest jerk of motions to streamed targets; empty: the acceleration is '
-        'reached in 0.05 s',
-        'rad/s^3',
-        omittable=True,
-    )
     scale: float = positive(
         1.0,
-        'share of the largest velocity, acceleration and jerk that motions which are sent '
+        'share of the largest velocity and acceleration that motions which are sent '
         'may use; starts from rest and stops have all of it',
         at_most=1.0,
     )
 
     @property
-    def largest_jerk(self) -> tuple[float, ...]:
-        """The jerk as given, or that which reaches the acceleration in `_RISE`."""
-        return self.jerk or tuple(each / _RISE for each in self.acceleration)
+    def jerk(self) -> tuple[float, ...]:
+        """The jerk (n,) [rad/s^3] that reaches the acceleration in `_RISE`."""
+        return tuple(each / _RISE for each in self.acceleration)
 
     def scaled(self, state: np.ndarray) -> MotionLimits:
         """Return the limits of a motion that is sent while the reference has this state (3, n).
@@ -121,9 +114,7 @@ class MotionLimits:
         of its acceleration and jerk to slow down.
         """
         _, dq, ddq = np.abs(state)
-        speed, change, jerk = np.array(
-            (self.velocity, self.acceleration, self.largest_jerk)
-        )
+        speed, change, jerk = np.array((self.velocity, self.acceleration, self.jerk))
         # the speed goes on to change while the acceleration falls to zero
         reached = np.abs(state[1] + 0.5 * state[2] * ddq / (self.scale * jerk))
         reached = _ROUNDING * np.maximum(dq, reached)
@@ -134,7 +125,6 @@ class MotionLimits:
             self,
             velocity=tuple(speed.tolist()),
             acceleration=tuple((share * change).tolist()),
-            jerk=tuple((share * jerk).tolist()),
         )
 
     def problems(

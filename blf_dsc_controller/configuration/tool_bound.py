@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
@@ -86,32 +87,32 @@ def _tool(chain: Chain, lower: tuple[float, ...], upper: tuple[float, ...]) -> T
 
 
 def joint_bounds(
-    values: Mapping[str, Any], robot: Robot, chain: Chain, base: BaseParameters
+    values: Mapping[str, Any], robot: Robot, arm: tuning.Design
 ) -> tuple[float, ...] | None:
-    """Return the joint bounds (n,) [rad] of parameters by dotted name.
+    """Return the joint bounds (n,) [rad] of parameters by dotted name, and what gains follow from.
 
     None if these do not fit the arm, as `ControllerConfig.problems` then says.
     """
     lower = tuple(values['limits.position_lower'])
     upper = tuple(values['limits.position_upper'])
     floor = tuple(values['learning.residual_floor'])
-    P0 = tuple(values['learning.initial_estimate'])
+    chain = arm.chain
     coulomb = robot.friction(chain)['coulomb']
     n = len(chain.joints)
     seen = tuple(values.get(_FRICTION, ())) or (0.0,) * n
     unseen = tuple(values.get(_UNSEEN, ())) or tuple(robot.unknown_rotors(chain))
     lengths = {len(each) for each in (lower, upper, floor, coulomb, seen, unseen)}
-    if lengths != {n} or len(P0) != base.model.p or n > MOST_JOINTS:
+    if lengths != {n} or n > MOST_JOINTS:
         return None
     region = _region(values, n) or (lower, upper)
-    stiffness = _stiffness(values)
+    stiffness = _stiffness(arm)
     limits = values['limits.acceleration']
     acceleration = tuple(_MEAN * a for a in limits) if stiffness else (0.0,) * n
     unmodelled = floor + at_reversal(np.array(coulomb), seen)
     unmodelled += np.array(acceleration) * unseen
     expected = _expected(
-        base,
-        P0,
+        arm.parameters,
+        tuning.initial_estimate(arm),
         robot.payload,
         tuple(unmodelled.tolist()),
         stiffness,
@@ -127,13 +128,13 @@ def joint_bounds(
     return tuple(float(f'{_DOWN * each:.4g}') for each in k.tolist())
 
 
-def _stiffness(values: Mapping[str, Any]) -> tuple[float, ...]:
+def _stiffness(arm: tuning.Design) -> tuple[float, ...]:
     """Return the stiffness (n,) [N m/rad] of joints, each on its own; else empty."""
-    if values.get('feedback.inertia') != 'none':
+    if arm.joints is None:
         return ()
-    names = 'barrier.weight', 'feedback.gain', 'surface.gain', 'surface.mu'
-    w, K_p, K, mu = (np.array(values[name]) for name in names)
-    return tuple((w + K_p * (K / 2.0 + mu)).tolist())
+    gains = tuning.gains_of(arm)
+    rate = np.array(gains.surface) / 2.0 + np.array(gains.mu)
+    return tuple((np.array(gains.weight) + np.array(gains.feedback) * rate).tolist())
 
 
 def _region(

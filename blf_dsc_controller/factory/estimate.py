@@ -18,6 +18,7 @@ from blf_dsc_controller.arms.base_parameters import (
 from blf_dsc_controller.arms.model import ArmModel, arm_model, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION, parameters_of
+from blf_dsc_controller.configuration.two_link import two_link
 from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.run import LearnedArm
 
@@ -33,7 +34,8 @@ def model_of(config: ControllerConfig) -> ArmModel:
         robot = config.robot
         base = parameters_of(robot, robot.chain(config.joints))
         return deepcopy(base.model)  # has working memory
-    return arm_model(config.arm.l1, config.arm.gravity)
+    given = two_link(config)
+    return arm_model(given.l1, given.gravity)
 
 
 class Column(NamedTuple):
@@ -68,16 +70,21 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     )
 
 
+def switched_blocks(config: ControllerConfig) -> dict[str, bool]:
+    """Return which disturbances are learned: friction of an arm from a URDF, or a constant."""
+    has_friction = config.model == 'urdf'
+    return {
+        'bias': not has_friction and two_link(config).bias,
+        'viscous': has_friction,
+        'coulomb': has_friction,
+        _LOAD_FRICTION: config.learns_load_friction,
+    }
+
+
 def _column_blocks(config: ControllerConfig) -> list[str]:
     """Return the names of the blocks of columns, each with a column per joint."""
     learning = config.learning
-    switched = {
-        'bias': learning.bias,
-        'viscous': learning.viscous,
-        'coulomb': learning.coulomb,
-        _LOAD_FRICTION: learning.load_friction,
-    }
-    blocks = [name for name, is_on in switched.items() if is_on]
+    blocks = [name for name, is_on in switched_blocks(config).items() if is_on]
     for w in learning.frequencies:
         blocks += [f'sin {w:g} rad/s', f'cos {w:g} rad/s']
     for cycles in learning.ripple_cycles:

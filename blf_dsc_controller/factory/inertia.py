@@ -10,6 +10,7 @@ from blf_dsc_controller.arms.tuning import over_postures
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.estimate import model_of
+from blf_dsc_controller.factory.gains import law_gains
 
 _POSTURES = 1000  # random ones of a planar arm
 
@@ -25,7 +26,7 @@ def joint_inertia(config: ControllerConfig, P: tuple[float, ...]) -> np.ndarray:
 
 def least_inertias(config: ControllerConfig) -> np.ndarray:
     """Return the least inertia (n,) [kg m^2] of each joint over the postures, the others free."""
-    P0 = config.learning.initial_estimate
+    P0 = law_gains(config).initial_estimate
     if config.model == 'urdf':
         return joint_inertia(config, P0)
     lower = config.limits.position_lower

@@ -61,12 +61,13 @@ def _of_paper(config: ControllerConfig, settings: Settings) -> Settings:
         adaptation=_chosen(gains, settings.adaptation),
         disturbance=_chosen(gains, settings.disturbance),
         surface=_chosen(gains, settings.surface),
+        excitation=_chosen(gains, settings.excitation),
     )
-    if settings.row.prediction == FILTERED:
+    if settings.row.prediction == FILTERED and gains.change_detection:
         return settings
     # Lambda is a heuristic: its rows contradict each other on any arm.
     return settings._replace(
-        excitation=settings.excitation._replace(change_detection=0)
+        excitation=settings.excitation._replace(change_detection=0, starts_full=1)
     )
 
 
@@ -94,14 +95,21 @@ def _of_linear_surface(config: ControllerConfig, settings: Settings) -> Settings
     """Return the settings that laws with a linear surface share; they learn if configured so."""
     gains: law_gains.LinearSurface = getattr(config, law_file.GROUP)
     nothing = np.zeros(settings.n)
+    Gamma = settings.adaptation.adaptation_gain.copy()
+    if gains.adaptation_gain and config.learning.enabled:
+        Gamma[: settings.p] = gains.adaptation_gain
     return settings._replace(
         compensation=STATE,
         surface=settings.surface._replace(gain=np.array(gains.surface_gain)),
-        feedback=settings.feedback._replace(robust_gain=nothing),
+        feedback=settings.feedback._replace(
+            gain=np.array(gains.feedback_gain or settings.feedback.gain),
+            robust_gain=nothing,
+            damping_rate=0.0 if gains.feedback_gain else settings.feedback.damping_rate,
+        ),
         disturbance=settings.disturbance._replace(gain=nothing, bumpless=0),
         excitation=settings.excitation._replace(change_detection=0),
         adaptation=_chosen(gains, settings.adaptation)._replace(
-            weight=gains.learning_weight
+            weight=gains.learning_weight, adaptation_gain=Gamma
         ),
     )
 

@@ -30,7 +30,9 @@ from blf_dsc_controller.factory.estimate import (
     doubting_covariance,
     model_of,
     prior_covariance,
+    switched_blocks,
 )
+from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.inertia import joint_inertia
 from blf_dsc_controller.factory.laws import law_of, of_law
 from blf_dsc_controller.law import (
@@ -122,7 +124,12 @@ def _parts_of_feedback(config: ControllerConfig, p: int, lag: float) -> dict[str
         'barrier': _barrier(config),
         'surface': _surface(config, lag),
         'feedback': _feedback(config),
-        'disturbance': filled(disturbance.Settings, config.disturbance, bumpless=1),
+        'disturbance': filled(
+            disturbance.Settings,
+            config.disturbance,
+            leakage=law_gains(config).leakage,
+            bumpless=1,
+        ),
         'observer': _observer(config, p, lag),
         'torque': _torque(config),
     }
@@ -140,7 +147,7 @@ def _parts_of_learning(
     sliding = _window(config)
     of = _columns(config, p)
     return {
-        'initial_estimate': np.array((*config.learning.initial_estimate, *initial)),
+        'initial_estimate': np.array((*law_gains(config).initial_estimate, *initial)),
         'information': inverse(covariance),
         'row_information': inverse(doubting_covariance(config)),
         'columns': of,
@@ -178,12 +185,14 @@ def _truth(config: ControllerConfig, p: int) -> truth.Settings:
 
 def _barrier(config: ControllerConfig) -> barrier.Settings:
     """Return the barrier, with the bound at the start, and where its slope is limited."""
-    given = config.barrier
-    joints = zip(given.bound, given.weight, given.slope_limit, strict=True)
-    return filled(
-        barrier.Settings,
-        given,
-        initial_bound=np.array(given.widest),
+    bound, gains = config.barrier.bound, law_gains(config)
+    joints = zip(bound, gains.weight, gains.slope_limit, strict=True)
+    return barrier.Settings(
+        bound=np.array(bound),
+        initial_bound=np.array(gains.initial_bound),
+        funnel_rate=gains.funnel_rate,
+        weight=np.array(gains.weight),
+        slope_limit=np.array(gains.slope_limit),
         knee=np.array([barrier.knee(*joint) for joint in joints]),
     )
 
@@ -192,9 +201,10 @@ def _surface(config: ControllerConfig, lag: float) -> surface.Settings:
     """Return the surface; the filter of an arm from a URDF uses the known rate f."""
     is_urdf = config.model == 'urdf'
     fastest = SURFACE if is_urdf else _SURFACE
-    return filled(
-        surface.Settings,
-        config.surface,
+    gains = law_gains(config)
+    return surface.Settings(
+        gain=np.array(gains.surface),
+        mu=np.array(gains.mu),
         time_constant=max(config.sample_time, fastest),
         known_rate=int(is_urdf),
         lag=lag,
@@ -203,13 +213,16 @@ def _surface(config: ControllerConfig, lag: float) -> surface.Settings:
 
 def _feedback(config: ControllerConfig) -> feedback.Settings:
     """Return the feedback of the velocity error, and what of it acts through the inertia."""
-    return filled(
-        feedback.Settings,
-        config.feedback,
+    gains = law_gains(config)
+    lags = config.feedback.lags(len(config.joints))
+    return feedback.Settings(
+        gain=np.array(gains.feedback),
+        robust_gain=np.array(gains.robust),
+        damping_rate=gains.damping_rate,
         follows_inertia=int(_follows_inertia(config)),
         decoupled=int(config.feedback.inertia == 'none'),
-        damping_lag=np.array(config.feedback.lags),
-        lags=int(any(config.feedback.lags)),
+        damping_lag=np.array(lags),
+        lags=int(any(lags)),
     )
 
 
@@ -255,10 +268,12 @@ def _torque(config: ControllerConfig) -> torque.Settings:
 def _columns(config: ControllerConfig, p: int) -> columns.Settings:
     """Return which disturbance columns there are."""
     learning = config.learning
+    blocks = switched_blocks(config)
     return filled(
         columns.Settings,
         learning,
         first=p,
+        **{name: int(is_on) for name, is_on in blocks.items()},
         coulomb_velocity=_coulomb_velocity(config),
         tones=len(learning.frequencies),
         ripples=len(learning.ripple_cycles),
@@ -315,17 +330,15 @@ def _excitation(config: ControllerConfig) -> excitation.Settings:
     With feedback through the inertia matrix it must be, too: there drives lighter than
     guessed are measured first.
     """
-    learning = config.learning
     least = _least_floor(config)
     is_urdf = config.model == 'urdf'
-    is_compared = is_urdf and learning.change_detection
     settling_time = _SETTLING if is_urdf else _SLOW_SETTLING
-    return filled(
-        excitation.Settings,
-        learning,
-        learning_start=learning.window + settling_time,
-        anchor_weight=_ANCHOR * least * least if is_urdf else _PLANAR_ANCHOR,
-        starts_full=int(not is_compared or config.feedback.inertia != 'none'),
+    return excitation.Settings(
+        excitation_threshold=law_gains(config).excitation_threshold,
+        learning_start=config.learning.window + settling_time,
+        change_detection=1,
+        anchor_weight=_ANCHOR * least**2 if is_urdf else _PLANAR_ANCHOR,
+        starts_full=int(not is_urdf or config.feedback.inertia != 'none'),
         residual_floor=len(config.joints) * least * least,
     )
 
@@ -337,14 +350,14 @@ def _adaptation(
     covariance: np.ndarray,
 ) -> adaptation.Settings:
     """Return the update, and the range of theta: p parameters, then the columns."""
-    learning = config.learning
-    gains = learning.adaptation_gain + (_COLUMNS,) * len(learned)
-    return filled(
-        adaptation.Settings,
-        learning,
+    gains = law_gains(config)
+    of_columns = _COLUMNS if config.learning.enabled else 0.0
+    return adaptation.Settings(
         update=adaptation.NEWTON,
+        weight=gains.learning_weight,
         leakage=0.0,
-        adaptation_gain=np.array(gains),
+        radius=gains.radius,
+        adaptation_gain=np.array(gains.adaptation + (of_columns,) * len(learned)),
         variance=np.diag(covariance).copy(),
         least=np.array([-np.inf] * p + [column.least for column in learned]),
         most=np.array([np.inf] * p + [column.most for column in learned]),
@@ -357,7 +370,7 @@ def _contact(config: ControllerConfig) -> contact.Settings:
     return filled(
         contact.Settings,
         given,
-        loads=int(given.loads and config.learning.weighing),
+        loads=int(given.loads and config.weighs),
         freezes=int(given.reaction != 'none'),
     )
 
@@ -416,7 +429,7 @@ def _joint_inertia(config: ControllerConfig) -> np.ndarray:
     """Return m (n,) [kg m^2] of each joint by the initial estimate; ones of a planar arm."""
     if config.model != 'urdf':
         return np.ones(len(config.joints))
-    return joint_inertia(config, config.learning.initial_estimate)
+    return joint_inertia(config, law_gains(config).initial_estimate)
 
 
 def _rotors(
@@ -469,7 +482,7 @@ def _weighing(
         columns=np.zeros((0, weighing.LOAD)),
         scale=np.zeros((4, weighing.LOAD)),
     )
-    if not config.learning.weighing:
+    if not config.weighs:
         return settings
     loaded, D = _loaded_parameters(config)
     p = len(loaded)

@@ -57,7 +57,7 @@ _STEADY, _SLOW, _REST = range(3)  # rows of `State.noise` and `State.samples`
 
 
 class Settings(NamedTuple):
-    """The parameter `contact.bandwidth`, and what r rests on."""
+    """The pole of r, and what r rests on."""
 
     bandwidth: float  # L, rad/s
     window: int  # N, rows in a window of the learning

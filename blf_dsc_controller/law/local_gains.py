@@ -73,7 +73,8 @@ class LocalGains:
         feedback = controller.settings.feedback
         if feedback.lags == 1:
             raise BlfDscError(
-                f'feedback.damping_lag: got {feedback.damping_lag.max():g} s, but motors that '
+                f'feedback.joint_damping_lag: got {feedback.damping_lag.max():g} s, but motors '
+                'that '
                 'close the feedback damp without a lag: set it to 0, drop '
                 'feedback.joint_damping_lag, or set drive.feedback: host'
             )

@@ -28,7 +28,7 @@ def monitored(
         'latched': (topics.LATCHED,),
         'changes': (topics.MODEL_CHANGES,),
     }
-    if config.learning.weighing:
+    if config.weighs:
         names['load'] = topics.LOAD
     if config.contact.enabled:
         names['contact'] = topics.CONTACT

@@ -202,7 +202,7 @@ def _limited(
     given.max_velocity = (fastest - drift).tolist()
     given.min_velocity = (-fastest - drift).tolist()
     given.max_acceleration = config.limits.acceleration
-    given.max_jerk = config.limits.largest_jerk
+    given.max_jerk = config.limits.jerk
     given.target_acceleration = [0.0] * n
     return given
 
@@ -378,7 +378,7 @@ def _within_limits(
     q = np.clip(target.positions, lower, upper)
     dq = np.clip(target.velocities, -fastest, fastest)
     room = np.where(dq > 0.0, upper - q, q - lower)
-    delay = 0.5 * a / np.array(limits.largest_jerk) + target.until - target.due
+    delay = 0.5 * a / np.array(limits.jerk) + target.until - target.due
     most = a * (np.sqrt(delay * delay + 2.0 * room / a) - delay)
     return q, np.clip(dq, -most, most)
 
@@ -449,7 +449,7 @@ def keeps_limits(
     limits = config.limits
     largest = [limits.velocity, limits.acceleration]
     if with_jerk:
-        largest.append(limits.largest_jerk)
+        largest.append(limits.jerk)
     c = motion.coefficients[0].T
     turning = turning_times(at_rest_after(0.0, motion), c.shape[1])
     inside = turning[(turning > 0.0) & (turning < motion.duration)]

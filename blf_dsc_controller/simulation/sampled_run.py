@@ -55,7 +55,7 @@ def run_of(
         external=external,
         arm=learned_arm(config),
         tool=tool.errors if tool else None,
-        learns=traits_of(config).learns and config.learning.weight > 0.0,
+        learns=traits_of(config).learns and config.learning.enabled,
         effort=effort,
         sliding=config.robot.sliding(config.joints),
     )

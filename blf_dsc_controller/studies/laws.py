@@ -25,6 +25,7 @@ from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.plant import pick_ups
 from blf_dsc_controller.configuration.schema import change, suggestion
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.inertia import joint_inertia
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.progress import steps
@@ -62,7 +63,6 @@ ROUGHEST = 0.05
 COLUMNS = (*INTERVALS, 'model before', 'model after')
 """Largest errors [mrad]; model errors [%] before the pick-up and at the end."""
 _BEFORE = PICK_UP - 0.01  # s, when the model is evaluated for the first time
-_STIFFEST = 4.0  # least slope limit of the barrier, as a multiple of its weight
 
 
 class StudiedLaw(NamedTuple):
@@ -79,20 +79,16 @@ COMPUTED_TORQUE = str(Path(__file__).with_name('computed_torque.py'))
 """Computed torque with an integrator, as a law of a file."""
 
 
-_DAMPING = Gain('feedback.damping_rate', 10.0, 200.0)
-_ADAPTATION = Gain('learning.adaptation_gain', 0.01, 30.0)
 _FEEDBACK = (
-    _DAMPING,
-    Gain('surface.gain', 5.0, 300.0),
-    Gain('surface.mu', 2.0, 100.0),
-    Gain('barrier.weight', 100.0, 1e4, inertial=True),
+    Gain('feedback.joint_stiffness', 100.0, 1e4, inertial=True),
+    Gain('feedback.joint_damping', 10.0, 200.0, inertial=True),
     Gain('disturbance.gain', 100.0, 3e4, inertial=True),
 )
 _SLOTINE_LI = (
-    _DAMPING,
+    Gain('gains.feedback_gain', 10.0, 200.0, inertial=True),
     Gain('gains.surface_gain', 5.0, 300.0),
     Gain('gains.integral_gain', 100.0, 3e4, inertial=True),
-    _ADAPTATION,
+    Gain('gains.adaptation_gain', 0.01, 30.0),
 )
 _PID = (
     Gain('gains.position', 100.0, 3e4),
@@ -109,7 +105,7 @@ LAWS = {
     'computed_torque': StudiedLaw(
         'computed torque with integrator, the same gains', law=COMPUTED_TORQUE
     ),
-    'proposed_tuned': StudiedLaw('proposed, tuned', (*_FEEDBACK, _ADAPTATION)),
+    'proposed_tuned': StudiedLaw('proposed, tuned', _FEEDBACK),
     'no_learning_tuned': StudiedLaw('without learning, tuned', _FEEDBACK, learns=False),
     'slotine_li_tuned': StudiedLaw(
         'Slotine-Li with integrator, tuned', _SLOTINE_LI, 'slotine_li'
@@ -140,7 +136,8 @@ def law_changes(
         changes['disturbance.observer_bandwidth'] = 0.0
     config = change(config, changes)  # a law of a file has gains of its own
     if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
-        slope = np.array(config.surface.gain) / 2.0 + config.surface.mu
+        gains = law_gains(config)
+        slope = np.array(gains.surface) / 2.0 + gains.mu
         changes['gains.surface_gain'] = slope.tolist()
         changes['gains.integral_gain'] = list(config.disturbance.gain)
     elif studied.law == COMPUTED_TORQUE:  # of equal bandwidth
@@ -149,35 +146,16 @@ def law_changes(
         changes['gains.velocity'] = velocity
         changes['gains.integral'] = integral
     elif not studied.learns:
-        without = [0.0] * len(config.learning.initial_estimate)
-        changes |= {'learning.weight': 0.0, 'learning.adaptation_gain': without}
-    gains = studied.gains
-    each = (values[gain.name] for gain in gains)
-    changes |= parameters_at(
-        config, gains, each, inertia_of_joints(config) if gains else 1.0
-    )
-    if 'barrier.weight' in changes:
-        weight = np.array(changes['barrier.weight'], dtype=float)
-        limit = np.maximum(config.barrier.slope_limit, _STIFFEST * weight)
-        changes['barrier.slope_limit'] = limit.tolist()
-    return changes
-
-
-def unsuitable(name: str, config: ControllerConfig) -> str:
-    """Return why the gains of a law are none for the arm of a configuration; empty if they are."""
-    law = LAWS[name]
-    untuned = law.law == COMPUTED_TORQUE and not law.gains
-    if config.feedback.inertia == 'whole' or not (untuned or _DAMPING in law.gains):
-        return ''
-    return (
-        f'{name}: its gains act through the inertia, and those of this arm on each joint '
-        f'(feedback.inertia {config.feedback.inertia}): choose laws such as computed_torque_tuned'
-    )
+        changes['learning.enabled'] = False
+    tuned = studied.gains
+    each = (values[gain.name] for gain in tuned)
+    inertia = inertia_of_joints(config) if tuned else 1.0
+    return changes | parameters_at(config, tuned, each, inertia)
 
 
 def inertia_of_joints(config: ControllerConfig) -> np.ndarray:
     """Return m (n,) [kg m^2]: the least inertia of a joint with the others free."""
-    return joint_inertia(config, config.learning.initial_estimate)
+    return joint_inertia(config, law_gains(config).initial_estimate)
 
 
 def linear_gains(config: ControllerConfig) -> np.ndarray:
@@ -188,9 +166,10 @@ def linear_gains(config: ControllerConfig) -> np.ndarray:
         k_p = omega_v r + (w + gamma) / m,   k_d = omega_v + r,   k_i = gamma r / m
     """
     m = inertia_of_joints(config)
-    damping = config.feedback.damping_rate
-    slope = 0.5 * np.array(config.surface.gain) + config.surface.mu
-    weight = np.array(config.barrier.weight) / m
+    gains = law_gains(config)
+    damping = gains.damping_rate + np.array(gains.feedback) / m
+    slope = 0.5 * np.array(gains.surface) + gains.mu
+    weight = np.array(gains.weight) / m
     integral = np.array(config.disturbance.gain) / m
     position = damping * slope + weight + integral
     return np.stack((position, damping + slope, integral * slope))
@@ -310,11 +289,7 @@ def trial(
         'seed': seed,
         'truth.seed': loop.plant.truth.seed + seed,
     } | pick_ups([PICK_UP], [load_of(loop)])
-    # No funnel, since the other laws have none: all approach the motion from rest.
-    law = change(
-        loop.controller, {'barrier.initial_bound': [0.0] * len(loop.plant.joints)}
-    )
-    law = another_motion(law, seed) if seed > 0 else law
+    law = another_motion(loop.controller, seed) if seed > 0 else loop.controller
     return loop._replace(controller=law, plant=change(loop.plant, plant))
 
 
@@ -365,16 +340,11 @@ def compare(
 ) -> dict[str, dict[str, Result]]:
     """Tune and run everything, write figures.json, and return the results.
 
-    `laws` are as in `chosen_laws`. Those that are `unsuitable` for an arm are left out there.
+    `laws` are as in `chosen_laws`.
     """
     names = chosen_laws(laws)
     results: dict[str, dict[str, Result]] = {arm: {} for arm in arms}
-    rows = [
-        (arm, name)
-        for arm in arms
-        for name in names
-        if not unsuitable(name, trial(arm, 0).controller)
-    ]
+    rows = [(arm, name) for arm in arms for name in names]
     with ProcessPoolExecutor(
         cores(), initializer=chosen_laws, initargs=(laws,)
     ) as pool:

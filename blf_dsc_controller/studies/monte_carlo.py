@@ -59,8 +59,6 @@ WITHOUT = 'without.'
 """Prefix of the columns of a run without learning."""
 NOISE = 'noise.'
 """Prefix of the columns of a run without learning and with other sensor noise."""
-STILL = 'still.'
-"""Prefix of the columns of a run in which nothing moves the parameters."""
 
 UNSEEN = 1000
 """Seed of the motion on which the torque of a learned model is evaluated."""
@@ -78,13 +76,8 @@ class MonteCarloConfig:
     seed: int = parameter(0, 'run i is determined by this seed and i alone', at_least=0)
     pairs: bool = parameter(
         default=False,
-        description='run each plant also without learning (learning.weight: 0), and once more so '
-        'with other sensor noise',
-    )
-    still: bool = parameter(
-        default=False,
-        description='with pairs: run each plant once more without learning and without adaptation '
-        'by the tracking error (learning.adaptation_gain: 0)',
+        description='run each plant also without learning (learning.enabled: false), and once more '
+        'so with other sensor noise',
     )
     settled_after: float = parameter(
         0.0,
@@ -107,12 +100,8 @@ class Study:
         """Return the law of each run of a plant, by the prefix of its columns."""
         if not self.settings.pairs:
             return {'': self.controller}
-        without = change(self.controller, {'learning.weight': 0.0})
-        laws = {'': self.controller, WITHOUT: without, NOISE: without}
-        if self.settings.still:
-            gains = [0.0] * len(self.controller.learning.adaptation_gain)
-            laws[STILL] = change(without, {'learning.adaptation_gain': gains})
-        return laws
+        without = change(self.controller, {'learning.enabled': False})
+        return {'': self.controller, WITHOUT: without, NOISE: without}
 
     def values(self) -> dict[str, dict[str, Setting]]:
         """Return every value by node and name, with distributions as written."""

@@ -13,7 +13,6 @@ from blf_dsc_controller.studies.runs import Store
 from blf_dsc_controller.studies.summary import (
     ALLOWED,
     Summary,
-    broken_only,
     summarize,
 )
 from blf_dsc_controller.writing import write_text
@@ -32,8 +31,6 @@ def format_report(summary: Summary, folder: Path) -> str:
     ]
     if summary['pairs'] is not None:
         lines += [f'{title}: {figure}' for title, figure in summary['table'].items()]
-        if summary['pairs']['still'] is not None:
-            lines.append(_against_none(summary['pairs']['still']))
         runs['bound broken only with learning'] = summary['pairs']['broken_only_with']
         runs[f'error above {ALLOWED:g} times that without'] = summary['pairs']['above']
     lines += [
@@ -43,20 +40,6 @@ def format_report(summary: Summary, folder: Path) -> str:
     out = shlex.quote(f'{folder.name}-run-{worst}')
     command = f'blf_dsc monte-carlo --reproduce {shlex.quote(str(folder))} {worst} --out {out}'
     return '\n'.join([*lines, f'one again   {command}'])
-
-
-def _against_none(still: Summary) -> str:
-    """Return a line about learning against parameters that nothing moves."""
-    kept, rms = still['kept'], still['median']['rms_error_rad']
-    with_, without = (
-        '-' if each is None else f'{1e3 * each:.3g}' for each in rms.values()
-    )
-    broken = broken_only(still)
-    return (
-        'with learning / with neither learning nor adaptation: bound kept '
-        f'{kept["with"]} / {kept["without"]}, broken only {broken[0]} / {broken[1]}, '
-        f'rms error {with_} / {without} mrad'
-    )
 
 
 def _percent(fraction: float) -> str:

@@ -12,26 +12,19 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.simulation.loop import simulate, write_bag
 from blf_dsc_controller.studies.monte_carlo import (
     NOISE,
-    STILL,
     WITHOUT,
     draw,
     plant_with,
 )
 from blf_dsc_controller.studies.runs import Store, differences, figures_of
 
-_FOLDERS = {
-    '': '',
-    WITHOUT: 'without_learning',
-    NOISE: 'other_noise',
-    STILL: 'no_adaptation',
-}
+_FOLDERS = {'': '', WITHOUT: 'without_learning', NOISE: 'other_noise'}
 
 
 def reproduce(store: Store, run: str, out: Path) -> None:
     """Repeat the run of this number: write its config.yaml and bag to `out`.
 
-    Those without learning, of a study of pairs, go to `without_learning`, `other_noise`
-    and `no_adaptation` in it.
+    Those without learning, of a study of pairs, go to `without_learning` and `other_noise` in it.
 
     Raises BlfDscError if the run has no results, or if they are not reproduced bit for
     bit; StartError if the controller rejects its start.

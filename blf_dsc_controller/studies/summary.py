@@ -9,7 +9,7 @@ import numpy as np
 
 from blf_dsc_controller.analysis.output import plain
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.studies.monte_carlo import NOISE, STILL, WITHOUT, Study
+from blf_dsc_controller.studies.monte_carlo import NOISE, WITHOUT, Study
 from blf_dsc_controller.studies.runs import (
     DIVERGED,
     KEPT,
@@ -86,9 +86,8 @@ def compare_pairs(study: Study, results: Columns) -> Summary:
     start = study.settings.settled_after
     early = [results[f'{law}first_violation_s'] < start for law in (NOISE, WITHOUT)]
     late = {name: values[~np.any(early, axis=0)] for name, values in results.items()}
-    still = _compare(study, results, '', STILL) if study.settings.still else None
     noise = _compare(study, late, NOISE)
-    return _compare(study, results, '') | {'noise': noise, 'still': still}
+    return _compare(study, results, '') | {'noise': noise}
 
 
 def _compare(study: Study, results: Columns, law: str, other: str = WITHOUT) -> Summary:

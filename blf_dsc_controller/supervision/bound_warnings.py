@@ -19,7 +19,6 @@ from blf_dsc_controller.supervision.expected_errors import (
     ExpectedErrors,
     guesses_rotors,
 )
-from blf_dsc_controller.supervision.gear_warnings import softer_by
 
 Floats = NDArray[np.float64]
 
@@ -37,12 +36,11 @@ def width_warnings(
     `errors` are those to expect, if known.
     """
     barrier = config.barrier
-    widest = max(barrier.widest)
+    widest = max(barrier.bound)
     if widest <= _WIDEST_BOUND:
         return
-    of_joint = widest in barrier.bound
-    name = 'barrier.bound' if of_joint else 'barrier.initial_bound'
-    units = config.units[barrier.widest.index(widest)]
+    name = 'barrier.bound'
+    units = config.units[barrier.bound.index(widest)]
     wide = f'{widest:g} {units.position}'
     remedy = f'is it in mm? Give {1e-3 * widest:.3g}'
     if units == TURNING:
@@ -54,7 +52,7 @@ def width_warnings(
     if of_tool := _tool_parameter(config):
         name = of_tool
         remedy = 'the bound of a joint follows from this one: give less'
-    elif of_joint and errors is not None and not errors.is_endless:
+    elif errors is not None and not errors.is_endless:
         is_widest = np.array(barrier.bound) == widest
         needed = np.where(is_widest, errors.unmodelled + errors.pick_up, 0.0)
         j = int(needed.argmax())
@@ -73,12 +71,11 @@ def error_warnings(
 ) -> Iterator[str]:
     """Check that the errors to expect are within the bound (n,) [rad]."""
     if errors.is_endless:
-        softer = softer_by(config)
         yield (
-            f'{softer}: with a sample time of {config.sample_time:g} s and a robot.lag of '
-            f'{config.robot.lag:g} s these gains make errors grow from sample to sample, on rigid '
-            f'gears too: lower {softer}. Gains that the motors of an arm close themselves belong '
-            'there: `blf_dsc drive` with drive.feedback: motor'
+            f'feedback.stiffness: with a sample time of {config.sample_time:g} s and a '
+            f'robot.lag of {config.robot.lag:g} s these gains make errors grow from sample to '
+            'sample, on rigid gears too: lower it. Gains that the motors of an arm close '
+            'themselves belong there: `blf_dsc drive` with drive.feedback: motor'
         )
         return
     yield from _of_unmodelled(config, bound, errors.unmodelled)

@@ -195,8 +195,8 @@ def _of_first_error(
         yield (
             f'barrier.bound: until the arm is learned, {config.joints[worst]} may be '
             f'{errors[worst]:.2g} {unit} from its reference with these gains, past its bound of '
-            f'{widest[worst]:g} {unit}: give {needed:.2g} {unit} or more, or a '
-            'barrier.initial_bound of that, or larger gains at a shorter sample_time'
+            f'{widest[worst]:g} {unit}: give {needed:.2g} {unit} or more, or larger gains at '
+            'a shorter sample_time'
         )
 
 
@@ -213,8 +213,8 @@ def _of_learning(
     step = settings.adaptation.weight * rate * config.sample_time
     if step > 1.0:
         yield (
-            f'learning.weight: {what} is {step:.2g}. Above 1 the estimate overshoots, above 2 it '
-            'diverges: lower learning.weight or learning.adaptation_gain'
+            f'two_link.learning_weight: {what} is {step:.2g}. Above 1 the estimate overshoots, '
+            'above 2 it diverges: lower it or two_link.adaptation_gain'
         )
     if config.reference.type == 'sinusoids':
         for frequency in config.reference.frequency:

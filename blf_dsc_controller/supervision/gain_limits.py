@@ -66,7 +66,7 @@ def _limits_of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator
         yield Limit(
             f'torque.limit: {joint}',
             _MARGIN * need / limit,
-            f'has {limit:g} {unit}, but with learning.initial_estimate the reference alone needs '
+            f'has {limit:g} {unit}, but with P^(0) the reference alone needs '
             f'{need:.3g} {unit}: let the reference be slower, or give at least '
             f'{_MARGIN * need:.3g} {unit} if the drive has that much',
         )
@@ -78,19 +78,25 @@ def _limits_of_feedback(
     T = config.sample_time
     rate = load.rate(settings)
     yield Limit(
-        'feedback.gain: K_p over the inertia',
+        f'{_feedback(config)}: K_p over the inertia',
         rate * T,
-        f'is {rate:.3g} 1/s with learning.initial_estimate, {rate * T:.2g} times the inverse of '
+        f'is {rate:.3g} 1/s with P^(0), {rate * T:.2g} times the inverse of '
         'sample_time. Above 1 the loop has little margin for delays, above 2 it chatters between '
-        'the limits: lower feedback.gain or sample_time',
+        f'the limits: lower {_feedback(config)} or sample_time',
     )
     absorbed = float(np.max(settings.disturbance.gain * T / _damping(settings, load)))
     yield Limit(
         'disturbance.gain: in each sample the disturbance estimate absorbs',
         2.0 * absorbed,
         f'{absorbed:.2g} of the velocity feedback. Above a half it oscillates against '
-        'feedback.gain: lower disturbance.gain',
+        'K_p: lower disturbance.gain',
     )
+
+
+def _feedback(config: ControllerConfig) -> str:
+    """Return the parameter that sets K_p."""
+    of_urdf = config.model == 'urdf'
+    return 'feedback.joint_damping' if of_urdf else 'two_link.feedback_gain'
 
 
 def _damping(settings: Settings, load: ReferenceLoad) -> Floats:
@@ -103,7 +109,7 @@ def _limits_of_surface(settings: Settings) -> Iterator[Limit]:
         filtering = settings.surface.time_constant
         rate = float(np.max(settings.surface.gain / 2.0 + settings.surface.mu))
         yield Limit(
-            'surface.gain, surface.mu: K/2 + mu',
+            'two_link.surface_gain, two_link.mu: K/2 + mu',
             filtering * rate,
             f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
             f'{0.25 / filtering:.3g} 1/s: lower the gains',
@@ -117,8 +123,8 @@ def _limits_of_slope(
     ratios = settings.barrier.slope_limit * T / damping
     for joint, ratio in zip(config.joints, ratios, strict=True):
         yield Limit(
-            f'barrier.slope_limit: past the knee of its barrier {joint} is corrected by',
+            f'{_feedback(config)}: past the knee of its barrier {joint} is corrected by',
             ratio / 2.0,
-            f'{ratio:.2g} times its error in a sample. Above 2 the error grows: give less than '
-            '2 feedback.gain / sample_time',
+            f'{ratio:.2g} times its error in a sample. Above 2 the error grows: give a '
+            'shorter sample_time',
         )

@@ -47,19 +47,9 @@ def _of_margin(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     margin = known.margin(linear_feedback(settings, M0, settings.barrier.weight))
     if margin.value >= LEAST_MARGIN:
         return
-    softer = softer_by(config)
     oscillates = 'is unstable' if margin.value == 0.0 else 'rings'
     yield (
-        f'{softer}: with robot.joint_stiffness the loop {oscillates} near '
-        f'{two_digits(margin.frequency)} Hz, its modulus margin is {margin.value:.2g}: lower '
-        f'{softer}, or '
-        'leave the gains out, so that they follow from robot.joint_stiffness'
+        f'feedback.stiffness: with robot.joint_stiffness the loop {oscillates} near '
+        f'{two_digits(margin.frequency)} Hz, its modulus margin is {margin.value:.2g}: lower it, '
+        'or leave the gains out, so that they follow from robot.joint_stiffness'
     )
-
-
-def softer_by(config: ControllerConfig) -> str:
-    """Return the parameter that makes the loop of an arm from a URDF softer."""
-    feedback = config.feedback
-    if feedback.joint_stiffness or feedback.inertia == 'whole':
-        return 'feedback.stiffness'
-    return 'feedback.gain'

@@ -118,9 +118,12 @@ class OscillationCheck:
         config = self._config
         too_stiff = 'the gains are too high for this arm or its base'
         if config.model != 'urdf':
-            return f'{too_stiff}; lower surface.mu, surface.gain and feedback.gain'
+            return (
+                f'{too_stiff}; lower two_link.mu, two_link.surface_gain and '
+                'two_link.feedback_gain'
+            )
         stiffness = _LOWER * config.feedback.stiffness
         return (
             f'{too_stiff}; commission it (`blf_dsc commission`), or give a feedback.stiffness of '
-            f'{stiffness:.2g}, and lower gains of feedback, surface and barrier that are given'
+            f'{stiffness:.2g}'
         )

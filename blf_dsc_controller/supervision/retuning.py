@@ -35,7 +35,6 @@ arrays are for reading only.
 """
 
 _STABLE = 2.0  # x += -a x diverges for a >= 2
-_ROUNDED = 1.0 + 1e-9  # times the radius, on which the projection may hold an estimate
 
 
 def apply(controller: Controller, config: ControllerConfig) -> None:
@@ -72,7 +71,6 @@ def problems(
     settings = settings_in_loop(config)
     yield from _outside_bound(controller, config, settings, t)
     yield from _above_torque_limit(controller, config)
-    yield from _outside_radius(controller, config)
     yield from _diverging_update(controller, config, settings)
 
 
@@ -108,17 +106,6 @@ def _above_torque_limit(
             )
 
 
-def _outside_radius(controller: Controller, config: ControllerConfig) -> Iterator[str]:
-    """Yield how far the estimate is outside the radius of the projection, if it is."""
-    radius = config.learning.radius
-    norm = float(np.linalg.norm(controller.state.estimate[: controller.settings.p]))
-    if norm > _ROUNDED * radius:
-        yield (
-            f'learning.radius: the norm of the estimate is {norm:.4g} kg m^2 now, above a '
-            f'radius of {radius:g} kg m^2: choose a larger one'
-        )
-
-
 def _diverging_update(
     controller: Controller, config: ControllerConfig, settings: Settings
 ) -> Iterator[str]:
@@ -128,14 +115,14 @@ def _diverging_update(
     if adaptation.update != NEWTON:
         step, stretch = 'gradient step', float(np.linalg.norm(latch.Phi, 2))
     share = (
-        config.learning.weight
+        adaptation.weight
         * float(adaptation.adaptation_gain.max())
         * stretch
         * config.sample_time
     )
     if latch.latched[0] and share >= _STABLE:
         yield (
-            f'learning.weight: the {step} of each sample would correct the '
+            f'two_link.learning_weight: the {step} of each sample would correct the '
             f'estimates by {share:.3g} times their error, which diverges at {_STABLE:g} or more: '
-            'lower learning.weight or learning.adaptation_gain'
+            'lower it or two_link.adaptation_gain'
         )

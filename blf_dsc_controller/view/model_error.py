@@ -8,6 +8,7 @@ import numpy as np
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.estimate import model_of
+from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.run import Floats
 
 
@@ -16,7 +17,7 @@ class ModelError:
 
     def __init__(self, config: ControllerConfig) -> None:
         self._model = model_of(config)
-        self._initial = np.array(config.learning.initial_estimate)
+        self._initial = np.array(law_gains(config).initial_estimate)
         self._dq = np.full(len(config.joints), np.nan)
         self._time = np.nan
 

@@ -19,6 +19,7 @@ from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import Chain, read_chain
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import resolve
+from blf_dsc_controller.configuration.two_link import two_link
 from blf_dsc_controller.errors import BlfDscError
 
 _THICKNESS = 0.025  # radius of a link relative to the length of all links
@@ -60,7 +61,7 @@ def arm_of(config: ControllerConfig, plant: Mapping[str, Any]) -> ShownArm:
         return ShownArm(robot.text, robot.chain(config.joints))
     given = [plant.get(name) for name in ('arm.l1', 'arm.l2')]
     lengths = [
-        each if isinstance(each, float) and isfinite(each) else config.arm.l1
+        each if isinstance(each, float) and isfinite(each) else two_link(config).l1
         for each in given
     ]
     text = urdf(config.joints, lengths, (1.0, 1.0))
