@@ -59,6 +59,13 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
     assert learning.parameter_error[-1] < 0.01
 
 
+def test_estimate_is_hardly_off_while_something_pushes():
+    """No window in which a push comes or goes is learned from, though no change is found."""
+    row = ROWS['push (0, 3.0, 3.0)']
+    pushed = run_preset(end_of(row), row)
+    assert pushed.parameter_error[pushed.t > row['events.begin'][0]].mean() < 0.03
+
+
 def test_push_that_lasts_does_not_restart_learning_again_and_again():
     """Sideways, as no load pulls.  It was 38 changes in 3 s.
 

@@ -68,6 +68,8 @@ def is_as_told(load, mass, within):
     if mass:
         assert (np.abs(load[1:4]) < load[5:]).all()  # held in the tip
         assert (load[5:] < 0.05).all()
+    else:
+        assert not np.isfinite(load[[1, 2, 3, 5, 6, 7]]).any()  # nothing has no centre
 
 
 @pytest.mark.parametrize('name', ['panda_rigid', 'ur5e_rigid', 'fr3'])
@@ -272,7 +274,9 @@ def test_load_is_weighed_though_gears_lose_15_percent_of_the_torque_they_carry()
     """57 % of the weights were outside of their intervals, by up to six times these."""
     run = run_of('panda', 'moves', 1, LOAD, **{'disturbance.load_share': 0.15})
     assert wrong(run, LOAD).mean() <= 0.05
-    assert at(run, LONG)[DEVIATION] < 0.1  # kg: hardly wider than before
+    t, load = weighed(run)
+    # kg: hardly wider than before
+    assert np.nanmedian(load[t > LONG - 5.0, DEVIATION]) < 0.1
 
 
 def test_load_is_weighed_though_friction_falls_by_40_percent():

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.motion_groups import MotionLimits
+import blf_dsc_controller as blf
 from blf_dsc_controller.reference import retargeting
 from blf_dsc_controller.reference import terms as reference
 from blf_dsc_controller.reference.stream import TargetStream
@@ -28,8 +27,6 @@ from blf_dsc_controller.reference.terms import (
 )
 from blf_dsc_controller.reference.trajectory import (
     Trajectory,
-    TrajectoryError,
-    TrajectoryPoint,
     plan_trajectory,
 )
 
@@ -120,9 +117,17 @@ def test_minimum_jerk_is_continuous_up_to_its_snap():
 
 
 JOINTS = ('shoulder', 'elbow')
-LIMITS = ControllerConfig(
-    JOINTS, limits=MotionLimits((-4.0, -3.0), (4.0, 3.0), (1.5, 1.5), (6.0, 6.0))
-)
+
+
+def limited(lower, upper):
+    """Return a configuration with position limits [rad], 1.5 rad/s and 6 rad/s^2."""
+    given = {'position_lower': lower, 'position_upper': upper}
+    given |= {'velocity': [1.5, 1.5], 'acceleration': [6.0, 6.0]}
+    limits = {f'limits.{name}': values for name, values in given.items()}
+    return blf.change(blf.ControllerConfig(), limits | {'joints': list(JOINTS)})
+
+
+LIMITS = limited([-4.0, -3.0], [4.0, 3.0])
 PAPER = pack(2, [sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))])
 NOW = 3.3  # s
 GOALS = np.array([[1.6, 1.2], [2.0, 1.5], [1.8, 1.0]])
@@ -140,7 +145,8 @@ FIELDS = {
 def trajectory(fields=(GOALS,), times=TIMES, joints=JOINTS, begin=None):
     rows = zip(times, *fields, strict=True)
     points = tuple(
-        TrajectoryPoint(t, *(tuple(row.tolist()) for row in each)) for t, *each in rows
+        blf.TrajectoryPoint(t, *(tuple(row.tolist()) for row in each))
+        for t, *each in rows
     )
     return Trajectory(joints, points, begin)
 
@@ -213,7 +219,10 @@ def test_later_trajectory_replaces_running_and_waiting_ones():
 
 REPEATED = trajectory((np.hstack((GOALS, GOALS[:, 1:])),), joints=(*JOINTS, 'elbow'))
 NOT_FINITE = VELOCITIES + np.array([[0.0], [np.inf], [0.0]])
-MIXED = (TrajectoryPoint(1.0, (1.6, 1.2), (0.0, 0.0)), TrajectoryPoint(2.0, (1.6, 1.2)))
+MIXED = (
+    blf.TrajectoryPoint(1.0, (1.6, 1.2), (0.0, 0.0)),
+    blf.TrajectoryPoint(2.0, (1.6, 1.2)),
+)
 BAD = (
     (
         trajectory(joints=('shoulder', 'wrist')),
@@ -221,7 +230,7 @@ BAD = (
     ),
     (REPEATED, "'shoulder', 'elbow' is needed once"),
     (Trajectory(JOINTS, ()), 'it has no points'),
-    (Trajectory(JOINTS, (TrajectoryPoint(1.0, (1.0,)),)), '[1.0], but 2 finite'),
+    (Trajectory(JOINTS, (blf.TrajectoryPoint(1.0, (1.0,)),)), '[1.0], but 2 finite'),
     (Trajectory(JOINTS, MIXED), 'do not all give the same'),
     (trajectory((GOALS, NOT_FINITE)), 'point 2 has velocities [inf, inf], but 2'),
     (trajectory(times=(1.0, 2.0, 1.5)), 'point 3 is at 1.5 s, not after'),
@@ -239,14 +248,14 @@ BAD = (
 
 def test_invalid_trajectory_is_rejected_with_the_reason():
     for bad, reason in BAD:
-        with pytest.raises(TrajectoryError) as rejection:
+        with pytest.raises(blf.TrajectoryError) as rejection:
             plan(bad)
         assert reason in str(rejection.value)
 
 
 def test_all_problems_are_reported_at_once():
-    points = TrajectoryPoint(1.0, (1.0,)), TrajectoryPoint(2.0, (np.nan, 1.0))
-    with pytest.raises(TrajectoryError) as rejection:
+    points = blf.TrajectoryPoint(1.0, (1.0,)), blf.TrajectoryPoint(2.0, (np.nan, 1.0))
+    with pytest.raises(blf.TrajectoryError) as rejection:
         plan(Trajectory(('shoulder', 'wrist'), points))
     assert len(rejection.value.problems) == 3
 
@@ -288,9 +297,8 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
     np.testing.assert_array_equal(dqr[-1], (0.0, 0.0))
 
 
-MIDDLE = ControllerConfig(  # positions about -1.57 and 1, as of a Panda's elbow
-    JOINTS, limits=MotionLimits((-3.07, -1.0), (-0.07, 3.0), (1.5, 1.5), (6.0, 6.0))
-)
+# positions about -1.57 and 1, as of a Panda's elbow
+MIDDLE = limited([-3.07, -1.0], [-0.07, 3.0])
 
 
 @pytest.mark.parametrize(
@@ -301,7 +309,7 @@ def test_position_limits_about_a_middle_that_is_not_zero_are_kept(goal, limit):
     """Also where the position itself is smaller than the other limit of the joint."""
     at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
     sent = trajectory((np.array([goal]),), times=(6.0,))
-    with pytest.raises(TrajectoryError, match=f'past its limit of {limit:g} rad'):
+    with pytest.raises(blf.TrajectoryError, match=f'past its limit of {limit:g} rad'):
         plan_trajectory(sent, at_rest, 0.0, MIDDLE)
     inside = np.array([goal]) + 0.04 * np.sign([-1.57 - goal[0], 1.0 - goal[1]])
     plan_trajectory(trajectory((inside,), times=(6.0,)), at_rest, 0.0, MIDDLE)
@@ -388,7 +396,7 @@ def test_points_past_position_limits_are_named_and_no_consequence_of_them():
     at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
     path = np.array([[-1.5, 1.0], [-1.0, 3.5], [0.5, 3.5]])
     sent = trajectory((path,), times=(0.1, 0.2, 0.3))
-    with pytest.raises(TrajectoryError) as rejection:
+    with pytest.raises(blf.TrajectoryError) as rejection:
         plan_trajectory(sent, at_rest, 0.0, MIDDLE)
     (problem,) = rejection.value.problems
     assert problem == (
@@ -400,7 +408,7 @@ def test_points_past_position_limits_are_named_and_no_consequence_of_them():
 
 def test_without_ruckig_what_exceeds_the_limits_says_what_is_missing(monkeypatch):
     monkeypatch.setattr(retargeting, 'ruckig', None)
-    with pytest.raises(TrajectoryError, match='pip install ruckig') as rejection:
+    with pytest.raises(blf.TrajectoryError, match='pip install ruckig') as rejection:
         plan(trajectory((GOALS[:1],), times=(0.2,)))
     assert 'past its limit of -6 rad/s^2' in str(rejection.value)
     plan(trajectory((GOALS, VELOCITIES[::-1])))  # brakes after its end all the same
@@ -505,7 +513,7 @@ def sequence_of_references(seed):
                 planned = retargeting.plan_stop(vector, at, LIMITS).vector
             else:
                 planned = random_plan(rng, stream, at, vector)
-        except TrajectoryError:
+        except blf.TrajectoryError:
             planned = vector
         seen.append(sampled(vector, PERIOD * np.arange(sample, sample + taken)))
         sample += taken
