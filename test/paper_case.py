@@ -101,7 +101,7 @@ def run(config: LoopConfig) -> Loop:
 
 BOUND = 2e-3  # rad
 WINDOW = 2.0 * np.pi  # s
-OFF = {'two_link.learning_weight': 0.0}
+OFF = {'learning.enabled': False}
 CHANGED = 20.0  # s
 
 

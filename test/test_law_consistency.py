@@ -55,7 +55,7 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
     gentle = 0.25e-3 if 'events.ramp' in row else 0.0
     allowed = np.maximum(1.3 * without.largest(begin), gentle) + quantisation
     assert np.all(learning.largest(begin) <= allowed)
-    assert learning.changes[-1] >= 1.0
+    assert 1.0 <= learning.changes[-1] <= 6.0
     assert learning.parameter_error[-1] < 0.01
 
 
@@ -90,14 +90,9 @@ def test_push_that_lasts_does_not_restart_learning_again_and_again():
     )
 
 
-def test_change_detection_has_no_effect_without_a_change():
-    """Bit for bit: consistency only decides which windows are latched."""
-    for preset in ('noisy', 'excitation', 'two_tone'):
-        assert run_preset(30.0, preset=preset).changes[-1] == 0.0
-    with_detection = run_preset(30.0)
-    without = run_preset(30.0, law={'learning.change_detection': False})
-    assert with_detection.changes[-1] == 0.0
-    np.testing.assert_array_equal(with_detection.torque, without.torque)
+@pytest.mark.parametrize('preset', ['recommended', 'noisy', 'excitation', 'two_tone'])
+def test_no_change_is_found_without_one(preset):
+    assert run_preset(30.0, preset=preset).changes[-1] == 0.0
 
 
 def test_estimate_does_not_drift_at_rest_with_noise():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tip holds, weighed in the loop: values, intervals, and no torque depends on it."""
+"""What the tip holds, weighed in the loop: values and intervals."""
 
 from __future__ import annotations
 
@@ -27,15 +27,14 @@ def held(begin, duration, payload, ramp=0.0):
     return {f'events.{name}': values for name, values in each.items()}
 
 
-def record_of(name, plant=None, **controller):
+def record_of(name, plant=None):
     """A run of an arm up to 30 % off its URDF that picks up a load and puts it down."""
     values = held([PICKED_UP], [PUT_DOWN - PICKED_UP], [LOAD]) | {
         'duration': END,
         'truth.mass_deviation': 0.3,
         'sensor.incomplete_states': 0,
     }
-    given = {'sim_plant': values | (plant or {}), 'blf_dsc_controller': controller}
-    loop = blf.load_loop(name, given)
+    loop = blf.load_loop(name, {'sim_plant': values | (plant or {})})
     return blf.simulate(loop.controller, loop.plant)
 
 
@@ -92,12 +91,6 @@ def test_change_makes_the_load_unknown_until_the_filters_have_settled(panda):
     half = load[(t > unknown[-1]) & (t < PICKED_UP + 1.0), DEVIATION]
     # friction may have changed since the hand was empty
     assert half[0] > 2.5 * half[-1]
-
-
-def test_no_torque_depends_on_it(panda):
-    without = record_of('panda_rigid', **{'learning.weighing': False}).run()
-    np.testing.assert_array_equal(panda.torque, without.torque)
-    assert not any(name.startswith('load') for name in without.monitor.names)
 
 
 CYCLE, CARRIED = 6.0, 3.0  # s, of pick and place, and with the load

@@ -14,7 +14,7 @@ from closed_loop_case import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from paper_case import NO_DISTURBANCE, configured, run
+from paper_case import configured, run
 from scipy.linalg import eigh
 from symbols import replaced
 
@@ -166,26 +166,6 @@ def learned(preset, duration, learning, arm):
     ]
 
 
-def test_friction_columns_recover_friction():
-    """A sinusoidal reference distinguishes viscous from Coulomb friction by the torque's shape."""
-    true = {'viscous': [0.5, 0.2], 'coulomb': [0.3, 0.1]}
-    arm = NO_DISTURBANCE | {
-        f'disturbance.{name}': value for name, value in true.items()
-    }
-    learning = {
-        'learning.viscous': True,
-        'learning.coulomb': True,
-        'learning.coulomb_velocity': 0.05,
-        'learning.excitation_threshold': 1e-4,
-    }
-    arm |= {'disturbance.coulomb_velocity': 0.05}
-    estimate, active = learned('recommended', 20.0, learning, arm)
-    assert all(active.values())
-    for name, values in (true | {'bias': (0.0, 0.0)}).items():
-        for joint, value in zip(('joint1', 'joint2'), values, strict=True):
-            assert estimate[f'{name} {joint}'] == pytest.approx(value, abs=2e-3)
-
-
 def test_same_columns_are_accepted_on_a_two_tone_reference():
     """Bias and sine are the whole disturbance: only the trapezoid's T^2 and the leakage remain."""
     estimate, active = learned('two_tone', 9.0, {}, {})
@@ -200,7 +180,7 @@ def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
 
     What is rejected is removed from Phi and b altogether, not merely small.
     """
-    learning = {'learning.frequencies': [1.0], 'learning.bias': False}
+    learning = {'learning.frequencies': [1.0], 'two_link.bias': False}
     config = configured('recommended', 7.99, learning)  # ends with an evaluation of Phi
     law = run(config).controller
     names = estimate_names(config.controller)[3:]
