@@ -370,15 +370,15 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     # Only one node in real time, which cannot keep the others from both processors.
     fifo = (
         'sim_plant:\n  ros__parameters:\n    arm: {gravity: 0.0}\n'
-        '    realtime: {priority: 10, lock_memory: true}\n'
+        '    realtime: {priority: 10}\n'
     )
     # Soft: with the delays of a busy computer, the gains for 1 kHz would shake the arm.
     at_rest = (
-        '    arm: {gravity: 0.0}\n    reference: {type: hold}\n'
+        '    reference: {type: hold}\n    two_link.gravity: 0.0\n'
         '    two_link.barrier_weight: [1.0, 1.0]\n'
         '    two_link.surface_gain: [1.0, 1.0]\n    two_link.mu: [1.0, 1.0]\n'
         '    two_link.feedback_gain: [1.0, 1.0]\n    disturbance.gain: [0.0, 0.0]\n'
-        '    two_link.learning_weight: 0.0\n'
+        '    learning: {enabled: false}\n'
     )
     config = tmp_path / 'fifo.yaml'
     out = tmp_path / 'out'

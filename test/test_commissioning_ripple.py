@@ -160,8 +160,7 @@ def test_bags_give_the_same_and_replay(whole, monkeypatch):
         blf.load_loop(whole.arm.with_name(name)).controller
         for name in ('out.yaml', 'again.yaml')
     )
-    date = {'commissioning.date': first.commissioning.date}
-    assert change(again, date) == first
+    assert again == first
     assert blf.verify(bags[0]).difference is None
     # it is the motion of a loop of one's own
     made = whole.found.slow_motion.config
@@ -215,7 +214,7 @@ def test_ctrl_c_in_the_slow_motion_keeps_the_gains(whole, arm, capsys, monkeypat
     assert f'Torque ripple was not measured; {out} has all else' in told.err
     assert PlantDriver.last.calls[-1] == 'finish'
     assert PlantDriver.last.velocity < 0.01  # rad/s
-    assert blf.load_loop(out).controller.commissioning.margin >= 0.5
+    assert 'with a modulus margin' in Path(out).read_text()
     assert cycles_of(out) == ()
     comment = out.read_text().replace('\n# ', ' ')
     assert 'torque ripple is not measured: the slow motion that shows it' in comment

@@ -84,8 +84,7 @@ def nothing_looks_whole(arm):
 def gains_of(path):
     config = blf.load_loop(path).controller
     feedback = config.feedback
-    assert config.commissioning.margin >= 0.5
-    assert config.commissioning.version == blf.__version__
+    assert len(config.commissioning.friction) == len(config.joints)
     assert not_commissioned(config) == ''
     return np.array([feedback.joint_stiffness, feedback.joint_damping])
 
@@ -356,8 +355,7 @@ def test_arm_of_which_little_is_known_is_measured_anew_and_its_bag_gives_the_sam
     bags = [str(folder / name) for name in ('posture_1', 'posture_2')]
     assert main(['commission', *bags, '--config', str(arm), '--out', str(again)]) == 0
     measured, recomputed = (blf.load_loop(each).controller for each in (out, again))
-    date = {'commissioning.date': measured.commissioning.date}
-    assert change(recomputed, date) == measured
+    assert recomputed == measured
     assert measured.robot.coulomb != ()
 
 

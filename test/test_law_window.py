@@ -180,7 +180,7 @@ def test_cosine_columns_are_rejected_on_the_reference_of_the_paper():
 
     What is rejected is removed from Phi and b altogether, not merely small.
     """
-    learning = {'learning.frequencies': [1.0], 'two_link.bias': False}
+    learning = {'two_link.frequencies': [1.0], 'two_link.bias': False}
     config = configured('recommended', 7.99, learning)  # ends with an evaluation of Phi
     law = run(config).controller
     names = estimate_names(config.controller)[3:]
@@ -203,7 +203,7 @@ def test_columns_are_not_checked_before_the_parameters_alone_are_excited():
     """An arm at rest excites nothing, so no column is rejected."""
     still = {'reference.amplitude': [0.0, 0.0], 'reference.offset': [2.2935, 1.6961]}
     _, active = learned(
-        'recommended', 8.0, {'learning.frequencies': [1.0], **still}, {}
+        'recommended', 8.0, {'two_link.frequencies': [1.0], **still}, {}
     )
     assert all(active.values())
 

@@ -193,7 +193,7 @@ def test_rejected_columns_are_in_the_summary_and_the_lyapunov_function_is_a_pane
     tmp_path,
 ):
     """Run of 8 s from a bag, truth known, with a cosine column that the reference cannot excite."""
-    learning = {'learning.frequencies': [1.0], 'two_link.bias': False}
+    learning = {'two_link.frequencies': [1.0], 'two_link.bias': False}
     config = configured('recommended', 8.0, LEAKY | learning)
     names = estimate_names(config.controller)
     for fresh in (config.controller, configured('model_based', 1.0).controller):

@@ -15,7 +15,6 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import interfaces
-from rclpy.parameter import Parameter
 from ros_rig import RosRig, activate, cleanup, configure, deactivate
 from std_srvs.srv import Trigger
 
@@ -104,16 +103,13 @@ class Arm:
 
 
 def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tmp_path):
-    """The arm of a UR's driver: at first it must rest for it, which it never does; then not."""
+    """The arm of a UR's driver, which accepts it in motion."""
     ros = RosRig()
     recorder = ros.add(BagRecorderNode, output=str(tmp_path / 'bag'))
     arm = Arm(ros, services['ur'], wait_for_subscribers=1)
     guard = arm.law.guard
-    arm.run_until(8.0)
-    assert guard.controller.state.weighing.load[0] == pytest.approx(2.0, abs=0.1)
-    assert not arm.requests
-    arm.law.set_parameters([Parameter('load.in_motion', value=True)])
     arm.run_until(9.5)
+    assert guard.controller.state.weighing.load[0] == pytest.approx(2.0, abs=0.1)
     masses = [request.mass for request in arm.requests]
     assert len(masses) > 10
     assert (np.diff(masses) > 0.0).all()
@@ -137,7 +133,7 @@ def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tm
 
 def test_driver_that_refuses_is_asked_once(services, ros):
     """As that of a Franka does while a controller is active."""
-    arm = Arm(ros, services['franka'], accepts=False, **{'load.in_motion': True})
+    arm = Arm(ros, services['franka'], accepts=False)
     arm.run_until(8.0)
     assert len(arm.requests) == 1
     asked = f'/driver/set_load refused {arm.requests[0].mass:.2f} kg'
@@ -148,7 +144,7 @@ def test_driver_that_refuses_is_asked_once(services, ros):
 
 def told_two_kilograms(ros, services):
     """Run an arm whose drives have been told what it picked up."""
-    arm = Arm(ros, services['ur'], **{'load.in_motion': True})
+    arm = Arm(ros, services['ur'])
     arm.run_until(8.5)
     assert arm.law.declaration.in_force.mass == pytest.approx(2.0, abs=0.1)
     return arm

@@ -245,7 +245,7 @@ def test_every_lifecycle_way_out_leaves_the_safe_torque(ros, way, event):
 def test_rejected_columns_are_logged_and_diagnosed_with_the_reason(ros, log):
     """On the paper's reference, cos t on both joints is indistinguishable from m2 l2^2."""
     diagnostics = ros.listen(topics.DIAGNOSTICS)
-    cosine = {'learning.frequencies': [1.0], 'two_link.bias': False}
+    cosine = {'two_link.frequencies': [1.0], 'two_link.bias': False}
     ros.add(ControllerNode, cosine, namespace='rejected')
     arm = ros.add(
         PlantNode, {'mode': 'lockstep', 'duration': 7.0}, namespace='rejected'

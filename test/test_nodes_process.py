@@ -86,7 +86,7 @@ def test_real_time_is_requested_for_all_threads_and_a_refusal_named_with_its_rem
     )
     request_realtime(Realtime(), lines.append)
     assert (scheduled, lines) == (set(), [])
-    request_realtime(Realtime(priority=50, lock_memory=True), lines.append)
+    request_realtime(Realtime(priority=50), lines.append)
     if refused:
         wanted = [
             '(Operation not permitted)',

@@ -70,7 +70,7 @@ def test_a_run_over_ros_is_refused_elsewhere_with_what_to_do(tmp_path, capsys):
 @pytest.mark.usefixtures('other')
 def test_real_time_is_left_out_elsewhere_with_a_word():
     said = []
-    request_realtime(Realtime(priority=10, lock_memory=True), said.append)
+    request_realtime(Realtime(priority=10), said.append)
     request_realtime(Realtime(), said.append)
     assert said == ['realtime: left out, since only Linux has it']
 

@@ -264,7 +264,7 @@ def test_gravity_is_held_in_silence_only_for_the_fade_time(calls, phase, late):
 
     `late` [ms] the torque fades already.
     """
-    rig = Rig(HOLDING | {'safety.fade_time': 0.2}, live=True)
+    rig = Rig(HOLDING, live=True)
     rig.step(20)
     rig.wait(late)
     for call in calls:

@@ -120,7 +120,7 @@ def test_controller_that_is_back_takes_over_at_once_and_the_torque_fades_with_th
     faded = [torque.copy() for torque in polled if torque is not None]
     assert not faded[-1].any()
     safety = arm.config.safety
-    seconds = arm.T + safety.state_timeout + safety.fade_time
+    seconds = arm.T + safety.state_timeout + 0.5
     assert len(faded) * 1e-3 == pytest.approx(seconds, abs=0.005)
     arm.run(0.2, hangs=True)
     assert not arm.line.active

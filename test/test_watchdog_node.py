@@ -428,8 +428,8 @@ def test_journal_that_cannot_be_read_is_reported_and_ends_nothing(ros):
     loop.note('parameters', parameters={'torque.limit': 'none'})
     assert not loop.node.finished
     assert loop.node.problem
-    loop.note('parameters', parameters={'safety.fade_time': 0.3})
-    assert loop.watchdog.config.safety.fade_time == 0.3
+    loop.note('parameters', parameters={'safety.state_timeout': 0.05})
+    assert loop.watchdog.config.safety.state_timeout == 0.05
     assert not loop.node.problem
     loop.go_on(0.02, commands=True)
     assert np.abs(loop.torque()).min() > 0.5

@@ -72,7 +72,7 @@ def _memory() -> Finding:
 
     most, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if os.geteuid() == 0 or most == resource.RLIM_INFINITY or most > _GIGA:
-        return ok('memory', 'may be locked (realtime.lock_memory)')
+        return ok('memory', 'may be locked (realtime.priority)')
     remedy = 'allow it with a limit on memlock for this user in /etc/security/limits.d'
     return note('memory', f'at most {most / 1e6:.0f} MB may be locked', remedy)
 

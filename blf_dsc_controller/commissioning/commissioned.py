@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller import __version__
 from blf_dsc_controller.arms.joint_gains import (
     JointGains,
     damped_arm,
@@ -153,9 +152,6 @@ class Commissioned(NamedTuple):
             'robot.lag': float(f'{self.lag:.3g}'),
             'feedback.inertia': 'none',
             **as_parameters(_rounded(gains.stiffness), damping),
-            'commissioning.date': self.date,
-            'commissioning.version': __version__,
-            'commissioning.margin': float(f'{self.choice.margin.value:.3g}'),
             'commissioning.friction': _rounded(self.friction),
             'commissioning.unseen_inertia': _rounded(self.unseen),
         }

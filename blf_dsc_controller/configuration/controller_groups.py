@@ -34,7 +34,6 @@ in_window = partial(
 """Declare a parameter on which the rows of a window depend."""
 _at_start = partial(parameter, read_only='it has no effect later')
 _FOUND = 'it says how the gains were found'
-_measured = partial(parameter, read_only=_FOUND)
 _of_joints = partial(non_negative, (), read_only=_FOUND, omittable=True)
 _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
@@ -103,9 +102,6 @@ class Safety:
     )
     deactivation_ramp: float = non_negative(
         0.5, 'the same ramp when the node is deactivated', 's'
-    )
-    fade_time: float = positive(
-        0.5, 'time to fade the safe torque without usable states', 's'
     )
 
 
@@ -240,13 +236,6 @@ class Learning:
         'tau_d',
         above=0.0,
     )
-    frequencies: tuple[float, ...] = sizing(
-        (),
-        'also estimate a sinusoidal disturbance of each joint at each of these frequencies',
-        'rad/s',
-        above=0.0,
-        omittable=True,
-    )
     ripple_cycles: tuple[float, ...] = sizing(
         (),
         'also estimate a torque ripple of each joint with so many periods per turn; where it '
@@ -292,9 +281,6 @@ class DeclaredLoad:
         'over ROS: link in whose frame that service expects the centre; empty: '
         'robot.tip',
     )
-    in_motion: bool = parameter(
-        False, 'over ROS: whether the drives accept a load while the arm moves'
-    )
 
 
 @dataclass(frozen=True)
@@ -324,20 +310,12 @@ class Contact:
 
 @dataclass(frozen=True)
 class CommissionedGains:
-    """When and with what result the gains were chosen by measuring the arm."""
+    """What the arm showed while it was measured, by which its gains were chosen."""
 
-    date: str = _measured(
-        '',
-        'when `blf_dsc commission` measured the arm and chose the gains; empty: never',
-    )
-    version: str = _measured('', 'version of this package that chose them')
-    margin: float = _measured(
-        0.0, 'modulus margin that they have in all postures measured', at_least=0.0
-    )
     friction: PerJoint = _of_joints(
         'friction that each joint showed while it was measured, which the errors to '
-        'expect count; empty: that of robot.coulomb, or 5 % of the rated torque where none '
-        'is known',
+        'expect count; empty: the arm was not measured, and robot.coulomb counts, or 5 % of '
+        'the rated torque where none is known',
         'N m',
     )
     unseen_inertia: PerJoint = _of_joints(

@@ -422,12 +422,10 @@ class Realtime:
 
     priority: int = _at_start(
         0,
-        "SCHED_FIFO priority, below controller_manager's 50; 0: unchanged",
+        "SCHED_FIFO priority, below controller_manager's 50, with which memory is locked, too; "
+        '0: unchanged',
         at_least=0,
         at_most=99,
-    )
-    lock_memory: bool = _at_start(
-        False, 'lock the memory of the process, to prevent swapping'
     )
 
 

@@ -82,6 +82,13 @@ class TwoLink:
         'minimum eigenvalue of the excitation matrix of an excited window',
         symbol='sigma',
     )
+    frequencies: tuple[float, ...] = _sizing(
+        (),
+        'also estimate a sinusoidal disturbance of each joint at each of these frequencies',
+        'rad/s',
+        above=0.0,
+        omittable=True,
+    )
     bias: bool = _sizing(True, 'also estimate a constant disturbance of each joint')
 
 

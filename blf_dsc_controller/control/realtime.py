@@ -20,30 +20,30 @@ _SWITCH_INTERVAL = 1e-4  # s, instead of the 5 ms of Python
 
 
 def request_realtime(realtime: Realtime, warn: Callable[[str], object]) -> None:
-    """Request SCHED_FIFO and locked memory as configured.
+    """Request SCHED_FIFO of a priority above 0, and locked memory.
 
     `warn` is called with a refusal.
     """
     if sys.platform != 'linux':
-        if realtime.priority > 0 or realtime.lock_memory:
+        if realtime.priority > 0:
             warn('realtime: left out, since only Linux has it')
         return
-    if realtime.priority > 0:
-        try:
-            _schedule(realtime.priority)
-        except OSError as error:
-            warn(
-                f'SCHED_FIFO priority {realtime.priority} refused ({error.strerror}): running with '
-                'the default scheduling; allow it with a limit on rtprio for this user'
-            )
-    if realtime.lock_memory:
-        libc = ctypes.CDLL(None, use_errno=True)
-        if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
-            reason = os.strerror(ctypes.get_errno())
-            warn(
-                f'locking memory refused ({reason}): pages may be swapped out; allow it with a '
-                'limit on memlock for this user'
-            )
+    if realtime.priority == 0:
+        return
+    try:
+        _schedule(realtime.priority)
+    except OSError as error:
+        warn(
+            f'SCHED_FIFO priority {realtime.priority} refused ({error.strerror}): running with '
+            'the default scheduling; allow it with a limit on rtprio for this user'
+        )
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+        reason = os.strerror(ctypes.get_errno())
+        warn(
+            f'locking memory refused ({reason}): pages may be swapped out; allow it with a '
+            'limit on memlock for this user'
+        )
 
 
 @contextmanager

@@ -81,11 +81,16 @@ def switched_blocks(config: ControllerConfig) -> dict[str, bool]:
     }
 
 
+def disturbance_frequencies(config: ControllerConfig) -> tuple[float, ...]:
+    """Return the frequencies [rad/s] of sinusoidal disturbances: of the two links alone."""
+    return () if config.model == 'urdf' else two_link(config).frequencies
+
+
 def _column_blocks(config: ControllerConfig) -> list[str]:
     """Return the names of the blocks of columns, each with a column per joint."""
     learning = config.learning
     blocks = [name for name, is_on in switched_blocks(config).items() if is_on]
-    for w in learning.frequencies:
+    for w in disturbance_frequencies(config):
         blocks += [f'sin {w:g} rad/s', f'cos {w:g} rad/s']
     for cycles in learning.ripple_cycles:
         blocks += [f'sin {cycles:g} q', f'cos {cycles:g} q']

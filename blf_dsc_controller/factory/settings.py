@@ -27,6 +27,7 @@ from blf_dsc_controller.configuration.robot import (
 from blf_dsc_controller.factory.estimate import (
     Column,
     columns_of,
+    disturbance_frequencies,
     doubting_covariance,
     model_of,
     prior_covariance,
@@ -269,13 +270,15 @@ def _columns(config: ControllerConfig, p: int) -> columns.Settings:
     """Return which disturbance columns there are."""
     learning = config.learning
     blocks = switched_blocks(config)
+    tones = disturbance_frequencies(config)
     return filled(
         columns.Settings,
         learning,
         first=p,
         **{name: int(is_on) for name, is_on in blocks.items()},
         coulomb_velocity=_coulomb_velocity(config),
-        tones=len(learning.frequencies),
+        tones=len(tones),
+        frequencies=np.array(tones),
         ripples=len(learning.ripple_cycles),
     )
 

@@ -266,7 +266,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             trajectories.poll(guard)
         try:
             if self.declaration is not None:
-                self.declaration.follow(guard, in_motion=self.config.load.in_motion)
+                self.declaration.follow(guard, in_motion=self.declaration.in_motion)
             torque = self._torque_for(guard, raw)
             self._write(topics.JOINT_STATES, raw)
             self._command(torque)

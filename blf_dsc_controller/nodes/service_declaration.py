@@ -25,6 +25,7 @@ from blf_dsc_controller.supervision.load_declaration import (
 )
 
 _PATIENCE = 2000  # states, until an answer is no longer waited for
+_UR = 'ur_msgs/srv/SetPayload'
 _DENSITY = 1000.0  # kg/m^3, of the ball that stands for the shape of a load
 
 
@@ -75,6 +76,11 @@ class ServiceDeclaration(LoadDeclaration):
             return
         self._type = types[0]
         self.client = self._node.create_client(service, self._name)
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether the drives accept a load while the arm moves: those of a UR do."""
+        return self._type == _UR
 
     def begin(self) -> None:
         """Begin with a new law, which does not count loads declared before."""
@@ -161,6 +167,6 @@ def _fill_franka(request: Any, mass: float, centre: np.ndarray) -> None:
 
 
 _FILLS: Mapping[str, Callable[[Any, float, np.ndarray], None]] = {
-    'ur_msgs/srv/SetPayload': _fill_ur,
+    _UR: _fill_ur,
     'franka_msgs/srv/SetLoad': _fill_franka,
 }

@@ -42,7 +42,6 @@ _TIMES = (
     'saturation_time',
     'stop_ramp',
     'deactivation_ramp',
-    'fade_time',
 )
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
 

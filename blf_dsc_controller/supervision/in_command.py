@@ -28,7 +28,7 @@ from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 from blf_dsc_controller.supervision.readings import Readings
 from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_stop import WINDING_UP, SafeStop
-from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.safe_torque import FADE_TIME, SafeTorque
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.state_check import StateCheck, rate_mismatch
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, Watchdog
@@ -153,7 +153,7 @@ class InCommand:
         self.silenced = self.has_sample = False
         self.clean = True
         self.readings.restart()
-        if self.safe_torque.last.age >= self.config.safety.fade_time:
+        if self.safe_torque.last.age >= FADE_TIME:
             # else a torque may have to fade, which a driver must not hold
             self.watchdog.wait()
 
@@ -201,7 +201,7 @@ class InCommand:
         By then the safe torque has faded to zero, and whoever restarted the driver may
         not expect another. `gap` [s] is the time since the state before.
         """
-        faded = self.safe_torque.last.age >= self.config.safety.fade_time
+        faded = self.safe_torque.last.age >= FADE_TIME
         if not self.silenced and faded and self.commanding and gap > LONG_SILENCE:
             self.withdraw(
                 f'joint states are back after {gap:.3g} s, and no torque is commanded until the '

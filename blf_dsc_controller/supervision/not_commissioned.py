@@ -17,12 +17,12 @@ def not_commissioned(config: ControllerConfig, *, in_motors: bool = False) -> st
     feedback = config.feedback
     if config.model != 'urdf' or config.law not in OWN:
         return ''
-    if config.commissioning.date:
+    if config.commissioning.friction:
         if feedback.stiffness <= 1.0:
             return ''
         return (
             f'feedback.stiffness: {feedback.stiffness:g} times the gains for which this arm was '
-            f'commissioned ({config.commissioning.date}): give 1 at most, or measure it again'
+            'commissioned: give 1 at most, or measure it again'
         )
     is_unknown = not (feedback.joint_stiffness or config.robot.joint_stiffness)
     if feedback.inertia == 'none' and is_unknown:

@@ -25,6 +25,9 @@ Vector = NDArray[np.float64]
 OBSERVER = 60.0, 30.0
 """L1 and L2 [rad/s] of the load: slow against the lag of velocities and torques."""
 
+FADE_TIME = 0.5
+"""Time [s] in which the torque fades while no usable state arrives."""
+
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
 # of the damping: an elastic joint that oscillates passes for a light one
 _LIGHTEST = 0.5
@@ -47,7 +50,7 @@ def safe_torque(
     (`within_gap`).
     """
     torque = np.zeros(settings.n)
-    if last.age >= safety.fade_time:
+    if last.age >= FADE_TIME:
         return torque
     with np.errstate(over='ignore', invalid='ignore'):  # checked below
         damping = scale * np.array(safety.damping)
@@ -61,7 +64,7 @@ def safe_torque(
     if not np.isfinite(torque).all():
         return np.zeros(settings.n)
     limited = np.clip(torque, -settings.torque.limit, settings.torque.limit)
-    return limited * (1.0 - last.age / safety.fade_time)
+    return limited * (1.0 - last.age / FADE_TIME)
 
 
 class SafeTorque:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.safe_torque import FADE_TIME, SafeTorque
 from blf_dsc_controller.supervision.sensor_noise import SensorNoise
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
 from blf_dsc_controller.supervision.swing_names import SwingNames
@@ -102,7 +102,7 @@ class TorqueWatchdog:
     @property
     def has_state(self) -> bool:
         """Whether it knows where the arm is."""
-        return self._safe.last.age < self.config.safety.fade_time
+        return self._safe.last.age < FADE_TIME
 
     @property
     def watches(self) -> bool:
@@ -173,7 +173,7 @@ class TorqueWatchdog:
         if not self.active:
             return None
         torque = safe.advance(safety, self._settings, self._estimate, dt)
-        if safe.last.age >= safety.fade_time:
+        if safe.last.age >= FADE_TIME:
             self._forget_controller()
         return torque
 
