@@ -127,7 +127,8 @@ def test_motion_begins_at_rest_and_keeps_its_limits(motion):
     middle = frames(chain, POSTURE)[-1][:3, 3]
     travel = np.linalg.norm(tips - middle, axis=1).max()
     assert travel == pytest.approx(made.travel, rel=1e-2)  # of samples between others
-    assert 0.5 * 0.01 < travel <= 0.0101
+    least = 0.4 if made.sliding else 0.5  # swings are as fast as they should be
+    assert least * 0.01 < travel <= 0.0101
     np.testing.assert_allclose(np.abs(dq).max(axis=0), made.speed, rtol=0.05)
 
 

@@ -280,7 +280,7 @@ def notes_of(found: Identified) -> Iterator[str]:
     if corrected > urdf:
         yield (
             'the corrected URDF alone predicts worse than the original: terms for which a URDF has '
-            'no place, above all offsets and rotors, are large here; use the .xml or .yaml of --out'
+            'no place, above all offsets and rotors, are large here; use the .yaml of --out'
         )
     if found.rest:
         yield f'{found.rest:.1f} s in which no joint moves were left out'
