@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller import load_loop
 from blf_dsc_controller.drive.driver import Driver, Facts, RobotState
 from blf_dsc_controller.motors.field import Field
 from blf_dsc_controller.motors.frame import Ranges, torque_alone

@@ -18,9 +18,10 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
+from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, load_loop
+from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
@@ -36,7 +37,7 @@ from blf_dsc_controller.messages.topics import (
     TRACKING_ERROR,
     TRUTH,
 )
-from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.simulation.loop import write_bag
 
 LATCHED = {ROBOT_DESCRIPTION.resolved: [ROBOT_DESCRIPTION.offered]}
 

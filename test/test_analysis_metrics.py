@@ -11,13 +11,12 @@ import pytest
 import recorded_run
 from recorded_run import BOUND_RAD, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
-from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller import Run, measure, read_run, simulate
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.output import plain, write_json
-from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LATE_STEPS
-from blf_dsc_controller.run import LearnedArm, Run, Series
-from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.run import LearnedArm, Series
+from blf_dsc_controller.simulation.loop import write_bag
 
 SAMPLES = 10_000
 

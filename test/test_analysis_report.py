@@ -16,9 +16,8 @@ from matplotlib import rcParams
 from matplotlib.colors import to_hex, to_rgb
 from recorded_run import JOINTS, MILLISECOND, START, Synthetic
 
+from blf_dsc_controller import draw, measure, read_run
 from blf_dsc_controller.analysis import figures
-from blf_dsc_controller.analysis.figures import draw
-from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.panels import (
     ALARM,
@@ -26,7 +25,6 @@ from blf_dsc_controller.analysis.panels import (
     panels,
 )
 from blf_dsc_controller.analysis.report import plots, read_bag, write_report
-from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType

@@ -9,10 +9,9 @@ import pytest
 import recorded_run
 from recorded_run import Synthetic
 
-from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller import measure, read_run
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.verdict import verdict_of
-from blf_dsc_controller.bags.reader import read_run
 
 
 @pytest.fixture(scope='module')

@@ -6,7 +6,8 @@ from __future__ import annotations
 import pytest
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.errors import BlfDscError, check_type
+from blf_dsc_controller import BlfDscError
+from blf_dsc_controller.errors import check_type
 
 LOOP = blf.load_loop('paper')
 

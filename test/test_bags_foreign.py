@@ -28,13 +28,11 @@ from rosbags.rosbag2 import (
 )
 from rosbags.typesys import Stores, get_typestore
 
+from blf_dsc_controller import BlfDscError, load_loop, read_run, share_folder
 from blf_dsc_controller.bags.content import NameMap, read_content
-from blf_dsc_controller.bags.reader import applied_torque, read_run, single_run
+from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,

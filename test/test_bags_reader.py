@@ -18,14 +18,9 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 from recorded_run import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
+from blf_dsc_controller import BagError, read_run
 from blf_dsc_controller.bags.content import NameMap, read_content
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.bags.sources import (
-    BagError,
-    BagMessage,
-    next_record,
-    records_in,
-)
+from blf_dsc_controller.bags.sources import BagMessage, next_record, records_in
 from blf_dsc_controller.bags.topic_messages import TopicMessages, UnreadableMessageError
 from blf_dsc_controller.bags.unpacking import LARGEST, unpacked
 from blf_dsc_controller.bags.writer import BagWriter

@@ -29,10 +29,11 @@ from rosbags.rosbag2 import (
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from blf_dsc_controller import BagError
 from blf_dsc_controller.bags import writer
 from blf_dsc_controller.bags.background_file import BackgroundFile
 from blf_dsc_controller.bags.recovery import recover
-from blf_dsc_controller.bags.sources import BagError, open_bag
+from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (

@@ -14,11 +14,12 @@ import recorded_run
 from command import finished
 from recorded_run import Synthetic, limited_files, small_disk
 
+from blf_dsc_controller import load_loop
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.cli.run import loop_configuration, notes_on_ideal_arm
 from blf_dsc_controller.compiled.announcement import COMPILING
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load_loop
+from blf_dsc_controller.configuration.nodes import CONTROLLER
 
 INTERRUPTED_WHILE_COMPILING = """
 import os, signal, sys

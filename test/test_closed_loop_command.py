@@ -28,7 +28,7 @@ from recorded_run import small_disk
 from ros_rig import simulated
 from rosbags.highlevel import AnyReader
 
-from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller import read_run
 from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.result_folder import (

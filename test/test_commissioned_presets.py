@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import load_loop, share_folder
 from blf_dsc_controller.commissioning import files
-from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import PLANT, load_loop, read
+from blf_dsc_controller.configuration.nodes import PLANT, read
 
 PRESETS = {'fr3_direct': '', 'panda': '', 'ur5e': ' --ripple'}
 """The option with which the file of a preset was written."""

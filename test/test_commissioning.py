@@ -10,6 +10,15 @@ import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import (
+    BlfDscError,
+    ControllerConfig,
+    PlantConfig,
+    change,
+    load_loop,
+    share_folder,
+    simulate,
+)
 from blf_dsc_controller.analysis import figures
 from blf_dsc_controller.arms.joint_gains import linear
 from blf_dsc_controller.arms.linear_loop import (
@@ -45,17 +54,12 @@ from blf_dsc_controller.commissioning.response import (
     response_of,
 )
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import PLANT, load_loop, read
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change, flatten
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.configuration.nodes import PLANT, read
+from blf_dsc_controller.configuration.schema import build, flatten
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import FIRST_STAMP, Oscillation, Stop
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.expected_errors import expected_errors
 from sim_plant.settings import true_rotors
 

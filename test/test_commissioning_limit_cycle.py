@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blf_dsc_controller import load_loop
 from blf_dsc_controller.cli import commission
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.limit_cycle import (
@@ -17,7 +18,6 @@ from blf_dsc_controller.commissioning.limit_cycle import (
     limit_cycles,
 )
 from blf_dsc_controller.commissioning.page import of_limit_cycle
-from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.run import TURNING
 
 T = np.arange(0.0, 15.0, 1e-3)  # s

@@ -10,6 +10,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from blf_dsc_controller import (
+    ControllerConfig,
+    PlantConfig,
+    change,
+    share_folder,
+    simulate,
+)
 from blf_dsc_controller.arms.joint_gains import linear
 from blf_dsc_controller.arms.linear_loop import (
     Joints,
@@ -35,12 +42,8 @@ from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.picture import draw
 from blf_dsc_controller.commissioning.planned import plan
 from blf_dsc_controller.commissioning.response import Sensed
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.simulation.loop import simulate
 
 ROTORS = (0.3, 0.1)  # kg m^2
 VISCOUS = (2.0, 1.0)  # N m s/rad

@@ -16,6 +16,7 @@ from elastic_two_link import ARM, NEAR, shorten_motions, shorten_moves
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import BlfDscError, change
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.commission_ripple import on_robot
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile
@@ -33,9 +34,7 @@ from blf_dsc_controller.commissioning.planned import FROM_LIMITS
 from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.commissioning.ripple import ripples_in, to_learn
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.loop import End
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled

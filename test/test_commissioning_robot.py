@@ -14,6 +14,7 @@ from plant_driver import PlantDriver
 from recorded_run import small_disk
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import BlfDscError, change
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.main import main
@@ -23,9 +24,7 @@ from blf_dsc_controller.commissioning.driven import Driven
 from blf_dsc_controller.commissioning.planned import plan
 from blf_dsc_controller.commissioning.postures import SPEED, EndedError, move
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.loop import End
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled

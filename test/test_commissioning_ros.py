@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from ros_rig import PATIENCE
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.cli.commission_ripple import on_robot
 from blf_dsc_controller.cli.commission_ros import made
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile
@@ -33,7 +34,6 @@ from blf_dsc_controller.commissioning.postures import EndedError, ripples_by_bag
 from blf_dsc_controller.commissioning.ripple import to_learn
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.drive.loop import End
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.plant_node import PlantNode

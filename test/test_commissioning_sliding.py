@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from blf_dsc_controller import BlfDscError, Commissioning, ControllerConfig
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.commissioning.commissioning import Commissioning
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, dump
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import BlfDscError
 
 
 def joint(name, kind, parent, axis, place, limits, effort, mass):

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from random_arm import chain_of, random_urdf
 
+from blf_dsc_controller import ControllerConfig, load_loop, simulate
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.settings import settings_of_config
@@ -21,7 +20,6 @@ from blf_dsc_controller.identification.exciting_reference import (
     ExcitationProblem,
     search,
 )
-from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
 SIGMA = 0.003

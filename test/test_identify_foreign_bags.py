@@ -13,11 +13,11 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.messages.codecs import JointStateEncoder, typestore
 from blf_dsc_controller.messages.topics import JOINT_STATE

@@ -14,10 +14,10 @@ import pytest
 from random_arm import PANDA, PANDA_TEXT, UR5E, UR5E_TEXT
 from scipy.io import savemat
 
+from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import next_record
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.from_table import read_table
 
 PERIOD = 0.01  # s

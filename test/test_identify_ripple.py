@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from random_arm import recording_of, reference_of
 
+from blf_dsc_controller import change, load_loop, simulate
 from blf_dsc_controller.commissioning.slow_motion import slow_frequencies
-from blf_dsc_controller.configuration.nodes import PLANT, load_loop
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.identification.identify import ripples_left
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.recording import resampled
@@ -21,7 +21,6 @@ from blf_dsc_controller.identification.ripple import (
     NOTHING,
     listed_cycles,
 )
-from blf_dsc_controller.simulation.loop import simulate
 from sim_plant.plant import plant_of
 
 LOAD = {'begin': [10.0], 'duration': [100.0], 'payload': [3.0]}

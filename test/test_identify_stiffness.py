@@ -18,13 +18,12 @@ from random_arm import (
     truth_of,
 )
 
+from blf_dsc_controller import change, load_loop, read_run, simulate
 from blf_dsc_controller.bags.content import NameMap
-from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.reading import read_recording
@@ -33,7 +32,7 @@ from blf_dsc_controller.identification.stiffness import compliance_of
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
-from blf_dsc_controller.simulation.loop import simulate, simulate_into_bag
+from blf_dsc_controller.simulation.loop import simulate_into_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
 STIFFNESS = np.array([14e3, 14e3, 14e3, 14e3, 8e3, 8e3, 8e3])  # N m/rad

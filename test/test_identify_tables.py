@@ -16,10 +16,10 @@ from random_arm import (
 )
 from scipy.io import savemat
 
+from blf_dsc_controller import ControllerConfig
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli import identify as command
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load
 from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.identification.from_table import read_table

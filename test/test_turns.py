@@ -14,21 +14,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller import (
+    ControllerConfig,
+    Phase,
+    PlantConfig,
+    TrajectoryPoint,
+    share_folder,
+)
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.identification.recording import resampled
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.reference.trajectory import (
-    Trajectory,
-    TrajectoryError,
-    TrajectoryPoint,
-)
+from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError
 from blf_dsc_controller.reference.turns import short_way
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 from blf_dsc_controller.supervision.wraps import Wraps
 from sim_plant.plant import plant_of

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 from recorded_run import limited_files
 
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.writing import write_text, writing
 
 
