@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from paper_case import (
     BOUND,
+    CHANGED,
     OFF,
     ROWS,
     WINDOW,
+    P,
     configured,
     end_of,
+    payload,
     run_preset,
     several,
 )
@@ -59,6 +62,26 @@ def test_bound_holds_when_the_arm_changes(name, sensors):
     assert learning.parameter_error[-1] < 0.01
 
 
+def test_change_is_known_before_its_window_is_full():
+    """5 of 6.3 s after it; 3 % are left without the pull to the estimate before."""
+    assert run_preset(CHANGED + 5.1, payload(0.75)).error_at(CHANGED + 5.0) < 0.025
+
+
+def test_another_change_takes_back_what_a_partial_window_taught_without_a_step():
+    """5.5 of 6.3 s after the first; the torque would jump by 3 N m."""
+    first, second = CHANGED, CHANGED + 5.5
+    load = {'payload': 0.25}
+    loaded = run_preset(
+        second + 1.0, several(load | {'begin': first}, load | {'begin': second})
+    )
+    before, after = np.searchsorted(loaded.t, (second - 0.1, second + 0.5))
+    assert loaded.error_at(second - 0.1) < 0.025
+    # as before the first change, but for 0.4 s of tracking errors
+    np.testing.assert_allclose(loaded.estimate[after, :3], P, atol=0.08)
+    steps = np.abs(np.diff(loaded.torque[before:after], axis=0))
+    assert steps.max() < 0.5
+
+
 def test_estimate_is_hardly_off_while_something_pushes():
     """No window in which a push comes or goes is learned from, though no change is found."""
     row = ROWS['push (0, 3.0, 3.0)']
@@ -104,6 +127,19 @@ def test_estimate_does_not_drift_at_rest_with_noise():
     standing = run_preset(60.0, preset='noisy', law={'reference.type': 'hold'})
     assert np.ptp(standing.parameter_error[standing.t > WINDOW + 0.1]) == 0.0
     assert np.all(standing.largest(1.0) < 0.5 * BOUND)
+
+
+def test_rest_after_a_motion_replaces_nothing_that_it_taught():
+    """Its windows are excited enough for seconds, but ever weaker: once they taught 5 % less."""
+    steps = np.arange(14)
+    ways = np.column_stack((2.293 - 0.5 * (steps % 2), 1.696 - 0.4 * (steps // 2 % 2)))
+    law = {
+        'reference.type': 'waypoints',
+        'reference.times': [0.0, *(1.0 + 1.5 * steps).tolist()],
+        'reference.waypoints': [2.293, 1.696, *ways.ravel().tolist()],
+    }
+    moved = run_preset(28.0, law=law)
+    assert moved.parameter_error[-1] == pytest.approx(moved.error_at(20.0), rel=0.02)
 
 
 def test_column_rejected_at_rest_is_readmitted_in_motion():
