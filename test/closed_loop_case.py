@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from symbols import replaced
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.backstepping import Backstepping
@@ -39,20 +39,17 @@ JOINTS = ('shoulder', 'elbow')
 
 
 def recommended(
-    *,
-    bias: bool = True,
-    viscous: bool = False,
-    frequencies: Sequence[float] = (),
-    **changes: Any,
+    *, bias: bool = True, frequencies: Sequence[float] = (), **changes: Any
 ) -> Settings:
     """Return the settings of the default configuration with changes (`symbols`), and their knee.
 
     Change detection is off, since the paper has none: test_law_consistency.py covers
     it.
     """
-    config = ControllerConfig()
-    columns = {'viscous': viscous, 'frequencies': frequencies}
-    config = replace(config, learning=replace(config.learning, bias=bias, **columns))
+    columns: dict[str, Any] = {'two_link.bias': bias}
+    if frequencies:
+        columns['two_link.frequencies'] = list(frequencies)
+    config = build(ControllerConfig, columns)
     settings = replaced(settings_of_config(config), **{'change_detection': 0} | changes)
     of = settings.barrier
     barriers = zip(of.bound, of.weight, of.slope_limit, strict=True)

@@ -134,7 +134,6 @@ def drawn(seed):
     linear = not random.integers(4)
     columns = {
         'bias': bool(random.integers(2)),
-        'viscous': bool(random.integers(2)),
         'frequencies': [(), (2.0,)][random.integers(2)],
     }
     m = quick(**columns).m

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identities of what rows say: load and intervals by numpy, changes of the arm by scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from law_part import part
+from scipy.optimize import brentq
+from scipy.stats import multivariate_normal, multivariate_t
+
+from blf_dsc_controller.law import innovation, weighing
+from blf_dsc_controller.numerics.algebra import cholesky_factor
+
+N, M, P = 2, 5, 3  # joints, entries of theta; base parameters, the others are friction
+LOAD = weighing.LOAD
+SINCE = LOAD + N
+K = M + 2 * N  # theta, breakaway torques, shares of the torque that are lost
+PERIOD = 0.01  # s, of the rows
+MOST = 500.0  # rows of a window
+UNSURE = np.repeat(
+    (0.3, 0.1), N
+)  # deviations of breakaway torques [N m], and of shares
+random = np.random.default_rng(1)
+SCALE = np.hstack((random.normal(size=(4, LOAD)), np.zeros((4, N))))
+SCALE[:, 0] = 1.0, 0.1, 0.2, -0.1  # z = (1, 0, ..., 0) is 1 kg with its moments [kg m]
+COLUMNS = np.zeros((K + 1, SINCE))  # [N D | E]
+COLUMNS[:M, :LOAD] = random.normal(size=(M, 4)) @ SCALE[:, :LOAD]
+COLUMNS[P:M, LOAD:] = 0.2 * np.eye(N)
+PRIOR = innovation.Prior(random.normal(size=M), np.diag(random.uniform(0.5, 2.0, M)))
+SETTINGS = weighing.Settings(
+    size=K + 1,
+    inertial=P,
+    since=SINCE,
+    unknowns=K + SINCE,
+    window=200,
+    row_interval=1,
+    pole=20.0,
+    motion_scale=0.05,
+    unmodelled=0.01,
+    load_friction=UNSURE[-1] ** -2,
+    breakaway=UNSURE[:N] ** -2,
+    columns=COLUMNS,
+    scale=SCALE,
+)
+
+
+def test_load_is_that_of_joint_least_squares_with_all_priors():
+    """Of random rows before and since; intervals by the inverse of the normal equations."""
+    state, work = (
+        part(layout, n=N, weighing=SETTINGS)
+        for layout in (weighing.State, weighing.Work)
+    )
+    truth = random.normal(size=K + SINCE)
+    rows, sums = [], {weighing.BEFORE: 90, weighing.NEWER: 40, weighing.LATEST: 20}
+    for which, count in sums.items():
+        X = random.normal(size=(count * N, K))
+        held = X[:, :M] @ COLUMNS[:M] * (which != weighing.BEFORE)
+        u = np.hstack((X, held)) @ truth + 0.04 * random.normal(size=count * N)
+        rows.append(np.column_stack((X, held, u)))
+        Xu = np.column_stack((X, u))
+        state.sums[which] = np.triu(Xu.T @ Xu)
+    period = innovation.CORRELATION / 7.0  # so that seven rows count as one
+    a = 7.0 * 0.04**2
+    grown = 5.0 / 20.0  # of the variance of changed friction
+    state.complete[0], state.age[0], state.innovation.noise[0] = 1.0, 5.0, 0.04**2
+    weighing.solve(SETTINGS, state, work, PRIOR, period)
+    weighing.describe(SETTINGS, state, work, period)
+
+    H = np.eye(K + SINCE)
+    H[:M, :M] = PRIOR.information
+    H[M:K, M:K] = np.diag(UNSURE**-2)
+    H[K + LOAD :, K + LOAD :] /= grown
+    *A, u = np.vstack(rows).T
+    expected = np.append(PRIOR.estimate, np.zeros(2 * N + SINCE))
+    g = np.array(A) @ u + a * H @ expected
+    H = np.array(A) @ np.transpose(A) + a * H
+    expected = np.linalg.solve(H, g)
+    np.testing.assert_allclose(state.solution, expected, rtol=1e-6, atol=1e-9)
+    mass, *moments = SCALE @ expected[K:]
+    centre = np.array(moments) / mass
+    C = a * SCALE @ np.linalg.inv(H)[K:, K:] @ SCALE.T
+    J = np.column_stack((-centre, np.eye(3))) / mass
+    deviation = np.sqrt(np.append(C[0, 0], np.diag(J @ C @ J.T)))
+    np.testing.assert_allclose(state.load, [mass, *centre, *deviation], rtol=1e-5)
+
+
+def begun(rows=0.0, unmodelled=1.0):
+    """Statistics after some rows: s^2 is a tenth of what is unmodelled."""
+    state = innovation.State(*np.zeros((5, 1)))
+    innovation.begin(state, unmodelled)
+    state.rows[0] = rows
+    return state
+
+
+def test_square_of_an_innovation_is_that_of_its_covariance():
+    """It is s^2 on average, whatever is known of theta."""
+    noise = 0.5
+    a = noise * innovation.CORRELATION / PERIOD
+    squares = []
+    for count in random.integers(1, 40, 1000):
+        before = random.normal(size=(count, M))
+        A = before.T @ before + a * np.eye(M)
+        theta = random.multivariate_normal(np.zeros(M), a * np.linalg.inv(A))
+        X = random.normal(size=(N, M))
+        u = X @ theta + np.sqrt(noise) * random.normal(size=N)
+        S = noise * np.eye(N) + a * X @ np.linalg.inv(A) @ X.T
+        expected = noise * u @ np.linalg.solve(S, u) / N
+        cholesky_factor(A)
+        square = innovation.normalized_square(X, u, A, PERIOD, np.zeros((N, N)))
+        assert square == pytest.approx(expected, rel=1e-9)
+        squares.append(square / noise)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.1)
+
+
+def as_improbable(rows, n=6):
+    """The F of n innovations, t by so many independent rows, as improbable as normal 8."""
+
+    def fall(distribution, square):
+        x = np.full(n, np.sqrt(square))
+        return distribution.logpdf(np.zeros(n)) - distribution.logpdf(x)
+
+    known = fall(multivariate_normal(np.zeros(n)), 8.0)
+    doubted = multivariate_t(np.zeros(n), df=n * rows)
+    return brentq(lambda F: fall(doubted, F) - known, 1.0, 100.0)
+
+
+@pytest.mark.parametrize('rows', [0.0, 50.0, 200.0, MOST])
+def test_change_by_a_noise_of_few_rows_is_as_improbable_as_by_that_of_a_window(rows):
+    """By scipy; a hundred assumed rows count, fewer as the window fills."""
+    counted = rows + 100.0 * (1.0 - rows / MOST)
+    few, window = (
+        as_improbable(each * PERIOD / innovation.CORRELATION)
+        for each in (counted, MOST)
+    )
+    found = innovation.alarm(begun(rows), PERIOD, MOST)
+    assert found == pytest.approx(8.0 * 0.1 * few / window)
+
+
+@pytest.mark.parametrize('share', [1.0, 0.25, 0.01])
+def test_noise_is_that_of_moving_rows_whatever_their_weight(share):
+    """Rows of a weight w have w^2 of the square; those at rest, of none, say nothing."""
+    state = begun()
+    for _ in range(round(600 / share)):
+        assert not innovation.update(state, 0.3 * share, share, 1.0, PERIOD, MOST)
+    assert state.noise[0] == pytest.approx(0.3, rel=0.01)
+    assert state.recent[0] == pytest.approx(0.3, rel=0.01)
+    before = [float(value[0]) for value in state]
+    for _ in range(1000):
+        assert not innovation.update(state, 0.0, 0.0, 1.0, PERIOD, MOST)
+    assert [float(value[0]) for value in state] == before
