@@ -196,7 +196,7 @@ def test_table_shows_the_metrics_and_what_is_unusual(run):
     ('changes', 'line'),
     [
         ({}, 'began at 0.6'),
-        ({'two_link.learning_weight': 0.0}, 'not used by this law'),
+        ({'learning.enabled': False}, 'not used by this law'),
         ({'law': 'slotine_li'}, 'not used by this law'),
     ],
 )

@@ -130,36 +130,6 @@ def test_a_lag_of_the_damping_helps_an_encoder_beyond_the_spring_alone():
     assert margin(late, motor_side=True) < margin(law, motor_side=True)
 
 
-def test_joints_that_do_not_act_on_each_other_may_lag_each_by_its_own():
-    lags, pair, two = (0.003, 0.0), np.eye(2)[None], np.ones(2)
-    arm = joints(3e4, motors=2.0)
-    both = Joints(motors=2.0 * two, viscous=0.5 * two, stiffness=3e4 * two)
-    law = by_velocity(60.0)
-    of_pair = Feedback(
-        surface=60.0 * pair,
-        position=pair,
-        inertia=0.0 * pair,
-        integral=0.1 * pair,
-        rate=two,
-        time_constant=0.004,
-        known_rate=True,
-        damping_lag=np.array(lags),
-    )
-    alone = [law._replace(damping_lag=lag) for lag in lags]
-    s = 2j * np.pi * np.array([5.0, 25.0])
-    C = law_response(of_pair, TIMING, s)
-    for i, each in enumerate(alone):
-        expected = law_response(each, TIMING, s)[..., 0, 0]
-        np.testing.assert_allclose(C[..., i, i], expected, rtol=1e-12)
-    A, _ = Loop(pair, both, TIMING, of_pair).transition()
-    values = [Loop(ONE, arm, TIMING, each).transition()[0] for each in alone]
-    found = np.sort(np.abs(np.linalg.eigvals(A[0])))
-    expected = np.sort(
-        np.abs(np.concatenate([np.linalg.eigvals(v[0]) for v in values]))
-    )
-    np.testing.assert_allclose(found[-expected.size :], expected, atol=1e-6)
-
-
 def test_a_torque_loop_hides_the_motor():
     """Far below its bandwidth the arm responds as a link with a motor of B / (1 + k_T)."""
     loop = TorqueLoop(gain=4.0, damping=0.0, lag=0.0003)

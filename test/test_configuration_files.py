@@ -20,16 +20,13 @@ from hypothesis import strategies as st
 from paper_case import instead
 
 from blf_dsc_controller.compiled.layout import pack
-from blf_dsc_controller.configuration import files
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import parse, share_folder
 from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
-    CONTROLLER,
     LoopConfig,
     dump,
     format_value,
-    ignored_sections,
     known_names,
     load,
     load_loop,
@@ -39,11 +36,8 @@ from blf_dsc_controller.configuration.nodes import (
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.configuration.side_nodes import RecorderConfig
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
+from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law.adaptation import GRADIENT
-from blf_dsc_controller.law.prediction import LAMBDA
-from blf_dsc_controller.law.state import STATE
 from blf_dsc_controller.messages import topics
 
 CHANGED = LoopConfig(
@@ -236,17 +230,13 @@ REMEDIES = [
     ('<robot name="a">\n<!-- it: is -->\n</robot>', 'names it as robot.urdf'),
     (section('n', 'a: 1') + '---\nm: {}\n', 'leave out the line ---'),
     (section('n', 'a: [0,08, 0,09]'), 'if 0,035 is to be one number, write 0.035'),
-    (section('n', 'a: [0,035, 0.035]'), 'if 0,035 is to be one number, write 0.035'),
-    (section('n', 'a: [1,05, 1.0]'), 'if 0,035 is to be one number, write 0.035'),
     (section('n', 'a: [0.5, -0,35]'), 'if 0,035 is to be one number, write 0.035'),
     (section('n', 'a: [0, 0, 1.0]'), 'write all entries alike (1.0, not 1)'),
-    (section('n', 'a: [1, 10, 1.0]'), 'write all entries alike (1.0, not 1)'),
     (section('n', 'a: 0,035'), ': 035 has no value: a comma separates entries'),
     (
         'm:\n    a: {}\n  b:\n    c: 1\n',
         'in the column of the other lines of its group',
     ),
-    (section('n', 'a: &x 1, b: *x'), 'alias *x: write out its value'),
     ('- 1\n', 'at the top, such as {/**: {ros__parameters: '),
     ('n:\n  ros_parameters: {a: 1}\n', 'ros_parameters has to be ros__parameters'),
     ('n:\n  seed: 1\n', 'write ros__parameters: below the name of the node'),
@@ -444,41 +434,6 @@ def test_the_law_paper_with_all_choices_of_blf_dsc_is_that_law(preset):
     )
 
 
-@pytest.mark.parametrize(
-    ('name', 'printed'),
-    [
-        ('prediction', LAMBDA),
-        ('update', GRADIENT),
-        ('compensation', STATE),
-        ('bumpless', 0),
-        ('known_rate', 0),
-        ('change_detection', 0),
-    ],
-)
-def test_each_choice_of_the_law_paper_is_as_printed_unless_it_is_given(name, printed):
-    """On an arm from a URDF, for which `blf_dsc` knows the rate."""
-    usual = instead(known_rate=True)
-    for gains, as_printed in ((usual, False), (without(usual, f'gains.{name}'), True)):
-        changes = {CONTROLLER: gains | {'disturbance.observer_bandwidth': 0.0}}
-        settings = settings_of_config(load_loop('panda', changes).controller)
-        found = {
-            'prediction': settings.row.prediction,
-            'update': settings.adaptation.update,
-            'compensation': settings.compensation,
-            'bumpless': settings.disturbance.bumpless,
-            'known_rate': settings.surface.known_rate,
-            'change_detection': settings.excitation.change_detection,
-        }
-        assert (found[name] == printed) == as_printed
-        assert settings.friction.bumpless == found['bumpless']
-        is_checked = not (as_printed and name in ('prediction', 'change_detection'))
-        assert found['change_detection'] == is_checked
-
-
-def without(values, name):
-    return {each: value for each, value in values.items() if each != name}
-
-
 def test_a_law_of_the_package_has_its_gains_and_others_have_not(file):
     gains = 'gains: {surface_gain: [9.0, 8.0]}'
     path = file(section('/**', f'law: backstepping, {gains}'))
@@ -569,45 +524,6 @@ def test_misspelt_node_name_is_reported(file):
     assert (
         load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
     )
-
-
-@pytest.mark.parametrize(
-    ('node', 'ignored'),
-    [
-        ('left/sim_plant', False),
-        ('right/sim_plant', False),
-        ('sim_plant', True),
-    ],
-)
-def test_sections_of_several_robots_are_read_if_one_of_them_is_that_of_the_node(
-    node, ignored
-):
-    """Each robot has its own in one file."""
-    text = ''.join(
-        f'/{name}/**:\n  ros__parameters: {{seed: 1}}\n' for name in ('left', 'right')
-    )
-    said = ignored_sections(parse(text), [node])
-    assert ('/left/** (line 2), /right/** (line 4)' in said) == ignored == bool(said)
-
-
-@pytest.mark.parametrize('prefix', ['source', 'prefix/share/blf_dsc_controller'])
-def test_files_are_those_of_the_source_tree_or_of_the_prefix(
-    tmp_path, monkeypatch, prefix
-):
-    """And never those of the current folder."""
-    here = tmp_path / 'here'
-    installed = tmp_path / 'prefix/lib/python3/site-packages'
-    own = installed if prefix == 'source' else tmp_path / prefix
-    monkeypatch.setattr(files, '_ABOVE', [installed, *installed.parents[:3]])
-    (here / 'config').mkdir(parents=True)
-    (here / 'config/recommended.yaml').touch()
-    monkeypatch.chdir(here)
-    with pytest.raises(BlfDscError, match='install the package again') as error:
-        files.share_folder()
-    assert str(here) not in str(error.value)
-    (own / 'config').mkdir(parents=True)
-    (own / 'config/recommended.yaml').touch()
-    assert files.share_folder() == own
 
 
 def test_wrong_joints_are_reported_with_their_own_line(tmp_path):

@@ -53,17 +53,6 @@ def test_values_are_kept_and_flattened_and_a_change_keeps_the_others():
         change(changed, {'sample_time': 1.0, 'duration': 0.5})
 
 
-def test_what_may_be_left_out_of_an_arm_from_a_urdf_is_left_out():
-    """Not zero for each joint, which would be known to have no rotors."""
-    given = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
-    values = flatten(build(PlantConfig, given))
-    found = {True: set(), False: set()}
-    for param in parameters(PlantConfig):
-        if param.length == ('joints',):
-            found[param.omittable].add(len(values[param.name]))
-    assert found == {True: {0}, False: {6}}
-
-
 def test_limits_are_inclusive_and_arrays_as_long_as_others_say():
     limits = {'sample_time': 1.0, 'actuator.delay': 1000, 'learning.interval': 1}
     for cls, given in (

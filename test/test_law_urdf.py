@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from paper_case import configured, several
 from plants import rigid_gears
-from random_arm import PANDA_TEXT, random_urdf
+from random_arm import PANDA_TEXT
 
 from benchmark.studies import load_study
 from blf_dsc_controller import simulate
@@ -24,7 +24,6 @@ from blf_dsc_controller.factory.estimate import (
     columns_of,
     doubting_covariance,
     estimate_names,
-    model_of,
     prior_covariance,
 )
 from blf_dsc_controller.factory.settings import settings_of_config
@@ -57,24 +56,12 @@ def test_urdf_and_tip_are_enough_to_configure_an_arm():
     )
 
 
-def test_threads_share_no_working_memory():
-    first, second = model_of(panda()), model_of(panda())
-    assert not np.shares_memory(first.vector, second.vector)
-
-
 def test_friction_of_the_urdf_is_known_unless_the_drives_compensate_it():
     config = load_loop('fr3').controller
     known = {'gravity': [0.003] * 7 + [0.2] * 7, 'gravity_and_friction': [0.0] * 14}
     for compensated, friction in known.items():
         given = change(config, {'robot.drive_compensates': compensated})
         assert [column.initial for column in columns_of(given)] == friction
-
-
-def test_given_parameters_override_the_derived_ones():
-    config = panda(barrier__bound=[0.01] * 7, robot__lag=0.002)
-    assert config.barrier.bound == (0.01,) * 7
-    heavy = panda(robot__rotor_inertia=[0.2] * 7)
-    assert heavy.robot.rotors(heavy.robot.chain(heavy.joints)).tolist() == [0.2] * 7
 
 
 def test_urdf_may_be_given_as_text_or_file(tmp_path):
@@ -226,14 +213,6 @@ def test_drives_with_unknown_effort_limit_get_a_finite_prior():
     rotor = config.robot.rotors(config.robot.chain(config.joints))[6]
     assert deviations(config)['rotor7'] == pytest.approx(0.5 * rotor)
     assert 0.005 < rotor < 0.03
-
-
-def test_random_arm_with_prismatic_joints_needs_only_its_urdf():
-    # one chain: no tip needed
-    given = {'robot.urdf': random_urdf(4, seed=3)[0]}
-    config = build(ControllerConfig, given)
-    assert config.joints == ('j1', 'j2', 'j3', 'j4')
-    assert np.all(np.isfinite(settings_of_config(config).information))
 
 
 NOISY = {'sensor.velocity': 'measured', 'sensor.velocity_noise': 0.005}

@@ -165,12 +165,6 @@ def test_torques_of_random_arms_are_mujocos(seed, base):
             (40, 40, 27, 27, 7, 7, 7),
         ),
         (
-            OPENARM,
-            'openarm_right_ee_base_link',
-            (0.0081, 0.0081, 0.16, 0.16, 0.01, 0.01, 0.01),
-            (40, 40, 27, 27, 7, 7, 7),
-        ),
-        (
             FR3,
             'hand',
             (0.195, 0.195, 0.195, 0.195, 0.074, 0.074, 0.074),
@@ -228,20 +222,6 @@ def test_mjcf_and_urdf_of_an_arm_are_the_same_chain(name, joints, tip):
         assert each.friction == pytest.approx(expected.friction)
 
 
-def test_preset_openarm_is_the_arm_of_the_package():
-    """Its URDF is shipped, so that it needs neither MuJoCo nor the package."""
-    tip = {'robot.tip': 'openarm_left_ee_base_link'}
-    shipped, ours = robot_of({'robot.urdf': 'openarm.urdf'} | tip)
-    package, theirs = robot_of({'robot.urdf': OPENARM} | tip)
-    assert shipped.rotor_inertia == package.rotor_inertia
-    np.testing.assert_array_equal(ours.inertias, theirs.inertias)
-    q = states_of(7)[0]
-    np.testing.assert_array_equal(frames(ours, q), frames(theirs, q))
-    for each, expected in zip(ours.joints, theirs.joints, strict=True):
-        for field in ('name', 'lower', 'upper', 'effort', 'damping', 'friction'):
-            assert getattr(each, field) == getattr(expected, field)
-
-
 def test_preset_widowx_has_the_armatures_and_limits_of_its_mjcf():
     """As trossen_arm_sim 0.2.3 has them."""
     robot, chain = robot_of({'robot.urdf': 'widowx.urdf', 'robot.tip': 'ee_site'})
@@ -271,21 +251,6 @@ def test_preset_yam_has_the_weight_the_zero_posture_and_the_limits_that_its_make
     np.testing.assert_allclose(lower, [-150, 0, 0, -97, -90, -120], atol=1e-3)
     np.testing.assert_allclose(upper, [180, 210, 180, 90, 90, 120], atol=1e-3)
     assert robot.rotor_inertia == (0.032,) * 3 + (0.0018,) * 3
-
-
-def test_mjcf_of_an_fr3_is_its_own_urdf():
-    """Two files that franky-sim ships, and neither of us wrote."""
-    chain = robot_of({'robot.urdf': FR3, 'robot.tip': 'fr3_link7'})[1]
-    urdf = resolve('package://franky_sim/assets/fr3.urdf')
-    names = tuple(joint.name for joint in chain.joints)
-    theirs = Robot(urdf=str(urdf), tip='fr3_link7').chain(names)
-    q = states_of(7)[0]
-    for placement, expected in zip(
-        frames(chain, q)[1:], frames(theirs, q)[1:], strict=True
-    ):
-        np.testing.assert_allclose(placement, expected, atol=1e-6)
-    for each, expected in zip(chain.joints, theirs.joints, strict=True):
-        assert each.effort == expected.effort
 
 
 ARM = """<mujoco>
@@ -349,24 +314,8 @@ def test_dynamics_of_joints_are_their_own_behind_a_free_body(tmp_path):
             },
             8.0,
         ),
-        (
-            {
-                'lower': 'actuatorfrcrange="-3 3"',
-                'more': '<actuator><motor joint="elbow" forcerange="-4 4"/></actuator>',
-            },
-            3.0,
-        ),
         # of two directions, what both allow
         ({'lower': 'actuatorfrcrange="-5 3"'}, 3.0),
-        (
-            {'more': '<actuator><motor joint="elbow" ctrlrange="-2 3"/></actuator>'},
-            2.0,
-        ),
-        (
-            {'more': '<actuator><motor joint="elbow" forcerange="-4 6"/></actuator>'},
-            4.0,
-        ),
-        ({'more': '<actuator><motor joint="elbow"/></actuator>'}, np.inf),
         ({}, np.inf),
     ],
 )
@@ -419,9 +368,6 @@ def cable(acts, more=''):
     'text',
     [
         cable('stiffness="3"'),
-        cable('damping="3"'),
-        cable('frictionloss="3"'),
-        cable('armature="3"'),
         cable('limited="true" range="0 1"'),
         cable('', '<actuator><motor tendon="cable"/></actuator>'),
     ],
@@ -429,11 +375,6 @@ def cable(acts, more=''):
 def test_tendon_that_acts_by_whatever_it_has_is_refused(text):
     with pytest.raises(ConfigurationError, match="<tendon> 'cable' acts on it"):
         robot_of({'robot.urdf': text, 'robot.tip': 'tool'})
-
-
-def test_tendon_that_only_measures_is_no_matter():
-    chain = robot_of({'robot.urdf': cable(''), 'robot.tip': 'tool'})[1]
-    assert [joint.name for joint in chain.joints] == ['shoulder', 'elbow']
 
 
 @pytest.mark.parametrize(
@@ -451,13 +392,6 @@ def test_tendon_that_only_measures_is_no_matter():
         ),
         (
             {
-                'more': '<tendon><fixed name="cable" stiffness="3"><joint joint="elbow" coef="1"/>'
-                '</fixed></tendon>'
-            },
-            ["'elbow'", "<tendon> 'cable'"],
-        ),
-        (
-            {
                 'more': '<tendon><spatial name="rope" springlength="0" stiffness="3">'
                 '<site site="tool"/><site site="wall"/></spatial></tendon>',
                 'beyond': POST,
@@ -465,7 +399,6 @@ def test_tendon_that_only_measures_is_no_matter():
             ["'shoulder'", "'elbow'", "<tendon> 'rope'"],
         ),
         ({'lower': 'stiffness="7"'}, ["'elbow'", 'stiffness="7"']),
-        ({'lower': 'damping="1 2"'}, ["'elbow'", 'polynomial']),
         (
             {'lower': '/><joint name="second" axis="1 0 0"'},
             ['lower: joint 1 of 2 in one body (moved by elbow)'],
@@ -507,26 +440,6 @@ def test_file_with_includes_becomes_one_text_that_needs_neither_files_nor_mujoco
         each.unlink()
     monkeypatch.setitem(sys.modules, 'mujoco', None)
     assert build(ControllerConfig, flatten(config)) == config
-
-
-def test_given_rotors_and_gravity_win():
-    given = {'robot.rotor_inertia': [1.0, 2.0], 'robot.gravity': [0.0, 0.0, 3.7]}
-    arm_given = {'robot.urdf': arm(), 'robot.tip': 'tool'}
-    robot = robot_of(arm_given | given)[0]
-    assert robot.rotor_inertia == (1.0, 2.0)
-    assert robot.gravity == (0.0, 0.0, 3.7)
-    own, other = (
-        build(ControllerConfig, arm_given | changes).learning.residual_floor
-        for changes in ({}, given)
-    )
-    np.testing.assert_allclose(other, np.multiply(own, 3.7 / 9.81), rtol=1e-3)
-
-
-def test_without_any_armature_drives_are_guessed_as_for_a_urdf():
-    text = arm(lower='actuatorfrcrange="-3 3"').replace('armature="0.1"', '')
-    robot, chain = robot_of({'robot.urdf': text, 'robot.tip': 'tool'})
-    assert robot.rotor_inertia == ()
-    assert robot.rotors(chain)[1] == 3.0 / 400.0
 
 
 def test_without_mujoco_the_error_says_how_to_install_it(monkeypatch, tmp_path):

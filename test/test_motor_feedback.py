@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,9 +24,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors import damiao
-from blf_dsc_controller.motors.field import Field
 from blf_dsc_controller.motors.frame import (
-    Frame,
     Gains,
     Motion,
     split,
@@ -83,12 +80,6 @@ def test_a_remainder_beyond_its_range_leaves_the_torque_alone():
     np.testing.assert_allclose(frame.torque, 1.0, atol=0.5 * RANGES.torque.step.max())
 
 
-def test_a_field_without_bits_is_cut_only():
-    field = Field(-1.0, 1.0)
-    np.testing.assert_array_equal(field.nearest([0.123, 7.0]), [0.123, 1.0])
-    assert field.step == 0.0
-
-
 @pytest.mark.parametrize('inside', [0.0, 0.5, 0.9])
 def test_local_gains_are_what_a_lasting_deviation_changes(inside):
     """By differences, with the filter of the surface settled; `inside` of the bound."""
@@ -121,7 +112,7 @@ def test_local_gains_are_what_a_lasting_deviation_changes(inside):
 
 @pytest.mark.parametrize(
     'words',
-    ['', '--write motion.yaml', '--robot simulated --yes', '--prove --robot simulated'],
+    ['--write motion.yaml', '--prove --robot simulated'],
 )
 def test_gains_for_motors_alone_are_not_commissioned_over_the_bus(
     tmp_path, monkeypatch, capsys, words
@@ -162,17 +153,6 @@ def test_motion_by_hand_sends_motors_the_torque_that_a_bag_records(
     assert load(Path('motion_1.yaml'), DRIVE, DriveConfig).feedback == 'host'
 
 
-def test_damping_that_lags_is_none_that_motors_can_do():
-    config = change(
-        loop_of(SLOW, LEROBOT).controller, {'feedback.joint_damping_lag': [0.003] * 7}
-    )
-    law = blf.ArmController(config).guard.controller
-    with pytest.raises(
-        BlfDscError, match=r'feedback\.joint_damping_lag: got 0\.003 s, but'
-    ):
-        LocalGains(law)
-
-
 def run(loop, feedback, duration, dies_after=2.0, loses=0):
     """Run the law on motors; return controller, largest error late, travel once it is dead.
 
@@ -200,27 +180,6 @@ def run(loop, feedback, duration, dies_after=2.0, loses=0):
         plant.coast()
     travel = np.abs(plant.plant.truth()[-14:-7] - died).max()
     return controller, worst, travel
-
-
-@pytest.mark.parametrize('as_reported', [False, True])
-def test_motors_report_positions_rounded_and_act_on_their_own(as_reported):
-    """Own steps of 0.043 mrad, of which a frame carries those of 0.38; 100 N m/rad."""
-    plant = MotorPlant(loop_of(SLOW).plant, RANGES, as_reported=as_reported)
-    own = damiao.ENCODER * np.arange(1000, 1007)
-    torques = []
-    plant.plant = SimpleNamespace(
-        measure=lambda: np.concatenate((own, np.zeros(14))), step=torques.append
-    )
-    seen = plant.measure()[0]
-    step = RANGES.position.step
-    np.testing.assert_allclose(seen, RANGES.position.nearest(own), atol=1e-12)
-    off = np.abs(seen - own)
-    assert (off <= 0.5 * step + 1e-12).all()
-    assert off.max() > 0.5 * damiao.ENCODER
-    q = np.zeros(7)
-    plant.advance(Frame(q, q, np.full(7, 100.0), q, q), 1)
-    known = seen if as_reported else own
-    np.testing.assert_allclose(torques[0], -100.0 * known, atol=1e-9)
 
 
 def test_a_dead_host_leaves_an_arm_that_its_motors_hold():
@@ -308,15 +267,6 @@ def test_motors_of_the_simulated_robot_are_those_of_the_plant(feedback, tmp_path
     rests = driver.positions()
     driver.recover()
     np.testing.assert_allclose(driver.positions(), rests, atol=1e-3)  # 0.38 mrad
-
-
-def test_simulated_motors_need_their_models():
-    loop = loop_of(SLOW)
-    made = simulated(loop.plant, 'motor')
-    with pytest.raises(
-        BlfDscError, match=r'motor_models: got 0, .* 7 joints: .* each, of 4310, 4340'
-    ):
-        made('simulated', loop.controller, build(DriveConfig, {'feedback': 'motor'}))
 
 
 def test_lost_frames_cost_motors_less_than_the_host():
@@ -408,11 +358,6 @@ def test_torques_alone_and_laws_of_files_cannot_have_it():
         MotorFeedback(controller, RANGES, 0.0)
 
 
-def test_motors_need_a_rate_that_fits_the_hosts():
-    with pytest.raises(BlfDscError, match='a multiple of'):
-        MotorPlant(loop_of(SLOW).plant, RANGES, rate=10_100.0)
-
-
 def test_margins_are_those_of_feedback_in_the_motors():
     """LeRobot's gains at 250 Hz are unstable over a bus, by the linear loop as in the plant."""
     config = loop_of(SLOW, LEROBOT).controller
@@ -424,13 +369,3 @@ def test_margins_are_those_of_feedback_in_the_motors():
     assert host > 0.5  # rad, within six time constants
     assert motor < 0.02
     assert as_in_motors(judged) == judged
-
-
-def test_motors_move_an_arm_of_mujoco_as_well():
-    """Its dry friction sticks, where the own plant's creeps: 0.2 mrad more of error."""
-    pytest.importorskip('mujoco')
-    loop = loop_of(SLOW, plant={'physics': 'mujoco'})
-    controller, worst, travel = run(loop, 'motor', 3.0)
-    assert controller.phase is Phase.TRACKING
-    assert worst < 2e-3
-    assert travel < 0.06
