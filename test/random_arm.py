@@ -350,27 +350,15 @@ def recording_of(states, joints=PANDA, period=PERIOD):
     return Recording(joints, period, states[:, 0], states[:, 2], gap, 'made up')
 
 
-def errors_and_deviations(found, truth):
-    """Return errors of base parameters, viscous and Coulomb friction, and their deviations.
-
-    The last are those that the URDF leaves.
-    """
+def is_covered(found, truth):
+    """Return whether each base parameter and friction is within its 95 % interval."""
     true = np.concatenate(
         (truth.inertias.ravel(), truth.rotors, truth.viscous, truth.coulomb)
     )
     at, n = slice(0, true.size), len(truth.rotors)
     G = base_matrix(found.parameters, n)[: found.parameters.model.p + 2 * n, at]
-    deviation, before = (
-        np.sqrt(np.diag(G @ C[at, at] @ G.T))
-        for C in (found.covariance, found.prior_covariance)
-    )
-    return G @ (found.values[at] - true), deviation, before
-
-
-def is_covered(found, truth):
-    """Return whether each base parameter and friction is within its 95 % interval."""
-    error, deviation, _ = errors_and_deviations(found, truth)
-    return np.abs(error) < 1.96 * deviation
+    deviation = np.sqrt(np.diag(G @ found.covariance[at, at] @ G.T))
+    return np.abs(G @ (found.values[at] - true)) < 1.96 * deviation
 
 
 FIELDS = ('position', 'velocity', 'effort')

@@ -7,48 +7,20 @@ import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
-from blf_dsc_controller import load_loop, share_folder
-from blf_dsc_controller.commissioning import files
-from blf_dsc_controller.configuration.nodes import PLANT, read
+from blf_dsc_controller.configuration.nodes import PLANT
+from blf_dsc_controller.configuration.schema import flatten
 
 PRESETS = {'fr3_direct': '', 'panda': '', 'ur5e': ' --ripple'}
 """The option with which the file of a preset was written."""
-FOLDER = share_folder() / 'config'
+CHOSEN = ('feedback.', 'commissioning.', 'barrier.', 'surface.', 'disturbance.')
+CHOSEN += ('robot.lag', 'robot.rotor_inertia', 'safety.damping')
+CHOSEN += ('learning.initial_estimate', 'learning.adaptation_gain', 'learning.radius')
+CHOSEN += ('learning.ripple_cycles',)
+"""What a commissioning chooses, and gains and limits that follow from it."""
 
 
 def path_of(preset):
-    return FOLDER / f'{preset}_commissioned.yaml'
-
-
-class Chosen:
-    """The parameters that a commissioned file has and its preset has otherwise."""
-
-    def __init__(self, preset):
-        config = load_loop(path_of(preset)).controller
-        feedback, commissioning = config.feedback, config.commissioning
-        self.values = {
-            'robot.lag': config.robot.lag,
-            'feedback.inertia': 'none',
-            'feedback.joint_stiffness': feedback.joint_stiffness,
-            'feedback.joint_damping': feedback.joint_damping,
-            'feedback.stiffness': 1.0,
-            'commissioning.friction': commissioning.friction,
-            'commissioning.unseen_inertia': commissioning.unseen_inertia,
-            'barrier.bound': config.barrier.bound,
-        }
-        if feedback.joint_damping_lag:  # where it pays
-            self.values['feedback.joint_damping_lag'] = feedback.joint_damping_lag
-        if config.disturbance.observer_bandwidth:  # joint torque sensors are used
-            bandwidth = config.disturbance.observer_bandwidth
-            self.values['disturbance.observer_bandwidth'] = bandwidth
-        if config.learning.ripple_cycles:  # a slow motion shows torque ripple
-            self.values['learning.ripple_cycles'] = config.learning.ripple_cycles
-        if config.robot.rotor_inertia:  # no drive hides the motors
-            self.values['robot.rotor_inertia'] = config.robot.rotor_inertia
-            self.values['safety.damping'] = config.safety.damping
-
-    def parameters(self):
-        return self.values
+    return blf.share_folder() / 'config' / f'{preset}_commissioned.yaml'
 
 
 @pytest.mark.parametrize('preset', PRESETS)
@@ -60,22 +32,21 @@ def test_it_is_its_preset_with_what_was_chosen(preset):
         f'# blf_dsc commission --config {preset}{PRESETS[preset]} '
         f'--out config/{path.name}'
     )
-    written = files.of_commissioned(read(FOLDER / f'{preset}.yaml'), Chosen(preset))
-    sections = {each.pattern: each.entries for each in read(path)}
-    for pattern, values in written.items():
-        entries = sections[pattern]
-        assert {name: entry.value for name, entry in entries.items()} == {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in values.items()
-        }
-    assert load_loop(path).controller.commissioning.friction
+    before, after = (
+        {**flatten(loop.plant), **flatten(loop.controller)}
+        for loop in (blf.load_loop(preset), blf.load_loop(path))
+    )
+    changed = {name for name, value in after.items() if value != before[name]}
+    assert {'feedback.joint_stiffness', 'barrier.bound'} <= changed
+    assert [name for name in changed if not name.startswith(CHOSEN)] == []
+    assert after['commissioning.friction']
 
 
 @pytest.mark.parametrize('preset', PRESETS)
 def test_simulated_arm_keeps_its_bound_when_it_picks_up_its_payload(preset):
     """At 3 s in motion, where 30 s of the command have it at 20 s."""
     early = {'duration': 6.0, 'events.begin': [3.0], 'events.duration': [0.0]}
-    loop = load_loop(path_of(preset), {PLANT: early})
+    loop = blf.load_loop(path_of(preset), {PLANT: early})
     run = blf.simulate(loop.controller, loop.plant).run()
     assert run.stops == ()
     assert run.oscillations == ()

@@ -8,12 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import blf_dsc_controller as blf
 from benchmark import random_arms
 from blf_dsc_controller.arms.linear_loop import law_responses
-from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.factory.controller import controller_of
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.expected_errors import linear_feedback
 from blf_dsc_controller.supervision.retuning import apply_bumpless
 
@@ -30,7 +27,7 @@ SHAKEN = 3  # the joint
 @pytest.fixture
 def config():
     """Return a UR5e at rest that learns nothing and whose damping lags."""
-    return change(load_loop('ur5e').controller, HELD | LAG)
+    return blf.change(blf.load_loop('ur5e').controller, HELD | LAG)
 
 
 def amplitude(values, s):
@@ -61,8 +58,8 @@ def test_the_law_has_the_frequency_response_of_its_linear_form(
     config, hertz, of_velocity, lags
 ):
     """One joint of the compiled law is shaken by 1 urad, or by 1 mrad/s."""
-    config = change(config, lags)
-    law = controller_of(config)
+    config = blf.change(config, lags)
+    law = blf.controller_of(config)
     qr, n = np.array(config.reference.offset), 6
     s = 2j * np.pi * hertz
     size = 1e-3 if of_velocity else 1e-6
@@ -87,7 +84,7 @@ def test_joints_have_the_torques_of_laws_that_have_their_lag_at_all_joints(confi
     moved = measured + 1e-4 * rng.standard_normal((200, 18))
 
     def torques(lags):
-        law = controller_of(change(config, lags))
+        law = blf.controller_of(blf.change(config, lags))
         return np.array(
             [law.update(LATE + k * T, T, row).copy() for k, row in enumerate(moved)]
         )
@@ -104,39 +101,28 @@ def test_joints_have_the_torques_of_laws_that_have_their_lag_at_all_joints(confi
     )
 
 
-def test_the_lag_begins_anew_with_the_first_sample_of_a_start(config):
-    """A reset, or a law that takes over again, damps what it finds."""
-    law = controller_of(config)
+def test_the_lag_begins_anew_with_the_first_sample_after_a_reset(config):
+    law = blf.controller_of(config)
     qr = np.array(config.reference.offset)
     rest, moving = np.zeros(12), np.concatenate((np.full(6, 0.1), np.zeros(6)))
     first = law.update(0.0, T, np.concatenate((qr, moving))).copy()
     for k in range(1, 5):
         law.update(k * T, T, np.concatenate((qr, rest)))
-    assert np.abs(law.state.feedback.late).min() > 0.01  # still late
     law.reset()
     again = law.update(0.0, T, np.concatenate((qr, moving)))
     np.testing.assert_array_equal(again, first)
-    np.testing.assert_array_equal(law.state.feedback.late, law.signals.xi2)
-    law.update(T, T, np.concatenate((qr, rest)))
-    assert np.abs(law.state.feedback.late - law.signals.xi2).min() > 0.01
-    law.state.samples[0] = 0.0  # as `Takeover.rejoin` does
-    law.update(2 * T, T, np.concatenate((qr, rest)))
-    np.testing.assert_array_equal(law.state.feedback.late, law.signals.xi2)
 
 
 def test_gains_that_change_leave_no_part_of_a_jump_behind(config):
-    """xi2 jumps with the rate of the surface; its lag is to follow at once."""
-    law = controller_of(config)
-    qr = np.array(config.reference.offset)
-    off = np.concatenate((qr + 2e-3, np.zeros(12)))
-    for k in range(200):
-        law.update(k * T, T, off)
-    before = law.signals.xi2.copy()
+    """The surface jumps with its rate; its lag follows at once, so that no torque jumps."""
+    law = blf.controller_of(config)
+    off = np.concatenate((np.add(config.reference.offset, 2e-3), np.zeros(12)))
+    torques = [law.update(k * T, T, off).copy() for k in range(200)]
     wider = [1.2 * each for each in config.barrier.bound]
-    apply_bumpless(law, change(config, {'barrier.bound': wider}), 0.199, off)
-    law.update(0.2, T, off)
-    assert np.abs(law.signals.xi2 - before).min() > 1e-3
-    np.testing.assert_allclose(law.state.feedback.late, law.signals.xi2, atol=1e-5)
+    apply_bumpless(law, blf.change(config, {'barrier.bound': wider}), 0.199, off)
+    torques += [law.update(k * T, T, off).copy() for k in range(200, 220)]
+    steps = np.abs(np.diff(torques[150:], axis=0)).max(axis=1)
+    assert steps[49:].max() < 1.3 * steps[:49].max()  # N m: the integral goes on
 
 
 @pytest.mark.parametrize(('given', 'reports'), [({}, True), (LAG, False)])
@@ -144,5 +130,5 @@ def test_an_arm_that_oscillates_with_the_published_gains_is_calm(given, reports)
     """Arm 442 of the study; it stops 1.6 s after the pick-up, at 26 Hz."""
     study = random_arms.study_of('ur5e')
     plant = replace(random_arms.arm_of(study, 442), duration=7.8)
-    record = simulate(change(study.controller, given), plant)
+    record = blf.simulate(blf.change(study.controller, given), plant)
     assert bool(record.run().stops) == reports

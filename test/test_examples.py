@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The programs of examples/ run as a reader would start them, and say what they should."""
+"""The programs of examples/ run as a reader would start them, and say what they should.
+
+They run at night; `test_pages.py` looks at their code.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +35,7 @@ EXPECTED = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs_without_hardware(path, tmp_path):
     arguments, packages, line = EXPECTED[path.stem]
@@ -53,6 +57,7 @@ def test_example_runs_without_hardware(path, tmp_path):
     assert re.search(line, ended.stdout), ended.stdout + ended.stderr
 
 
+@pytest.mark.nightly
 def test_keys_that_are_pressed_at_once_all_count():
     """Joint 1 is chosen and turned by one press: 0.1 s at 0.3 rad/s."""
     pytest.importorskip('ruckig', reason='needs ruckig')
@@ -79,6 +84,7 @@ def shown_position(output):
     return float(found[1])
 
 
+@pytest.mark.nightly
 def test_keyboard_without_a_terminal_says_what_to_give():
     path = ROOT / 'examples' / '05_keyboard.py'
     ended = finished(sys.executable, path, stdin=subprocess.DEVNULL)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plugin of LeRobot, as its own programs find, make and use it; where LeRobot is installed."""
+"""The plugin of LeRobot, as its own programs find, make and use it.
+
+It runs at night, where LeRobot is installed.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,8 @@ from lerobot.robots import Robot, RobotConfig
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+pytestmark = pytest.mark.nightly
 
 FOLDER = Path(__file__).resolve().parents[1] / 'lerobot_robot_blf_dsc'
 WAVE = 0.1  # rad

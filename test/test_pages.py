@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README and doc/: code runs, files load, commands exist.
+"""README and doc/: files load, commands exist, and at night code runs and the site is whole.
 
-The site is whole and loads nothing.
+In `make test`, code of pages and examples is compiled, and what it imports must exist.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import functools
+import importlib
 import importlib.util
 import io
 import re
@@ -33,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOC = ROOT / 'doc'
 OUTSIDE = ('README.md', 'CONTRIBUTING.md')
 PAGES = [*(ROOT / name for name in OUTSIDE), *sorted((ROOT / 'doc').glob('*.md'))]
+OWN = 'blf_dsc_controller', 'sim_plant'
 SAVED = re.compile(r'Save this as\s`(\w+\.py)`')
 MAKEFILE = (ROOT / 'Makefile').read_text()
 LAUNCH = (ROOT / 'launch/closed_loop.launch.py').read_text()
@@ -64,6 +67,42 @@ def each_page(pages):
     )
 
 
+def home_page():
+    """Return the program of the home page."""
+    text = (DOC / 'index.rst').read_text()
+    (block,) = re.findall(r'code-block:: python\n\n((?: {3}.*\n|\n)+)', text)
+    return textwrap.dedent(block)
+
+
+PROGRAMS = {
+    'index.rst': home_page(),
+    **{path.name: path.read_text() for path in (ROOT / 'examples').glob('*.py')},
+    **{page.name: '\n'.join(fences(page, 'python')) for page in PAGES},
+}
+
+
+@pytest.mark.parametrize('name', [name for name in PROGRAMS if PROGRAMS[name]])
+def test_code_compiles_and_has_only_names_that_exist(name):
+    """Of the package; each name after the module under which it is imported."""
+    modules = {}
+    for node in ast.walk(ast.parse(PROGRAMS[name])):
+        if isinstance(node, ast.Import):
+            found = {each.asname or each.name: each.name for each in node.names}
+            modules |= {k: v for k, v in found.items() if v.startswith(OWN)}
+        elif isinstance(node, ast.ImportFrom) and node.module.startswith(OWN):
+            assert all(exists(node.module, each.name) for each in node.names)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            module = modules.get(node.value.id)
+            assert not module or exists(module, node.attr)
+
+
+def exists(module, name):
+    """Whether a module has a name, also that of a module in it."""
+    has_name = hasattr(importlib.import_module(module), name)
+    return has_name or importlib.util.find_spec(f'{module}.{name}') is not None
+
+
+@pytest.mark.nightly
 @each_page([page for page in PAGES if fences(page, 'python')])
 def test_python_blocks_run_and_print_the_output_shown_below_them(
     page, tmp_path, monkeypatch
@@ -90,13 +129,12 @@ def test_python_blocks_run_and_print_the_output_shown_below_them(
                 assert printed.getvalue() == below.content
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures('blank_pictures')
 def test_python_of_the_home_page_keeps_the_bound(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text = (DOC / 'index.rst').read_text()
-    (block,) = re.findall(r'code-block:: python\n\n((?: {3}.*\n|\n)+)', text)
     program = {}
-    exec(textwrap.dedent(block), program)  # noqa: S102 - our own pages
+    exec(home_page(), program)  # noqa: S102 - our own pages
     assert program['metrics'].max_error_ratio < 1.0
     assert Path('pictures/change.png').is_file()
 

@@ -10,15 +10,12 @@ import os
 import numpy as np
 import pytest
 
-from blf_dsc_controller.bags.reader import read_run
+import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.configuration.nodes import DRIVE, load, load_loop, locate
-from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.configuration.nodes import DRIVE, load, locate
 
-NAMES = sorted(path.stem for path in (share_folder() / 'config').glob('*.yaml'))
+NAMES = sorted(path.stem for path in (blf.share_folder() / 'config').glob('*.yaml'))
 IN_MOTORS = [
     name for name in NAMES if load(locate(name), DRIVE, DriveConfig).feedback == 'motor'
 ]
@@ -38,17 +35,12 @@ LAW = {
 DRAWN = {'recommended', 'slotine_li', 'panda'}
 
 
+STOPPED = 5  # exit code
+
+
 def offline(preset, out, duration):
-    arguments = [
-        '--config',
-        preset,
-        '--offline',
-        '--duration',
-        str(duration),
-        '--out',
-        str(out),
-    ]
-    return main(['run', *arguments])
+    words = f'run --config {preset} --offline --duration {duration} --out {out}'
+    return main(words.split())
 
 
 @pytest.mark.parametrize('preset', PRESETS)
@@ -62,8 +54,10 @@ def test_preset_runs_by_name_and_saves_its_configuration(
     summary = json.loads(
         (tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8')
     )
-    assert summary['samples'] == round(0.5 / load_loop(preset).plant.sample_time) + 1
-    saved = load_loop(tmp_path / 'out' / 'config.yaml').controller
+    assert (
+        summary['samples'] == round(0.5 / blf.load_loop(preset).plant.sample_time) + 1
+    )
+    saved = blf.load_loop(tmp_path / 'out' / 'config.yaml').controller
     assert saved.law == LAW.get(preset, 'blf_dsc')
     held = preset != 'comparison_detuned'
     assert summary['held'] is held
@@ -81,7 +75,7 @@ def test_preset_with_feedback_in_its_motors_is_driven_by_name(preset, tmp_path, 
     arguments = ['--robot', 'simulated', '--config', preset, '--out', str(bag)]
     assert main(['drive', *arguments, '--duration', '0.5']) == 0
     assert 'and 0 missed' in capsys.readouterr().out
-    assert verify(bag).difference is None
+    assert blf.verify(bag).difference is None
     assert offline(preset, tmp_path / 'out', 0.5) == STOPPED
     told = capsys.readouterr()
     assert f'blf_dsc drive --robot simulated --config {preset}' in told.err
@@ -97,7 +91,7 @@ def test_papers_preset_over_ros_matches_its_offline_run_bit_for_bit(tmp_path):
     assert main(['run', *over_ros, '--out', str(tmp_path / 'ros')]) == 0
     assert dict(os.environ) == before  # the ROS domain of the run is not left behind
 
-    runs = [read_run(tmp_path / name / 'bag') for name in ('offline', 'ros')]
+    runs = [blf.read_run(tmp_path / name / 'bag') for name in ('offline', 'ros')]
     np.testing.assert_array_equal(runs[0].error, runs[1].error)
     np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
     assert runs[0].monitor.names == runs[1].monitor.names

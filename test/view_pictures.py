@@ -13,7 +13,6 @@ from pathlib import Path
 
 import chromium
 import numpy as np
-from animation import save
 from PIL import Image
 from ros_rig import RosRig
 
@@ -24,6 +23,7 @@ from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.view.node import ViewNode
 
 OUT = Path('doc/view.webp')
+RATE = 8.0  # frames per second
 TIMES = np.arange(17.0, 26.0, 0.25)  # s; it picks up 2 kg at 20 s
 SETTLE = 1.5  # s, until the browser has drawn a frame without a GPU
 WINDOW = (1200, 880)
@@ -65,9 +65,18 @@ def pictures():
 
 
 def main():
-    """Write the animation."""
-    _, *frames = pictures()  # at the first one the camera is not there yet
-    save(OUT, frames)
+    """Write an endless animation."""
+    _, first, *others = pictures()  # at the first one the camera is not there yet
+    duration = round(1000.0 / RATE)
+    first.save(
+        OUT,
+        save_all=True,
+        append_images=others,
+        duration=duration,
+        loop=0,
+        quality=60,
+        method=6,
+    )
     print(f'{OUT}: {OUT.stat().st_size / 1e6:.2f} MB')
 
 
