@@ -4,24 +4,19 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 
 import numpy as np
 import pytest
-from paper_case import EXACT, NO_DISTURBANCE, configured, instead, run
-from plants import rigid_gears
+from paper_case import NO_DISTURBANCE, P, configured, run
+from scenario import carrying
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import load, load_loop, locate
 from blf_dsc_controller.configuration.robot import read_urdf
-from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law.samples import sample_columns
-from blf_dsc_controller.run import FIRST_STAMP
-from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import (
     expectation,
@@ -30,11 +25,10 @@ from blf_dsc_controller.supervision.expected_errors import (
     linear_loop,
 )
 from blf_dsc_controller.supervision.gain_limits import worsened
-from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.reference_load import reference_load
-from sim_plant.plant import plant_of
 
 BOUND = 0.002  # rad
+KNOWN = {'two_link.initial_estimate': P.tolist(), 'two_link.learning_weight': 0.0}
 
 
 def warnings(changes, preset='recommended'):
@@ -56,7 +50,6 @@ def test_presets_cause_no_warnings(preset):
         ('disturbance.gain', {'disturbance.gain': [100.0, 15000.0]}),
         ('two_link.surface_gain', {'two_link.surface_gain': [300.0, 300.0]}),
         ('two_link.learning_weight', {'two_link.learning_weight': 2500.0}),
-        ('two_link.learning_weight', instead(update='gradient')),
         ('learning.window', {'learning.window': 5.0}),
     ],
 )
@@ -77,7 +70,7 @@ def test_bound_that_these_gains_cannot_hold_at_first_names_one_that_they_can(
 
     def stops(bound):
         config = change(loop.controller, {'barrier.bound': [bound] * 2})
-        record = simulate(config, change(loop.plant, {'duration': 0.5}))
+        record = blf.simulate(config, change(loop.plant, {'duration': 0.5}))
         return [stop.reason for stop in record.run().stops]
 
     assert stops(bound) == ['error past the bound']
@@ -116,18 +109,9 @@ def test_change_must_not_worsen_an_existing_warning_nor_cause_one(gain, accepted
     )
 
 
-def test_laws_cause_no_warnings_about_gains_they_do_not_have():
-    changes = {
-        'learning.window': 5.0,
-        'law': 'backstepping',
-    }
-    assert warnings(changes) == []
-
-
 def test_reference_load_predicts_the_torque_of_the_run():
     """True parameters, no disturbance: the run's largest torque, up to the filter's lag."""
-    undisturbed = {'truth.constant': [0.0, 0.0], 'truth.amplitude': [0.0, 0.0]}
-    loop = configured('model_based', 7.0, undisturbed, NO_DISTURBANCE)
+    loop = configured('recommended', 7.0, KNOWN, NO_DISTURBANCE)
     config = loop.controller
     torque = np.abs(run(loop).torque[1000:])
     load = reference_load(config, settings_of_config(config))
@@ -156,12 +140,6 @@ STRONG = {'two_link.adaptation_gain': [0.02] * 3, 'two_link.learning_weight': 21
         ),
         ('', STRONG | {'two_link.learning_weight': 900.0}, 12.0, leaves_the_bound),
         (
-            'two_link.learning_weight: kappa lambda_max',
-            instead(update='gradient') | {'two_link.learning_weight': 30.0},
-            9.0,
-            lambda loop: loop.parameter_error[-1] > 0.5,
-        ),
-        (
             'learning.window',
             {'learning.window': 5.0},
             12.0,
@@ -170,11 +148,11 @@ STRONG = {'two_link.adaptation_gain': [0.02] * 3, 'two_link.learning_weight': 21
         ('', {}, 12.0, lambda loop: loop.error_at(12.0) > 1e-4),
         (
             'two_link.feedback_gain: K_p over',
-            EXACT | {'two_link.feedback_gain': [60.0, 500.0]},
+            KNOWN | {'two_link.feedback_gain': [60.0, 500.0]},
             4.0,
             chatters,
         ),
-        ('', EXACT | {'two_link.feedback_gain': [60.0, 60.0]}, 4.0, chatters),
+        ('', KNOWN | {'two_link.feedback_gain': [60.0, 60.0]}, 4.0, chatters),
         (
             'torque.limit: joint1',
             {'torque.limit': [5.5, 20.0], 'approach.enabled': False},
@@ -338,50 +316,13 @@ def test_a_wide_bound_of_soft_gains_is_not_taken_for_degrees(changes, remedy):
     assert remedy in text
 
 
-def test_drives_may_be_heavier_than_guessed_if_nothing_hides_or_tells_them():
-    guessed = load_loop('ur5e').controller
-    guess = guessed.robot.rotors(guessed.robot.chain(guessed.joints)).tolist()
-    told = change(guessed, {'robot.rotor_inertia': guess})
-    hidden = change(guessed, {'robot.torque_loop': True})
-    expected, *others = (
-        expected_errors(each, settings_of_config(each))
-        for each in (guessed, told, hidden)
-    )
-    # on 20 UR5es with five times the guess, the last joint was 2.6 to 6.5 mrad off
-    assert 5.5e-3 < expected.unmodelled[-1] < 7e-3
-    for each in others:
-        np.testing.assert_array_equal(each.pick_up, expected.pick_up)
-        assert (each.unmodelled < 0.7 * expected.unmodelled).all()
-    assert 'drives heavier than guessed' in expectation(guessed)
-    assert 'drives' not in expectation(told)
-    narrow, known = (
-        change(each, {'barrier.bound': [0.005] * 6}) for each in (guessed, told)
-    )
-    heavy = 'drives up to 7 times as heavy as guessed (without robot.rotor_inertia)'
-    assert heavy in '\n'.join(config_warnings(narrow))
-    assert 'drives' not in '\n'.join(config_warnings(known))
-
-
-def test_neither_gains_nor_the_residual_floor_rest_on_placeholders():
-    config = arm_of('panda_rigid', changes={'robot.urdf': PLACEHOLDERS})
-    assert max(config.learning.residual_floor) < 1.0  # N m
-    rotors = config.robot.rotors(config.robot.chain(config.joints))
-    assert max(rotors) < 0.2  # kg m^2, instead of 5
-    assert arm_of('panda_rigid').learning.residual_floor == (0.87,) * 4 + (0.12,) * 3
-    bare = arm_of('panda_rigid', changes={'robot.urdf': STICKY, **BARE})
-    # learned before it is used
-    assert not settings_of_config(bare).initial_estimate[-14:].any()
-
-
 # Margins and expected errors of the gains derived from a URDF, at three sample rates.
 
-ARMS = [('panda_rigid', 7), ('ur5e_rigid', 6), ('fr3', 7)]
+ARMS = [('panda_rigid', 7), ('ur5e_rigid', 6)]
 
 
 def arm_of(preset, sample_time=0.001, changes=None):
     given = {'sample_time': sample_time, **(changes or {})}
-    if preset == 'fr3':
-        given = rigid_gears(7, 0.01)['blf_dsc_controller'] | given
     return load(locate(preset), 'blf_dsc_controller', ControllerConfig, given)
 
 
@@ -407,7 +348,7 @@ def growth(settings, T, lag, M, M0, stiffness):
 
 
 @pytest.mark.parametrize('sample_time', [0.001, 0.002, 0.004])
-@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid', 'fr3'])
+@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
 def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     """Inertias coupled, with the barrier at its softest and at its stiffest."""
     config = arm_of(preset, sample_time)
@@ -424,154 +365,15 @@ def test_default_gains_have_margins_at_every_rate(preset, sample_time):
     )
 
 
-def test_lags_of_the_loop_have_their_time_constants():
-    """A held velocity and what alpha2' follows are approached as by lags of first order."""
-    config = arm_of('panda_rigid')
-    settings = settings_of_config(config)
-    n, T, lag = settings.n, 0.001, 0.02
-    M0 = inertias(config, settings)[:1]
-    A = transition(settings, T, lag, M0, M0, settings.barrier.weight)[0][0]
-    q, before, speed, alpha2 = (slice(k * n, k * n + n) for k in (0, 4, 5, 6))
-    share = 1.0 - np.exp(-1.0)
-    x = np.zeros(8 * n)
-    for _ in range(round(0.5 * lag / T)):
-        x[q], x[before] = 3.0 * T, 0.0  # 3 rad/s
-        x = A @ x
-    np.testing.assert_allclose(x[speed], 3.0 * share)
-    x = np.zeros(8 * n)
-    for _ in range(2):
-        x[q] = x[before] = 0.1
-        x = A @ x
-    rate = settings.surface.gain / 2.0 + settings.surface.mu
-    share = 1.0 - np.exp(-2.0 * T / settings.surface.time_constant)
-    np.testing.assert_allclose(x[alpha2], -0.1 * rate * share)
-
-
-@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
-def test_the_loop_is_that_of_one_joint_in_every_posture(preset):
-    """Damping, barrier and disturbance estimate follow the inertia: n equal, decoupled loops."""
-    config = arm_of(preset)
-    settings = settings_of_config(config)
-    lag = config.robot.lag
-    M0 = inertias(config, settings)
-    one = np.eye(settings.n)[np.newaxis]
-    for M, stiffness in (
-        (1.0, settings.barrier.weight),
-        (0.6, settings.barrier.slope_limit),
-    ):
-        A, _ = transition(settings, 0.001, lag, M * M0, M0, stiffness)
-        alone, _ = transition(settings, 0.001, lag, M * one, one, stiffness)
-        found = np.abs(np.linalg.eigvals(A)).max(axis=-1)
-        (expected,) = np.abs(np.linalg.eigvals(alone)).max(axis=-1)
-        np.testing.assert_allclose(found, np.full(len(M0), expected), atol=1e-3)
-
-
-def test_softer_loop_has_lower_gains_and_larger_errors():
+def test_softer_loop_has_larger_errors_and_stops_as_fast():
     stiff = arm_of('panda_rigid')
     soft = arm_of('panda_rigid', changes={'feedback.stiffness': 0.5})
-    rates = ('damping_rate', 0.5, stiff.feedback, soft.feedback)
-    weights = ('weight', 0.25, stiff.barrier, soft.barrier)
-    for name, factor, before, after in (rates, weights):
-        expected = factor * np.array(getattr(before, name))
-        np.testing.assert_allclose(getattr(after, name), expected, rtol=1e-3)
     peak, wider = (
         expected_errors(config, settings_of_config(config)).pick_up.max()
         for config in (stiff, soft)
     )
-    assert 3.0 < wider / peak < 4.0  # the delay matters less
+    assert 1.5 < wider / peak < 4.0
     assert soft.safety.damping == stiff.safety.damping
-    free = build(
-        ControllerConfig,
-        {
-            'robot.urdf': 'panda.urdf',
-            'robot.tip': 'panda_link7',
-            'feedback.inertia': 'whole',
-            'feedback.stiffness': 0.5,
-        },
-    )
-    assert free.barrier.bound == (0.008,) * 7
-
-
-def test_soft_loop_that_leaves_its_bound_is_named_with_the_stiffness_that_holds():
-    def of_bound(stiffness):
-        found = config_warnings(
-            arm_of('panda_rigid', changes={'feedback.stiffness': stiffness})
-        )
-        return [text for text in found if 'picked up' in text]
-
-    (warning,) = of_bound(0.5)
-    stiffer = float(re.search(r'a feedback.stiffness of ([0-9.]+)', warning)[1])
-    assert 0.5 < stiffer <= 1.0
-    assert of_bound(stiffer) == []
-
-
-def test_stiffness_of_an_arm_without_a_urdf_is_rejected():
-    with pytest.raises(ConfigurationError, match=r'feedback.stiffness: got 0.5 with'):
-        configured('recommended', 1.0, {'feedback.stiffness': 0.5})
-
-
-@pytest.mark.parametrize(
-    ('known_rate', 'expected'),
-    [(False, [[True, False], [False, False]]), (True, [[True, True], [True, True]])],
-)
-def test_lag_of_the_surface_filter_costs_margin_at_low_rates(known_rate, expected):
-    """Of an arm that is 1.4 and 1.6 times lighter, with time constants of one and two samples."""
-    found = []
-    config = arm_of('panda_rigid', 0.004, instead(known_rate=known_rate))
-    for time_constant in (0.004, 0.008):
-        settings = settings_of_config(config)
-        surface = settings.surface._replace(time_constant=time_constant)
-        settings = settings._replace(surface=surface)
-        M0 = inertias(config, settings)
-        size = partial(growth, settings, 0.004, config.robot.lag)
-        found.append(
-            [size(M0 / x, M0, settings.barrier.weight) < 1.0 for x in (1.4, 1.6)]
-        )
-    assert found == expected
-
-
-def test_gains_follow_the_sample_time():
-    fast, slow = (arm_of('panda_rigid', T) for T in (0.001, 0.005))
-    planar = (arm_of('noisy', T) for T in (0.001, 0.005))
-    settings = [settings_of_config(each) for each in (fast, slow, *planar)]
-    filters = [each.surface.time_constant for each in settings]
-    assert filters == [0.004, 0.005, 0.002, 0.005]
-    intervals = [(each.window.row_interval, each.window.interval) for each in settings]
-    assert intervals == [(10, 50), (2, 10), (1, 10), (1, 2)]
-
-
-def errors_of(guard, arm, end):
-    """Run the law and an arm on to a sample; return the errors (k, n) [rad] from there on."""
-    law = guard.controller
-    samples = range(arm.sample, end)
-    rows = Rows(
-        np.zeros((len(samples), arm.measure().size)),
-        np.zeros((len(samples), law.sample_vector.size)),
-        np.zeros((len(samples), arm.truth().size)),
-    )
-    span = Span(samples.start, end - 1, is_end=False, observed=True)
-    assert CompiledLoop(law, arm).run(span, rows)  # no check stops it
-    return sample_columns(rows.samples, law.settings).xi1
-
-
-def errors_at_pick_ups(config, plant, moments):
-    """Yield the errors (k, n) [rad] in half a second after 2 kg appear, for each moment [s].
-
-    The motion before it is simulated once, and continued both with and without the load.
-    """
-    guard = Guard(config, lambda: 0, lambda: 0)
-    guard.starting.activate()
-    law, arm = guard.controller, plant_of(plant)
-    arm.step(guard.update(FIRST_STAMP, arm.measure()))
-    for moment in moments:
-        begin, end = (round(t / plant.sample_time) for t in (moment, moment + 0.5))
-        errors_of(guard, arm, begin)
-        before, checks = law.save(), law.checks_vector.copy()
-        loaded = plant_of(change(plant, {'events.begin': [moment]}))
-        loaded.restore(arm.save())
-        yield errors_of(guard, loaded, end)
-        law.restore(before)
-        law.checks_vector[:] = checks
 
 
 @pytest.mark.parametrize(('preset', 'n'), ARMS)
@@ -582,23 +384,17 @@ def errors_at_pick_ups(config, plant, moments):
 def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(
     preset, n, sample_time
 ):
-    """The largest of ten moments of the simulated motion; the bound is far away."""
+    """The largest of four moments of the simulated motion; the bound is far away."""
     controller = {'sample_time': sample_time, 'barrier.bound': [0.05] * n}
-    plant = {
-        'sample_time': sample_time,
-        'events.begin': [1000.0],
-        'events.duration': [9.0],
-        'events.payload': [2.0],
-        'truth.rotor_factor': 1.0,
-    }
-    if preset == 'fr3':
-        rigid = rigid_gears(n, 0.05)
-        controller = rigid['blf_dsc_controller'] | controller
-        plant = rigid['sim_plant'] | plant
-    loop = load_loop(preset, {'blf_dsc_controller': controller, 'sim_plant': plant})
-    moments = np.arange(8.0, 13.0, 0.5).tolist()
-    errors = errors_at_pick_ups(loop.controller, loop.plant, moments)
-    largest = max(np.abs(each).max() for each in errors)
+    plant = {'sample_time': sample_time, 'truth.rotor_factor': 1.0}
+    largest = 0.0
+    for moment in (8.5, 9.5, 10.5, 11.5):
+        events = carrying(2.0, moment) | {'duration': moment + 0.5}
+        given = {'blf_dsc_controller': controller, 'sim_plant': plant | events}
+        loop = load_loop(preset, given)
+        run = blf.simulate(loop.controller, loop.plant).run()
+        after = np.abs(run.error[run.time > moment]).max()
+        largest = max(largest, after)
     config = arm_of(preset, sample_time, {'robot.payload': 2.0})
     expected = expected_errors(config, settings_of_config(config)).pick_up.max()
     assert 0.85 * largest < expected < 1.45 * largest  # friction, which it lacks, helps
