@@ -48,7 +48,7 @@ def test_presets_cause_no_warnings(preset):
         ('torque.limit', {'torque.limit': [5.0, 20.0]}),
         ('two_link.feedback_gain', {'two_link.feedback_gain': [60.0, 120.0]}),
         ('disturbance.gain', {'disturbance.gain': [100.0, 15000.0]}),
-        ('two_link.surface_gain', {'two_link.surface_gain': [300.0, 300.0]}),
+        ('two_link.surface_gain', {'two_link.surface_gain': [1000.0, 1000.0]}),
         ('two_link.learning_weight', {'two_link.learning_weight': 2500.0}),
         ('learning.window', {'learning.window': 5.0}),
     ],
