@@ -24,16 +24,15 @@ from command import COMPILED, PATIENCE, own_address
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.drive.driver import (
     ConnectionLostError,
     DriverError,
     ReflexError,
     disagreements,
 )
-from blf_dsc_controller.errors import LoopEndedError
 from blf_dsc_controller.identification.reading import read_recording
-from blf_dsc_controller.messages.topics import MOTOR_STATES
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
@@ -122,15 +121,15 @@ def assert_replays(folder):
 def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
     """With topics beside it, where there is ROS."""
     wire.simulate('load=2@500', 'load=0@1000')
-    topics = ['--ros'] if importlib.util.find_spec('rclpy') else []
-    code, output = ended(wire.drive(1.5, *topics))
+    beside = ['--ros'] if importlib.util.find_spec('rclpy') else []
+    code, output = ended(wire.drive(1.5, *beside))
     assert code == 0, output
     assert not any(line.startswith('topics') for line in output.splitlines()), output
     assert 'end effector of 0.73 kg' in output
     recorded = blf.read_run(wire.folder / 'bag')
     assert set(np.diff(recorded.stamp)) == {1_000_000}  # ns: no state was missed
     assert recorded.stamp.size > 1500  # 1.5 s, and the end
-    assert MOTOR_STATES.resolved not in message_counts(wire)  # it reports zeros
+    assert topics.MOTOR_STATES.resolved not in message_counts(wire)  # it reports zeros
     assert np.nanmax(np.abs(recorded.error)) < BOUND
     assert_replays(wire.folder / 'bag')
 
@@ -146,7 +145,7 @@ def test_positions_of_motors_are_recorded_and_identification_reads_them(wire):
     assert code == 0, output
     counts = message_counts(wire)
     # the first state may come before the first torque, with which the cycles begin
-    assert counts[MOTOR_STATES.resolved] >= counts['/joint_states'] - 20
+    assert counts[topics.MOTOR_STATES.resolved] >= counts['/joint_states'] - 20
     recorded = blf.read_run(wire.folder / 'bag')
     robot = blf.load_loop('fr3_direct').controller.robot
     read = read_recording(wire.folder / 'bag', robot.text, recorded.joints)
@@ -285,7 +284,7 @@ def test_a_script_moves_it_and_takes_command_again_after_a_reflex(wire):
         arm.move_to(start + 0.1)
         np.testing.assert_allclose(arm.state.q, start + 0.1, atol=0.5 * BOUND)
         long = [(60.0, start - 0.2)]
-        with pytest.raises(LoopEndedError, match=r'stopped by itself: .*recovered'):
+        with pytest.raises(blf.LoopEndedError, match=r'stopped by itself: .*recovered'):
             arm.follow(long)
         arm.recover()
         arm.move_to(start)
@@ -293,191 +292,26 @@ def test_a_script_moves_it_and_takes_command_again_after_a_reflex(wire):
     assert_replays(bag)
 
 
-def test_a_script_takes_command_again_once_a_robot_that_was_lost_is_back(wire):
-    lost = wire.simulate('die@1000')
-    with blf.Drive('fr3_direct', robot=wire.address) as arm:
-        with pytest.raises(LoopEndedError, match='the connection was lost'):
-            arm.follow([(60.0, arm.state.q - 0.2)])
-        lost.wait()
-        wire.simulate()
-        arm.recover()
-        start = arm.state.q
-        arm.move_to(start + 0.1)
-        np.testing.assert_allclose(arm.state.q, start + 0.1, atol=0.5 * BOUND)
+class MadeUpRobot:
+    """A robot at rest in libfranka's terms, which keeps what it is told.
 
+    Modes come one after the other; `state` are fields of its state.
+    """
 
-class ToldRobot:
-    """Keeps the load that it was sent last."""
-
-    def set_load(self, *load):
-        self.load = load
-
-
-def test_load_is_told_in_the_frame_of_the_flange_and_none_without_mass():
-    """With the frame of joint 7 as the tip: the flange is 0.107 m further along its axis."""
-    tip = {'robot.tip': 'fr3_link7'}
-    controller = change(blf.load_loop('fr3_direct').controller, tip)
-    config = build(DriveConfig, {'load_inertia': [0.1, 0.2, 0.3]})
-    driver = FrankaDriver('', controller, config)
-    driver._robot = ToldRobot()
-    driver.tell_load(DriveLoad(2.0, (0.02, 0.0, 0.01)))
-    mass, centre, inertia = driver._robot.load
-    assert (mass, inertia) == (2.0, np.diag([0.1, 0.2, 0.3]).ravel().tolist())
-    np.testing.assert_allclose(centre, [0.02, 0.0, 0.01 - 0.107], atol=1e-9)
-    driver.tell_load(DriveLoad(0.0, (0.0, 0.0, 0.0)))
-    assert driver._robot.load == (0.0, [0.0] * 3, [0.0] * 9)
-
-
-@pytest.mark.parametrize(
-    ('set_load', 'm_ee', 'm_total', 'words'),
-    [
-        (True, 0.73, 1.23, 'an end effector of 0.73 kg'),
-        (True, 0.005, 2.0, ''),
-        (False, 0.73, 0.73, 'compensates 0.73 kg at its flange, but'),
-        (False, 0.73, 0.505, ''),
-    ],
-)
-def test_mass_that_only_the_robot_knows_is_remarked(set_load, m_ee, m_total, words):
-    """That of the end effector if we set the load, else both; the configuration has 0.5 kg."""
-    known = {'robot.drive_payload': 0.5}
-    controller = change(blf.load_loop('fr3_direct').controller, known)
-    driver = FrankaDriver('', controller, build(DriveConfig, {'set_load': set_load}))
-    driver._robot = ToldRobot()
-    driver._robot.read_once = lambda: SimpleNamespace(
-        m_ee=m_ee, m_total=m_total, tau_J=[1.0] * 7
-    )
-    remarks = list(driver._remarks())
-    assert len(remarks) == bool(words)
-    assert words in ''.join(remarks)
-
-
-def test_robot_without_torques_is_remarked_with_settings_that_its_driver_takes():
-    """As of franka-sim, whose tau_J is the command."""
-    given = blf.load_loop('fr3_direct').controller
-    driver = FrankaDriver('', given, build(DriveConfig, {}))
-    driver._robot = ToldRobot()
-    driver._robot.read_once = lambda: SimpleNamespace(
-        m_ee=0.0, m_total=0.0, tau_J=[0.0] * 7
-    )
-    (remark,) = driver._remarks()
-    advised = re.findall(r'([a-z_]+\.[a-z_]+): ([a-z0-9.]+[a-z0-9])', remark)
-    values = {name: yaml.safe_load(value) for name, value in advised}
-    assert values == {
-        'safety.first_torque': 'send',
-        'disturbance.observer_bandwidth': 0.0,
-    }
-    assert not disagreements(FrankaDriver.facts, change(given, values))
-
-
-@pytest.mark.parametrize(('sensors', 'remarked'), [(True, False), (False, True)])
-def test_joint_torque_sensors_that_a_file_does_not_name_are_remarked(sensors, remarked):
-    given = blf.load_loop(
-        'fr3_direct', {'blf_dsc_controller': {'robot.torque_loop': sensors}}
-    )
-    driver = FrankaDriver('', given.controller, build(DriveConfig, {}))
-    driver._robot = ToldRobot()
-    driver._robot.read_once = lambda: SimpleNamespace(
-        m_ee=0.0, m_total=0.0, tau_J=[1.0] * 7
-    )
-    told = '\n'.join(driver._remarks())
-    assert ('robot.torque_loop: true' in told) == remarked
-
-
-@pytest.mark.parametrize(
-    ('theta', 'has_motors'),
-    [([0.0] * 7, False), ([0.5] * 7, False), ([0.5] * 6 + [0.51], True)],
-)
-def test_motors_that_are_where_their_links_are_say_nothing(theta, has_motors):
-    """Gears that do not give way would be stiffer than any."""
-    driver = FrankaDriver('', blf.load_loop('fr3_direct').controller, DriveConfig())
-    state = SimpleNamespace(
-        m_load=1.5,
-        time=SimpleNamespace(to_sec=lambda: 1.0),
-        q=[0.5] * 7,
-        dq=[0.1] * 7,
-        tau_J=[2.0] * 7,
-        tau_J_d=[3.0] * 7,
-        theta=theta,
-        dtheta=[0.0] * 7,
-    )
-    driver._control = SimpleNamespace(readOnce=lambda: (state, None))
-    stamp, q, dq, effort, motors = driver.read()
-    assert (motors is not None) == has_motors
-    assert (stamp, q, dq, effort) == (1.0, [0.5] * 7, [0.1] * 7, [2.0] * 7)
-    assert driver.load_in_force() == 1.5
-
-
-@pytest.mark.parametrize('call', ['readOnce', 'writeOnce'])
-@pytest.mark.parametrize(
-    ('raised', 'expected', 'remedy'),
-    [
-        ('NetworkException', ConnectionLostError, 'check its computer and the cable'),
-        ('ControlException', ReflexError, ''),
-        ('CommandException', ReflexError, 'see Desk, which names the cause'),
-        ('InvalidOperationException', DriverError, 'end what else reads or moves'),
-        ('RealtimeException', DriverError, 'see Desk, and start again'),
-        ('FrankaException', DriverError, 'see Desk, and start again'),
-    ],
-)
-def test_what_libfranka_raises_in_motion_is_an_error_of_a_driver(
-    call, raised, expected, remedy
-):
-    """All of its exceptions, none of which is another's base class in Python."""
-
-    def fail(*_):
-        raise getattr(pylibfranka, raised)('libfranka: it said no')
-
-    given = blf.load_loop('fr3_direct').controller
-    driver = FrankaDriver('', given, build(DriveConfig, {}))
-    driver._control = SimpleNamespace(**{call: fail})
-    use = driver.read if call == 'readOnce' else driver.finish
-    with pytest.raises(DriverError, match=f'it said no.*{remedy}') as caught:
-        use()
-    assert type(caught.value) is expected
-    assert 'libfranka' not in str(caught.value)
-
-
-class WrittenTorques:
-    """Keeps the torques that it was sent, and whether each ended the motion."""
-
-    def __init__(self):
-        self.sent = []
-
-    def writeOnce(self, torques):
-        self.sent.append((list(torques.tau_J), torques.motion_finished))
-
-
-def test_torques_go_on_until_the_next_start_which_begins_at_zero():
-    """A reflex leaves a torque behind that the next motion must not begin with."""
-    driver = FrankaDriver('', blf.load_loop('fr3_direct').controller, DriveConfig())
-    controls = [WrittenTorques(), WrittenTorques()]
-    left = iter(controls)
-    driver._robot = SimpleNamespace(start_torque_control=lambda: next(left))
-    driver.start()
-    driver.write(None)
-    driver.write(np.full(7, 3.0))
-    driver.write(None)
-    driver.finish()
-    driver.start()
-    driver.write(None)
-    first, second = (each.sent for each in controls)
-    zero, three = [0.0] * 7, [3.0] * 7
-    assert first == [(zero, False), (three, False), (three, False), (three, True)]
-    assert second == [(zero, False)]
-
-
-class ConnectedRobot:
-    """A robot in a mode, with what it was told."""
-
-    def __init__(self, *modes):
-        self.modes = list(modes)
+    def __init__(self, *modes, **state):
+        self.modes = list(modes or [pylibfranka.RobotMode.Idle])
         self.told = []
+        still = dict.fromkeys(
+            ('q', 'dq', 'tau_J', 'tau_J_d', 'theta', 'dtheta'), [0.5] * 7
+        )
+        masses = {'m_ee': 0.0, 'm_total': 0.0, 'm_load': 1.5}
+        time = SimpleNamespace(to_sec=lambda: 1.0)
+        self.state = SimpleNamespace(**still | masses | state, time=time)
 
     def read_once(self):
-        mode = self.modes.pop(0) if len(self.modes) > 1 else self.modes[0]
-        return SimpleNamespace(
-            robot_mode=mode, m_ee=0.0, m_total=0.0, tau_J=[1.0] * 7, q=[0.0] * 7
-        )
+        self.state.robot_mode = self.modes[0]
+        del self.modes[: len(self.modes) > 1]
+        return self.state
 
     def automatic_error_recovery(self):
         self.told.append('recovered')
@@ -488,58 +322,150 @@ class ConnectedRobot:
     def set_load(self, *load):
         self.told.append(load)
 
+    # Of a motion.
 
-def connected(monkeypatch, robot, given=None, priority=0):
-    """Return a driver that has connected to this robot, and how it did."""
-    calls = []
+    def start_torque_control(self):
+        self.told.append('started')
+        return self
 
-    def reach(address, realtime):
-        calls.append((address, realtime))
-        return robot
+    def readOnce(self):
+        return self.read_once(), None
 
-    monkeypatch.setattr(pylibfranka, 'Robot', reach)
-    values = {'blf_dsc_controller': {'realtime.priority': priority}}
-    controller = blf.load_loop('fr3_direct', values).controller
-    driver = FrankaDriver('here', controller, build(DriveConfig, given or {}))
-    driver.connect()
-    return calls
+    def writeOnce(self, torques):
+        self.told.append((torques.tau_J[0], torques.motion_finished))
 
 
-def test_thresholds_are_those_of_torque_and_force(monkeypatch):
+@pytest.fixture
+def connected(monkeypatch):
+    """Connect to a made-up robot; return the driver, and what it said and asked for."""
+
+    def connect(robot, given=None, **controller):
+        asked = []
+        reach = lambda *how: asked.append(how) or robot  # noqa: E731
+        monkeypatch.setattr(pylibfranka, 'Robot', reach)
+        given_law = {'blf_dsc_controller': controller}
+        config = blf.load_loop('fr3_direct', given_law).controller
+        driver = FrankaDriver('here', config, build(DriveConfig, given or {}))
+        said = driver.connect()
+        robot.told.pop()  # the load at the start
+        return driver, said, asked
+
+    return connect
+
+
+def test_load_is_told_in_the_frame_of_the_flange_and_none_without_mass(connected):
+    """With the frame of joint 7 as the tip: the flange is 0.107 m further along its axis."""
+    robot = MadeUpRobot()
+    given = {'load_inertia': [0.1, 0.2, 0.3]}
+    driver, _, _ = connected(robot, given, **{'robot.tip': 'fr3_link7'})
+    driver.tell_load(DriveLoad(2.0, (0.02, 0.0, 0.01)))
+    driver.tell_load(DriveLoad(0.0, (0.0, 0.0, 0.0)))
+    (mass, centre, inertia), without_mass = robot.told
+    assert (mass, inertia) == (2.0, np.diag([0.1, 0.2, 0.3]).ravel().tolist())
+    np.testing.assert_allclose(centre, [0.02, 0.0, 0.01 - 0.107], atol=1e-9)
+    assert without_mass == (0.0, [0.0] * 3, [0.0] * 9)
+
+
+def test_robot_without_torques_is_remarked_with_settings_that_its_driver_takes(
+    connected,
+):
+    """As of franka-sim, whose tau_J is the command."""
+    driver, (_, remark), _ = connected(MadeUpRobot(tau_J=[0.0] * 7))
+    advised = re.findall(r'([a-z_]+\.[a-z_]+): ([a-z0-9.]+[a-z0-9])', remark)
+    values = {name: yaml.safe_load(value) for name, value in advised}
+    assert values == {
+        'safety.first_torque': 'send',
+        'disturbance.observer_bandwidth': 0.0,
+    }
+    given = blf.change(driver.controller, values)
+    assert not disagreements(FrankaDriver.facts, given)
+
+
+@pytest.mark.parametrize(
+    ('theta', 'has_motors'),
+    [([0.0] * 7, False), ([0.5] * 7, False), ([0.5] * 6 + [0.51], True)],
+)
+def test_motors_that_are_where_their_links_are_say_nothing(
+    connected, theta, has_motors
+):
+    """Gears that do not give way would be stiffer than any."""
+    driver, _, _ = connected(MadeUpRobot(theta=theta))
+    driver.start()
+    assert (driver.read().motors is not None) == has_motors
+    assert driver.load_in_force() == 1.5
+
+
+@pytest.mark.parametrize(
+    ('raised', 'expected', 'call', 'remedy'),
+    [
+        ('NetworkException', ConnectionLostError, 'readOnce', 'check its computer and'),
+        ('ControlException', ReflexError, 'writeOnce', ''),
+        ('CommandException', ReflexError, 'readOnce', 'see Desk, which names the'),
+        ('InvalidOperationException', DriverError, 'writeOnce', 'end what else reads'),
+        ('FrankaException', DriverError, 'readOnce', 'see Desk, and start again'),
+    ],
+)
+def test_what_libfranka_raises_in_motion_is_an_error_of_a_driver(
+    connected, call, raised, expected, remedy
+):
+    """All of its exceptions, none of which is another's base class in Python."""
+
+    def fail(*_):
+        raise getattr(pylibfranka, raised)('libfranka: it said no')
+
+    robot = MadeUpRobot()
+    driver, _, _ = connected(robot)
+    driver.start()
+    setattr(robot, call, fail)
+    use = driver.read if call == 'readOnce' else driver.finish
+    with pytest.raises(DriverError, match=f'it said no.*{remedy}') as caught:
+        use()
+    assert type(caught.value) is expected
+    assert 'libfranka' not in str(caught.value)
+
+
+def test_torques_go_on_until_the_next_start_which_begins_at_zero(connected):
+    """A reflex leaves a torque behind that the next motion must not begin with."""
+    robot = MadeUpRobot()
+    driver, _, _ = connected(robot)
+    driver.start()
+    for torque in (None, np.full(7, 3.0), None):
+        driver.write(torque)
+    driver.finish()
+    driver.start()
+    driver.write(None)
+    first = [(0.0, False), (3.0, False), (3.0, False), (3.0, True)]
+    assert robot.told == ['started', *first, 'started', (0.0, False)]
+
+
+def test_thresholds_are_those_of_torque_and_force(connected):
     """The lower ones, of contacts, and the upper ones, of collisions, are the same."""
     torque, force = [10.0 + k for k in range(7)], [20.0 + k for k in range(6)]
-    robot = ConnectedRobot(pylibfranka.RobotMode.Idle)
-    given = {'collision_torque': torque, 'collision_force': force}
-    connected(monkeypatch, robot, given)
-    assert robot.told[0] == (torque, torque, force, force)
+    robot = MadeUpRobot()
+    connected(robot, {'collision_torque': torque, 'collision_force': force})
+    assert robot.told == [(torque, torque, force, force)]
     given = {'collision_torque': torque[:6], 'collision_force': force}
     with pytest.raises(DriverError, match='got 6 entries, but the robot has 7 joints'):
-        connected(monkeypatch, robot, given)
+        connected(robot, given)
 
 
-def test_only_a_reflex_is_recovered_and_no_other_mode_is_started_from(monkeypatch):
+def test_only_a_reflex_is_recovered_and_no_other_mode_is_started_from(connected):
     modes = pylibfranka.RobotMode
-    robot = ConnectedRobot(modes.Reflex, modes.Idle)
-    connected(monkeypatch, robot)
-    assert robot.told[0] == 'recovered'
+    robot = MadeUpRobot(modes.Reflex, modes.Idle)
+    connected(robot)
+    assert robot.told == ['recovered']
     for mode in (modes.Reflex, modes.UserStopped, modes.Guiding, modes.Move):
-        robot = ConnectedRobot(mode)
+        robot = MadeUpRobot(mode)
         with pytest.raises(DriverError, match=f'is not idle, but in mode {mode.name}'):
-            connected(monkeypatch, robot)
+            connected(robot)
         assert robot.told == ['recovered'] * (mode is modes.Reflex)
 
 
-@pytest.mark.parametrize(('priority', 'enforced'), [(0, False), (80, True)])
-def test_realtime_is_enforced_where_a_priority_is_asked_for(
-    priority, enforced, monkeypatch
-):
-    robot = ConnectedRobot(pylibfranka.RobotMode.Idle)
-    ((address, realtime),) = connected(monkeypatch, robot, priority=priority)
+def test_realtime_is_enforced_where_a_priority_is_asked_for(connected):
     wanted = pylibfranka.RealtimeConfig
-    assert (address, realtime) == (
-        'here',
-        wanted.kEnforce if enforced else wanted.kIgnore,
-    )
+    for priority, kind in ((0, wanted.kIgnore), (80, wanted.kEnforce)):
+        _, _, asked = connected(MadeUpRobot(), **{'realtime.priority': priority})
+        assert asked == [('here', kind)]
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):
