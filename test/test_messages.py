@@ -20,10 +20,7 @@ from blf_dsc_controller.messages.codecs import (
     typestore,
 )
 from blf_dsc_controller.messages.errors import (
-    DuplicatedJointError,
     MessageError,
-    MissingJointError,
-    ShortArrayError,
 )
 from blf_dsc_controller.messages.strings import decode_string, encode_string
 
@@ -86,14 +83,6 @@ def test_encoded_string_equals_full_serialisation(text):
     assert decode_string(raw) == text
 
 
-def test_array_of_another_size_or_label_has_another_layout():
-    own = Float64MultiArrayEncoder(2, 'arm')
-    assert own.has_layout(own.encode([3.0, 4.0]))
-    for other in ((3, 'arm'), (2, 'leg'), (2, '')):
-        raw = Float64MultiArrayEncoder(*other).encode(np.zeros(other[0]))
-        assert not own.has_layout(raw)
-
-
 @given(NAMES, st.text('base_', max_size=9), STAMPS, st.randoms())
 def test_decoder_matches_joints_by_name(names, frame_id, stamp, random):
     values = {
@@ -145,19 +134,19 @@ def test_decoder_follows_a_change_of_layout(before, raw, values):
     [
         (
             joint_state('ac', [7, 7], [7, 7], [7, 7]),
-            MissingJointError,
+            MessageError,
             "'b' is .* names a, c: set",
         ),
         (
             joint_state('aba', [1, 2, 3], [4, 5, 6], []),
-            DuplicatedJointError,
+            MessageError,
             "'a' appears 2",
         ),
         *(
-            (joint_state('ab', [1, 2], [4.0] * k, []), ShortArrayError, f'{k} values')
+            (joint_state('ab', [1, 2], [4.0] * k, []), MessageError, f'{k} values')
             for k in (0, 1, 3)
         ),
-        (joint_state('ab', [1, 2], [3, 4], [5]), ShortArrayError, '1 values'),
+        (joint_state('ab', [1, 2], [3, 4], [5]), MessageError, '1 values'),
         (b'\x00\x00' + GOOD[2:], MessageError, '00 00, not with 00 01'),
     ],
 )
@@ -185,40 +174,3 @@ def test_every_truncation_is_rejected(create, raw, warm):
             decoder.decode(raw)
         with pytest.raises(MessageError, match='is cut off'):
             decoder.decode(raw[:length])
-
-
-@pytest.mark.parametrize('data', [[], [1.0, 2.0, 3.0]])
-def test_multi_array_with_dimensions_of_the_expected_size_is_decoded(data):
-    dimension = made('std_msgs/MultiArrayDimension', 'joints', len(data), 3)
-    decoder = Float64MultiArrayDecoder(len(data))
-    assert decoder.decode(multi_array(data, dimension)) == len(data)
-    assert decoder.decode(multi_array([4, 5])) == 2
-    assert decoder.values.tolist() == data
-
-
-@given(
-    NAMES, st.sets(st.sampled_from(JOINT_STATE_FIELDS)), st.text('base_', max_size=9)
-)
-def test_messages_pass_through_rclpy_unchanged(names, fields, frame_id):
-    rclpy = pytest.importorskip('rclpy.serialization', reason='needs ROS 2')
-    from sensor_msgs.msg import JointState
-    from std_msgs.msg import Float64MultiArray
-
-    count = len(names)
-    values = {
-        name: (k - np.arange(count) / 3).tolist()
-        for k, name in enumerate(sorted(fields))
-    }
-    raw = JointStateEncoder(names, fields).encode(STAMP, **values)
-    message = rclpy.deserialize_message(raw, JointState)
-    message.header.frame_id = frame_id
-    decoder = JointStateDecoder(names[::-1], ())
-    assert decoder.decode(rclpy.serialize_message(message)) == STAMP
-    for field in JOINT_STATE_FIELDS:
-        expected = values.get(field, [NAN] * count)
-        np.testing.assert_array_equal(getattr(decoder, field)[::-1], expected)
-    raw = Float64MultiArrayEncoder(count).encode(range(count))
-    array = Float64MultiArrayDecoder(count)
-    message = rclpy.deserialize_message(raw, Float64MultiArray)
-    assert array.decode(rclpy.serialize_message(message)) == count
-    assert array.values.tolist() == list(range(count))
