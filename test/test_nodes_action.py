@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import signal
 import sys
 from pathlib import Path
@@ -35,19 +36,9 @@ from trajectory_msgs.msg import (
     MultiDOFJointTrajectoryPoint,
 )
 
-from blf_dsc_controller.control.goal_messages import (
-    Answer,
-    Cancel,
-    End,
-    Goal,
-    Outcome,
-)
-from blf_dsc_controller.control.goals import Goals
+import blf_dsc_controller as blf
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.nodes import action_process
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
-from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.supervision.supervisor import Reason
 
 BRISK = {
@@ -206,8 +197,6 @@ def rests_at(law):
 
 
 SUCCESSES = {
-    'single point': [point(NEAR, 0.8)],
-    'single point with a velocity': [point(NEAR, 0.8, (0.0, 0.0))],
     'points with the measured position first, as from MoveIt': [
         point(np.add(START, (2e-3, -3e-3)), 0.0, (0.0, 0.0), (0.0, 0.0)),
         point(NEAR, 1.0, (0.0, 0.0), (0.0, 0.0)),
@@ -242,13 +231,6 @@ def test_goal_is_reached_with_feedback_on_the_way(loop, points):
     assert np.diff(times).min() > 0.05 - 1e-6
 
 
-def test_joints_may_come_in_any_order(loop):
-    _, law, client = loop
-    handle = client.follow(point(NEAR[::-1], 0.8), joints=JOINTS[::-1])
-    assert client.result(handle)[0] == SUCCEEDED
-    np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
-
-
 def test_goal_that_ends_in_motion_succeeds_there_and_brakes(loop):
     _, law, client = loop
     velocity = np.array([0.3, -0.3])
@@ -259,24 +241,25 @@ def test_goal_that_ends_in_motion_succeeds_there_and_brakes(loop):
     assert np.all((beyond > 0.0) & (beyond < 0.3 * (0.3 / 6.0 + 0.1)))
 
 
-def test_path_tolerance_of_a_goal_aborts_it_and_the_reference_rests(loop):
+@pytest.mark.parametrize(
+    ('tolerance', 'told'),
+    [
+        (('joint1', 1e-7, 0.0), "'joint1' is .* 1e-07 rad are allowed"),
+        (('joint2', 0.0, 1e-6), "'joint2' is .* rad/s"),
+    ],
+)
+def test_path_tolerance_of_a_goal_aborts_it_and_the_reference_rests(
+    loop, tolerance, told
+):
     arm, law, client = loop
-    handle = client.follow(point(FAR, 1.0), path=[('joint1', 1e-7, 0.0)])
+    # joints may come in any order
+    handle = client.follow(point(FAR[::-1], 1.0), joints=JOINTS[::-1], path=[tolerance])
     status, result = client.result(handle)
     assert (status, result.error_code) == (ABORTED, result.PATH_TOLERANCE_VIOLATED)
-    assert "'joint1' is " in result.error_string
-    assert '1e-07 rad are allowed' in result.error_string
+    assert re.search(told, result.error_string)
     assert np.abs(rests_at(law) - START).max() < 0.1  # it had hardly begun
     client.ros.run(arm, 500)
     np.testing.assert_array_equal(reference(law)[1:], 0.0)
-
-
-def test_path_tolerance_of_a_velocity_is_kept_too(loop):
-    _, _, client = loop
-    handle = client.follow(point(FAR, 1.0), path=[('joint2', 0.0, 1e-6)])
-    status, result = client.result(handle)
-    assert (status, result.error_code) == (ABORTED, result.PATH_TOLERANCE_VIOLATED)
-    assert 'rad/s' in result.error_string
 
 
 def test_goal_tolerance_aborts_a_goal_that_has_not_arrived_in_time(loop):
@@ -289,68 +272,15 @@ def test_goal_tolerance_aborts_a_goal_that_has_not_arrived_in_time(loop):
     np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
 
 
-def test_goal_without_a_time_tolerance_waits_until_the_arm_is_there(loop):
-    arm, law, client = loop
-    handle = client.follow(point(NEAR, 0.5), arrival=[('joint1', 1e-12, 0.0)])
-    client.ros.run(arm, 2000)
-    client.ros.until(lambda: handle.status == GoalStatus.STATUS_EXECUTING)
-    client.cancel(handle)
-    assert client.result(handle)[0] == CANCELED
-    np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
-
-
-WRONG_TOLERANCES = {
-    'negative': [('joint1', -0.5, 0.0)],
-    'negative velocity': [('joint1', 0.0, -2.0)],
-    'not finite': [('joint1', float('nan'), 0.0)],
-    'unknown joint': [('elbow', 1e-12, 0.0)],
-}
-
-
-@pytest.mark.parametrize('wrong', WRONG_TOLERANCES.values(), ids=WRONG_TOLERANCES)
+@pytest.mark.parametrize(
+    'wrong', [[('joint1', 0.0, -2.0)], [('joint1', np.nan, 0.0)], [('elbow', 1.0, 0.0)]]
+)
 def test_wrong_tolerances_become_the_default_ones(loop, wrong):
     """As for joint_trajectory_controller; a tight one beside them does not apply either."""
     client = loop.client
     tight = [('joint1', 1e-12, 0.0)]
     handle = client.follow(point(NEAR, 0.5), path=tight, arrival=wrong)
     assert client.result(handle)[0] == SUCCEEDED
-
-
-def test_tolerance_of_minus_one_allows_everything(loop):
-    """Without it, the default applies: the bound."""
-    _, law, client = loop
-    free = [(joint, -1.0, -1.0) for joint in JOINTS]
-    handle = client.follow(point(NEAR, 2.0), path=free, arrival=free, time=-1.0)
-    followed = law.action._goals._followed
-    assert np.isinf(followed.path.position).all()
-    assert np.isinf(followed.latest)
-    assert client.result(handle)[0] == SUCCEEDED
-    handle = client.follow(point(FAR, LONG))
-    followed = law.action._goals._followed
-    guard = law.guard
-    outside = np.array([[0.0, 1.01], [9.0, 9.0]]) * guard.controller.sample.bound
-    found = followed.path.violation(
-        guard.config, outside, guard.controller.sample.bound
-    )
-    assert "'joint2' is " in found
-    client.cancel(handle)
-
-
-def test_cancel_of_a_goal_does_not_brake_the_motion_that_has_replaced_it(loop):
-    """Both arrive between two samples."""
-    _, law, client = loop
-    sent = []
-    inputs = law.status.trajectories
-    goals = Goals(inputs, JOINTS, sent.append, law.get_logger())
-    far = JointTrajectory(joint_names=JOINTS, points=[point(FAR, 1.0)])
-    goals.take(law.guard, Goal(7, serialize_message(far), (), (), 0.0))
-    client.ros.until(lambda: sent)
-    newer = Trajectory(JOINTS, (TrajectoryPoint(1.0, tuple(NEAR)),))
-    law.guard.motions.adopt(law.guard.motions.plan(newer))
-    goals.take(law.guard, Cancel(7))
-    np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
-    assert [type(each) for each in sent] == [Answer, End]
-    assert sent[1].outcome is Outcome.CANCELLED
 
 
 def test_cancelled_goal_decelerates_within_the_limits_and_holds(loop):
@@ -368,6 +298,19 @@ def test_cancelled_goal_decelerates_within_the_limits_and_holds(loop):
     assert np.abs(reference(law)[0] - FAR).min() > 0.01  # it stopped before
     v = np.array([each.velocity for each in references])
     assert np.abs(np.diff(v, axis=0)).max() <= 6.0e-3 * 1.001
+
+
+def test_cancel_of_a_goal_does_not_brake_the_motion_that_has_replaced_it(loop):
+    """Both come between two samples: the arm stands still, and so does its time."""
+    arm, law, client = loop
+    handle = client.follow(point(FAR, LONG))
+    assert deactivate(client.ros, arm)
+    by_the_topic(law, client)
+    client.cancel(handle)
+    client.ros.spin(0.1)
+    assert activate(client.ros, arm)
+    assert client.result(handle)[0] != SUCCEEDED
+    np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
 
 
 def by_a_goal(_law, client):
@@ -406,16 +349,6 @@ def test_pre_empted_goal_is_aborted(loop, preempt):
     if second is not None:
         assert client.result(second)[0] == SUCCEEDED
         np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
-
-
-def test_goal_with_a_later_stamp_lets_the_motion_before_it_go_on(loop):
-    _, law, client = loop
-    stamp = law.guard.reference.last_stamp + 4_000_000_000
-    handle = client.follow(point(NEAR, 0.5), stamp=stamp)
-    np.testing.assert_allclose(reference(law)[0], START, atol=1e-3)
-    assert client.result(handle)[0] == SUCCEEDED
-    assert law.guard.reference.last_stamp >= stamp + 500_000_000
-    np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
 
 
 def test_deactivation_aborts_the_goal(loop):
@@ -457,14 +390,6 @@ def past_the_limits(client, _law):
     return client.goal(point((9.0, 0.0), 5.0))
 
 
-def of_another_arm(client, _law):
-    return client.goal(point(NEAR, 1.0), joints=('joint1', 'elbow'))
-
-
-def without_points(client, _law):
-    return client.goal()
-
-
 def too_fast_for_its_time(client, _law):
     return client.goal(point(FAR, 0.1), time=0.2)
 
@@ -473,8 +398,6 @@ REJECTED = {
     in_the_past: 'it lies entirely in the past',
     with_two_degrees_of_freedom: '',  # which the log of the action's process says
     past_the_limits: 'past its limit of 6.28319 rad',
-    of_another_arm: "its joints are 'joint1', 'elbow'",
-    without_points: 'it has no points',
     too_fast_for_its_time: 'goal_time_tolerance allows 0.2 s',
 }
 
@@ -526,17 +449,6 @@ def test_process_of_the_action_has_the_enclave_of_its_controller_and_the_policys
         for kind, names in found.items()
     }
     assert others == sros2_graph.ACTION_ACCESS
-
-
-def test_long_goal_is_followed(loop):
-    """Of 2,000 points."""
-    _, law, client = loop
-    t = np.linspace(0.0, 2.0, 2001)[1:]
-    share = 0.5 - 0.5 * np.cos(np.pi * t / 2.0)
-    way = np.outer(share, NEAR - START) + START
-    points = [point(q, time) for q, time in zip(way, t, strict=True)]
-    assert client.result(client.follow(*points))[0] == SUCCEEDED
-    np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
 
 
 def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd):
@@ -614,9 +526,9 @@ def test_streams_chunks_stops_and_goals_in_one_bag_replay_bit_for_bit(
     run.run(300)
     assert inputs.rejected == 0, inputs.reason
     client.close()
-    result = verify(run.end())
+    result = blf.verify(run.end())
     assert (result.difference, result.remarks) == (None, ())
     assert result.compared == 1.0
     assert result.motions == 40 + 3 + 3
-    brakes = [event for event in result.events if event.type is EventType.BRAKE]
+    brakes = [event for event in result.events if event.type == 'brake']
     assert len(brakes) == 2
