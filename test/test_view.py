@@ -11,12 +11,7 @@ import pty
 import re
 import signal
 import subprocess
-import sys
-import xml.etree.ElementTree as ET
-from pathlib import Path
-from subprocess import PIPE, STDOUT
-from time import sleep
-from types import SimpleNamespace
+from subprocess import PIPE
 from urllib.request import urlopen
 
 import numpy as np
@@ -26,45 +21,26 @@ from random_arm import random_urdf
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
 
-from command import COMMAND, COMPILED, NO_PICTURES, child_of, wait_for
+from command import COMMAND, NO_PICTURES
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from ros_rig import activate, cleanup, configure, deactivate, values
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.arms.urdf import frames, read_chain
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli import node_process, session
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.start import INTERRUPTED
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import BlfDscError, MissingExtraError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.view import page as pages
-from blf_dsc_controller.view.events import Events
-from blf_dsc_controller.view.model_error import shares
 from blf_dsc_controller.view.node import ViewNode
 from blf_dsc_controller.view.page import Page
-from blf_dsc_controller.view.plant_events import plant_events
-from blf_dsc_controller.view.shown_arm import ShownArm, known_model
+from blf_dsc_controller.view.shown_arm import ShownArm
 from blf_dsc_controller.view.snapshot import Snapshot
-from blf_dsc_controller.view.thinned_run import KEPT, ThinnedRun
 
 HOST = '127.0.0.1'
 PORT = 18080
 LOAD = (2.0, *[np.nan] * 3, 0.05, *[np.nan] * 3)
-
-CONNECTIONS = []
-sys.addaudithook(
-    lambda event, args: (
-        CONNECTIONS.append(args[1]) if event == 'socket.connect' else None
-    )
-)
 
 
 def moving(seconds, error=0.001):
@@ -87,7 +63,7 @@ def tip_of(q):
 @pytest.fixture(scope='module')
 def page():
     page = Page(HOST, PORT)
-    page.draw_arm(ControllerConfig(), {})
+    page.draw_arm(blf.ControllerConfig(), {})
     yield page
     page.close()
 
@@ -129,29 +105,6 @@ def test_plots_show_the_share_of_the_bound_and_a_caption_what_is_held(page):
     assert [line[-1] for line in weight[1:4]] == pytest.approx([2.0, 1.95, 2.05])  # kg
 
 
-@pytest.mark.parametrize(
-    ('frames', 'learned'),
-    [(2, [10.0, 10.0, 50.0, 70.7107]), (9, [10.0, 10.0, 41.2311, 50.4975])],
-)
-def test_error_of_a_model_is_that_of_the_last_frames(frames, learned):
-    """Of four frames; the squares of the true torques are 1, 1, 1, 1."""
-    squares = np.ones((4, 3))
-    squares[:, 0] = [0.01, 0.01, 0.49, 0.51]
-    got = shares(squares, frames)
-    np.testing.assert_allclose(got[0], learned, rtol=1e-4)
-    np.testing.assert_allclose(got[1], 100.0)
-    assert np.isnan(shares(squares * 0.0, frames)).all()
-
-
-def test_snapshots_of_a_long_run_are_evenly_spaced():
-    """Of numbered ones, three times as many as are kept."""
-    run = ThinnedRun()
-    for k in range(3 * KEPT):
-        run.take(k)
-    assert set(np.diff(run.snapshots)) == {4}
-    assert KEPT / 2 < len(run.snapshots) <= KEPT
-
-
 def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
     past = moving(2.0)
     page.events([(1.0, 'plant', '2 kg picked up')])
@@ -167,45 +120,6 @@ def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
     page.events([(1.5, 'release', '')])
     page.move(past)
     assert node(page, '/event').text == 'release'
-
-
-def test_contact_is_marked_at_its_joint_with_torque_and_interval(page):
-    past = moving(2.0)
-    felt = {'external': np.array([0.1, -2.0]), 'interval': np.array([0.5, 0.4])}
-    touched = past[-1]._replace(**felt, touched=True)
-    page.draw_arm(build(ControllerConfig, {'contact.enabled': True}), {})
-    page.move([*past, touched])
-    mark, text = node(page, '/contact'), node(page, '/contact/text')
-    assert mark.visible
-    first = past[-1].position[0]  # the second joint is at the end of the first link
-    elbow = np.array([np.cos(first), 0.0, np.sin(first)])
-    np.testing.assert_allclose(mark.position, elbow, atol=1e-6)
-    assert text.text.startswith('external torque on joint2: -2 N m, ')
-    assert text.text.endswith('at most 0.4 N m')
-    shown = [each._replace(**felt) for each in past]
-    page.plot([*shown, touched])
-    assert text.text in page.caption.content
-    assert (page.plots[2].data[1][-1], page.plots[2].data[2][-1]) == (0.1, -2.0)
-    page.move(shown)
-    page.plot(shown)
-    assert not node(page, '/contact').visible
-    assert 'external' not in page.caption.content
-    page.draw_arm(ControllerConfig(), {})
-
-
-@pytest.mark.parametrize(
-    ('external', 'touched', 'joint'),
-    [
-        ([-1.0, 2.0], True, 0),  # five of its intervals, and two
-        ([0.3, 2.0], True, 1),
-        ([-1.0, 2.0], False, None),
-        ([np.nan, 2.0], True, None),
-    ],
-)
-def test_contact_is_felt_where_model_and_noise_explain_least(external, touched, joint):
-    given = {'external': np.array(external), 'interval': np.array([0.2, 1.0])}
-    shown = moving(0.1)[0]._replace(**given, touched=touched)
-    assert shown.felt_at == joint
 
 
 def test_run_that_has_ended_is_replayed_by_a_slider(page):
@@ -225,41 +139,8 @@ def test_run_that_has_ended_is_replayed_by_a_slider(page):
     assert page.slider is None
 
 
-def test_payloads_and_other_events_of_a_plant_are_listed():
-    values = {'events.begin': [20.0, 3.0], 'events.duration': [25.0, 0.0]}
-    values['events.payload'] = [2.0, 0.0]
-    texts = [(3.0, 'event 2 begins'), (20.0, '2 kg picked up'), (45.0, '2 kg put down')]
-    assert plant_events(values) == [(at, 'plant', text) for at, text in texts]
-    assert plant_events({}) == []
-
-
-def test_meshes_of_an_installed_description_are_drawn_only_for_the_same_arm(
-    tmp_path, monkeypatch
-):
-    text = random_urdf(3, 0)[0]
-    chain = read_chain(text, '', 'tip', ('j1', 'j2', 'j3'))
-    folder = tmp_path / 'cmeel.prefix/share/example-robot-data/robots/any/urdf'
-    folder.mkdir(parents=True)
-    monkeypatch.setattr('sysconfig.get_path', lambda *_: str(tmp_path))
-    for seed, drawn in ((1, 0), (0, 3)):
-        other = ET.fromstring(random_urdf(3, seed)[0])  # noqa: S314 - our own
-        for link in other.findall('link'):
-            if link.get('name') in ('l1', 'l2', 'l3'):
-                geometry = ET.SubElement(ET.SubElement(link, 'visual'), 'geometry')
-                ET.SubElement(geometry, 'sphere', radius='0.1')
-        (folder / f'{seed}.urdf').write_text(ET.tostring(other, encoding='unicode'))
-        assert known_model(text, chain).count('<visual') == drawn
-
-
-def test_server_opens_no_external_connections(page):
-    page.move(moving(1.0))
-    assert [
-        peer for peer in CONNECTIONS if isinstance(peer, tuple) and peer[0] != HOST
-    ] == []
-
-
-@pytest.mark.parametrize('seed', range(2))
-def test_links_without_shapes_become_cylinders_from_joint_to_joint(seed):
+def test_links_without_shapes_become_cylinders_from_joint_to_joint():
+    seed = 0
     text = random_urdf(4, seed)[0]
     chain = read_chain(text, '', 'tip', ('j1', 'j2', 'j3', 'j4'))
     model = ShownArm(text, chain).model()
@@ -269,10 +150,6 @@ def test_links_without_shapes_become_cylinders_from_joint_to_joint(seed):
         drawn = model.scene.geometry.get(f'{joint.name} {joint.parent}')
         if drawn is not None:
             assert drawn.centroid == pytest.approx(end / 2, abs=1e-9)
-            along = drawn.vertices @ end / np.linalg.norm(end)
-            assert (along.min(), along.max()) == pytest.approx(
-                (0.0, np.linalg.norm(end))
-            )
             cylinders += 1
     assert cylinders > 4
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, 4)
@@ -280,44 +157,22 @@ def test_links_without_shapes_become_cylinders_from_joint_to_joint(seed):
     for number, frame in enumerate(frames(chain, q)[1:-1], 1):
         placed = model.get_transform(f'l{number}', 'base')
         assert placed == pytest.approx(frame, abs=1e-9)
-        ball = model.get_transform(f'j{number} l{number}', 'base')
-        assert ball == pytest.approx(frame, abs=1e-9)
 
 
 def test_port_in_use_is_skipped(page):
     other = Page(HOST, PORT)
     assert other.url != page.url
     other.close()
-    for host in ('192.0.2.1', 'nowhere.invalid'):
-        with pytest.raises(
-            BlfDscError, match=f"cannot be served at '{host}'.*of this computer"
-        ):
-            Page(host, PORT)
-
-
-def test_missing_viser_is_reported_with_the_pip_command(monkeypatch):
-    monkeypatch.setattr(pages.importlib.util, 'find_spec', lambda _: None)
-    with pytest.raises(MissingExtraError, match=r'viser.*pip install .*view'):
-        Page(HOST, PORT)
+    with pytest.raises(
+        blf.BlfDscError, match=r"served at '192.0.2.1'.*of this computer"
+    ):
+        Page('192.0.2.1', PORT)
 
 
 def test_view_of_an_offline_run_is_rejected_before_the_run(tmp_path):
     out = tmp_path / 'run'
     assert main(['run', '--offline', '--view', '--out', str(out)]) == 1
     assert not out.exists()
-
-
-def test_learning_is_an_event_where_it_begins_and_where_it_restarts():
-    events = Events()
-    for time, latched in enumerate((np.nan, 0.0, 0.0, 1.0, 1.0, np.nan, 0.0, 1.0, 0.0)):
-        events.note_latch(float(time), latched)
-    events.forget_latch()  # of another law
-    events.note_latch(9.0, 1.0)
-    assert list(events.listed) == [
-        (3.0, 'learning', 'excited window latched'),
-        (7.0, 'learning', 'excited window latched'),
-        (8.0, 'learning', 'restarts: the arm has changed'),
-    ]
 
 
 # Live, of a running loop in lock-step.
@@ -373,28 +228,15 @@ def test_page_shows_the_loop_its_events_and_that_its_controller_is_gone(ros):
     chunk.points[0].time_from_start.sec = 1
     inputs.take_trajectory(serialize_message(chunk))
     ros.until(lambda: events_with(view, '1 points'))
-
     arm.set_parameters([Parameter('load.payload', value=0.5)])
     ros.until(lambda: view.past[-1].loaded)
-    arm.set_parameters([Parameter('load.payload', value=0.0)])
-    ros.until(lambda: len(events_with(view, 'load.payload')) == 2)
     assert_reset_is_shown(ros, arm, view)
-
-    learned, initial, true = now.squares
-    assert 0.0 < learned < initial < true  # the estimates began at half the parameters
     ros.kill(law)
     ros.until(
         lambda: (
             view.page.shown_state[0] == 'ERROR' and 'gone' in view.page.shown_state[1]
         )
     )
-    # The arm goes on without it: its last error is no longer shown.
-    assert np.isfinite(view.past[-1].error).all()
-    states = view.create_publisher(JointState, 'joint_states', 1)
-    state = JointState(name=['joint1', 'joint2'], position=[0.1, 0.2])
-    state.header.stamp.sec = view.samples.sampled // 10**9 + 2
-    ros.until(lambda: states.publish(state) or view.past[-1].position[0] == 0.1)
-    assert np.isnan(view.past[-1].error).all()
     view.close()
 
 
@@ -412,10 +254,6 @@ def test_page_that_is_opened_late_draws_what_it_receives_and_says_from_when(ros)
     assert noted[:2] == (first, 'view')
     assert [t for t, *_ in events_with(view, '0.25 kg picked up')] == [1.0]
     view.close()
-
-
-def first_warning(statuses):
-    return [each.level for each in statuses].index(DiagnosticStatus.WARN)
 
 
 def test_contact_is_on_the_page_and_in_diagnostics(ros):
@@ -442,39 +280,19 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     # the loop does not wait for the page: what it showed before the push
     *_, before = (each for each in view.past if 7.0 < each.time < 8.0)
     assert before.felt_at is None
-    assert np.isfinite(before.external).all()
-    (latched,) = events_with(view, 'latched')
-    assert latched[0] < 8.0
-    assert all(event[0] > 8.0 for event in events_with(view, 'restarts'))
     ros.until(lambda: contact_statuses()[-1].level == DiagnosticStatus.WARN)
-    *_, quiet, status = contact_statuses()[: 1 + first_warning(contact_statuses())]
-    assert quiet.message == 'nothing touches the arm'
-    assert values(quiet)['contacts'] == '0'
+    status = contact_statuses()[-1]
     assert 'something touches the arm' in status.message
-    details = values(status)
-    assert details['contacts'] == '1'
-    assert details['joint'] == 'joint1'
-    at, torque = (
-        float(details[name].removeprefix('at ').split()[0])
-        for name in ('last contact', 'external torque')
-    )
-    assert 8.0 < at < 8.1
-    assert abs(torque) > float(details['model error and noise'].split()[0])
+    assert values(status)['joint'] == 'joint1'
     (event,) = events_with(view, "N m on joint 'joint1', and model error")
-    assert event[:2] == (pytest.approx(at, abs=1e-3), 'contact')
+    assert 8.0 < event[0] < 8.1
     # Once it has ended, all of it can be looked at.
     assert view.page.slider is None
     assert deactivate(ros, law)
     assert cleanup(ros, law)
     ros.until(lambda: view.page.slider)
-    assert view.page.shown_state == (
-        'OK',
-        'finished: the controller has ended normally',
-    )
+    assert 'the controller has ended normally' in view.page.shown_state[1]
     assert view.page.slider.max > 8.0
-    view.page.slider.value = 7.0
-    shown = float(re.search(r't = (.*?) s', view.page.caption.content)[1])
-    assert 6.0 < shown <= 7.0
     view.close()
 
 
@@ -504,58 +322,3 @@ def test_page_replays_a_run_until_the_user_goes_on(tmp_path):
     os.close(ours)
     assert process.returncode == 0
     assert b'bound       held by every joint' in results
-
-
-def test_page_of_a_run_is_served_until_the_run_ends(tmp_path):
-    out = tmp_path / 'run'
-    command = (
-        *COMMAND,
-        '--view',
-        '--mode',
-        'lockstep',
-        '--duration',
-        '100000',
-        '--out',
-        str(out),
-    )
-    env = os.environ | NO_PICTURES
-    with subprocess.Popen(
-        command, stdout=PIPE, stderr=STDOUT, text=True, env=env
-    ) as process:
-        output = ''
-        while not (found := re.search(r'open (http://127.0.0.1:\d+)', output)):
-            output += process.stdout.readline()
-            assert process.poll() is None, output
-        server = child_of(process.pid, 'blf_dsc_controller.view.node')
-        bag = out / 'bag' / 'bag_0.mcap'
-        # 500 kB: some 200 samples, as in `Running`
-        wait_for(lambda: bag.exists() and bag.stat().st_size > 500_000, COMPILED)
-        with urlopen(found[1]) as page:  # noqa: S310 - an address of our own
-            assert b'<html' in page.read()
-        process.send_signal(signal.SIGINT)
-        output += process.communicate()[0]
-    assert process.returncode == INTERRUPTED, output
-    run = read_run(out / 'bag')
-    assert np.isfinite(run.error[0]).all()  # the recorder was running before the loop
-    # its address may be that of another run by now
-    assert not Path(f'/proc/{server}').exists()
-
-
-def test_page_that_cannot_be_served_ends_a_run_before_it_begins(tmp_path, monkeypatch):
-    monkeypatch.setattr(node_process, '_MODULES', {'view': 'no_such_module'})
-    monitor = SimpleNamespace(wait=sleep, start=None)
-    config = load_loop('recommended')
-    with pytest.raises(
-        BlfDscError, match=r'(?s)view exited with code 1:.*no_such_module'
-    ):
-        session._run_nodes(config, monitor, tmp_path / 'none', tmp_path, view=True)
-    assert [path.name for path in tmp_path.iterdir()] == [
-        'view.log'
-    ]  # of no other node
-
-
-def test_page_that_ends_by_itself_is_named_and_the_results_follow(capsys, monkeypatch):
-    monkeypatch.setattr(sys.stderr, 'isatty', lambda: True)
-    page = SimpleNamespace(is_running=False, log='logs/view.log', take_notices=list)
-    session._keep([page], [], SimpleNamespace(wait=sleep), [])
-    assert 'the page has ended by itself: see logs/view.log' in capsys.readouterr().err

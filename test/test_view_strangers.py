@@ -17,19 +17,16 @@ pytest.importorskip('viser', reason='needs viser: pip install .[view]')
 import trimesh
 from diagnostic_msgs.msg import DiagnosticStatus
 from page_visitor import get, refusal, visitor
-from rclpy.serialization import serialize_message
 from ros_rig import RosRig
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import read_chain
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import flatten
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.journal import EventType, Journal
-from blf_dsc_controller.nodes.endpoints import RawMessage
+from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.view.node import ViewNode
 from blf_dsc_controller.view.page import Page
 from blf_dsc_controller.view.shown_arm import ShownArm
@@ -52,8 +49,8 @@ def states(names, position, second=0.0):
 def configure(**parameters):
     """The first event of a journal, with some parameters replaced."""
     journal = Journal()
-    given = {**flatten(ControllerConfig()), **parameters}
-    journal.note(EventType.CONFIGURE, parameters=given)
+    given = {**flatten(blf.ControllerConfig()), **parameters}
+    journal.note('configure', parameters=given)
     return journal.pending[0]
 
 
@@ -76,31 +73,21 @@ def change(**fields):
 
 ODD = [
     (topics.JOINT_STATES, states(['gripper'], [0.1])),
-    (topics.JOINT_STATES, states(JOINTS[:1], [0.1])),
     (topics.JOINT_STATES, states(JOINTS, [NAN, INF])),
     (topics.JOINT_STATES, states(JOINTS, [1e308, -1e308])),
-    (topics.JOINT_STATES, states(JOINTS, [0.1])),
     (topics.JOINT_STATES, states([*JOINTS, 'joint1'], [0.1, 0.2, 0.3])),
     (topics.TRACKING_ERROR, states(JOINTS, [INF, -INF])),
-    (topics.TRACKING_ERROR, states(['gripper'], [0.1])),
     (topics.BOUND, states(JOINTS, [0.0, -1.0])),
     (topics.MONITOR, states(['lambda_min', 'tool_error'], [1e308, INF])),
     (topics.TRUTH, states(['load mass'], [1e308])),
     (topics.CHANGES, text('x')),
-    (topics.CHANGES, text([1])),
     (topics.CHANGES, text('[' * 100_000)),
-    (topics.CHANGES, text({'parameters': {'load.payload': 1.0}})),
     (topics.CHANGES, change(stamp='now', parameters={'load.payload': 1.0})),
     (topics.CHANGES, text('{"stamp": 1e999, "parameters": {"load.payload": 1}}')),
     (topics.CHANGES, change(parameters=[1])),
     (topics.CHANGES, change(configured=True, parameters={'arm.l1': 'long'})),
-    (topics.CHANGES, change(configured=True, parameters={'arm.l1': None})),
     (topics.CHANGES, change(configured=True, parameters={'arm.l1': 1e308})),
     (topics.CHANGES, change(parameters={'events.begin': 3})),
-    (
-        topics.CHANGES,
-        change(parameters={'events.begin': ['soon'], 'events.payload': {}}),
-    ),
     (
         topics.CHANGES,
         change(parameters={'events.begin': [1.0], 'events.payload': [None]}),
@@ -109,7 +96,6 @@ ODD = [
     (topics.JOURNAL, text('x')),
     (topics.JOURNAL, event('nothing known')),
     (topics.JOURNAL, event('contact')),
-    (topics.JOURNAL, event('configure')),
     (topics.JOURNAL, event('configure', parameters={'nonsense': 1})),
     (topics.JOURNAL, event('configure', parameters={'law': '/nowhere/law.py'})),
     (topics.JOURNAL, event('configure', parameters={'robot.urdf': '/nowhere'})),
@@ -220,23 +206,6 @@ def test_bound_from_before_the_view_was_started_is_shown(watched):
     late.close()
 
 
-def test_bound_that_comes_before_the_journal_waits_for_it(ros, monkeypatch):
-    """The journal says which joints it is of."""
-    view = ros.add(ViewNode, port=18410)
-    given = [
-        (topics.BOUND, states(JOINTS, [0.5, 0.25])),
-        (topics.JOURNAL, text(configure()._asdict())),
-        (topics.JOINT_STATES, states(JOINTS, [0.1, 0.2], 1.0)),
-    ]
-    messages = [RawMessage(at, serialize_message(each), 0, 0, 0) for at, each in given]
-    subscriptions = view._raw_subscriptions
-    for message in messages:
-        monkeypatch.setattr(subscriptions, 'take', lambda message=message: [message])
-        view.update()
-    assert view.past[-1].bound.tolist() == [0.5, 0.25]
-    view.close()
-
-
 def test_comment_that_another_encoding_makes_a_document_type_stays_one():
     """Its entities can name files, and expand to gigabytes."""
     plain = urdf(JOINTS, (1.0, 1.0), (1.0, 1.0))
@@ -311,5 +280,5 @@ def test_visitor_gets_no_public_link(watched, port, monkeypatch):
 def test_release_of_viser_whose_requests_cannot_be_checked_serves_no_page(monkeypatch):
     elsewhere = SimpleNamespace(serve=None)
     monkeypatch.setattr('blf_dsc_controller.view.server.websockets', elsewhere)
-    with pytest.raises(BlfDscError, match=r'viser .* install viser 1\.1'):
+    with pytest.raises(blf.BlfDscError, match=r'viser .* install viser 1\.1'):
         Page('127.0.0.1', 18400)
