@@ -22,17 +22,15 @@ from ros_rig import PATIENCE
 from std_msgs.msg import String
 from test_nodes_process import NODES, arguments_of, launched, start  # noqa: F401 - fixtures
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load, load_loop
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load
 from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.endpoints import qos_profile
 from blf_dsc_controller.run import FIRST_STAMP
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
@@ -82,7 +80,7 @@ ROBOTS = pytest.mark.parametrize('robot', FACTS)
 @ROBOTS
 def test_file_has_the_joints_and_the_rate_of_the_driver(robot):
     facts = FACTS[robot]
-    loop = load_loop(facts.preset)
+    loop = blf.load_loop(facts.preset)
     for config in (loop.controller, loop.plant):
         assert config.joints == facts.joints
         assert config.sample_time == 1.0 / facts.rate
@@ -155,12 +153,12 @@ def test_parameter_file_of_the_page_runs_on_the_simulated_driver(
     for text in texts:
         file = tmp_path / 'my.yaml'
         file.write_text(text.replace('topic://robot_description', 'ur5e.urdf'))
-        config = load(file, '/blf_dsc_controller', ControllerConfig)
+        config = load(file, '/blf_dsc_controller', blf.ControllerConfig)
         if (config.joints[0], config.sample_time) == (joint, 1.0 / rate):
             found.append(config)
     (law,) = found
     given = {'duration': 4.0, 'events.begin': [1.0], 'events.duration': [0.0]}
-    run = simulate(law, change(load_loop(preset).plant, given)).run()
+    run = blf.simulate(law, blf.change(blf.load_loop(preset).plant, given)).run()
     assert run.stops == ()
     assert np.abs(run.error).max() < 0.05
 
@@ -170,7 +168,7 @@ def test_parameter_files_of_the_pages_on_robots_get_no_warning(tmp_path):
     for text in (block.content for block in fences() if 'urdf:' in block.content):
         file = tmp_path / 'my.yaml'
         file.write_text(text.replace('topic://robot_description', 'ur5e.urdf'))
-        config = load(file, CONTROLLER, ControllerConfig)
+        config = load(file, CONTROLLER, blf.ControllerConfig)
         if load(file, DRIVE, DriveConfig).feedback == 'motor':
             config = as_in_motors(config)
         assert config_warnings(config) == []
@@ -178,27 +176,26 @@ def test_parameter_files_of_the_pages_on_robots_get_no_warning(tmp_path):
 
 def test_repeated_reading_does_not_make_the_torque_of_the_ur5e_jump():
     """It looks like a joint that stops for 2 ms: once 222 N m without a rate limit, usually 8."""
-    loop = load_loop('ur5e_driver')
-    law = change(loop.controller, {'torque.rate_limit': [0.0] * 6})
+    loop = blf.load_loop('ur5e_driver')
+    law = blf.change(loop.controller, {'torque.rate_limit': [0.0] * 6})
     steps = []
     for every in (0, 100):
-        plant = change(loop.plant, {'duration': 5.0, 'sensor.repeat_every': every})
-        torques = simulate(law, plant).run().torque[500:]
+        plant = blf.change(loop.plant, {'duration': 5.0, 'sensor.repeat_every': every})
+        torques = blf.simulate(law, plant).run().torque[500:]
         steps.append(np.abs(np.diff(torques, axis=0)).max())
     assert steps[1] < 1.5 * steps[0]
 
 
 @ROBOTS
-@pytest.mark.parametrize('lost', [1, 3])
-def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
-    """In a row, twenty times a second or more.
+def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot):
+    """Three in a row, twenty times a second or more.
 
     2 kg are picked up at 4 s, and put down at 7 s.
     """
-    loop = load_loop(FACTS[robot].preset)
+    loop = blf.load_loop(FACTS[robot].preset)
     events = {'events.begin': [4.0], 'events.duration': [3.0]}
     guard = Guard(loop.controller)
-    plant = plant_of(change(loop.plant, events))
+    plant = plant_of(blf.change(loop.plant, events))
     guard.starting.activate()
     ratio = 0.0
     random = np.random.default_rng(0)
@@ -209,7 +206,7 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot, lost):
         )
         if left == 0:
             applied = torque.copy()
-            left = lost if random.random() < 0.05 else 0
+            left = 3 if random.random() < 0.05 else 0
         else:
             left -= 1
         plant.step(applied)

@@ -42,11 +42,10 @@ pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
 import recorded_run
 from recorded_run import raw_records
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.unpacking import unpacked
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.files import share_folder
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import JOURNAL
 
@@ -165,7 +164,7 @@ def test_names_are_survived(name):
             assert message_class(name).__module__.split('.')[0] == name.split('/')[0]
         with contextlib.suppress(UnknownTypeError):
             register_definition(name)
-        with contextlib.suppress(BlfDscError):
+        with contextlib.suppress(blf.BlfDscError):
             NameMap.parse([name, f'joint1={name}'])
 
 
@@ -196,7 +195,7 @@ def read(bag, way):
     """Read a bag in one of several ways."""
     out = bag.parent / 'out'
     if way == 'part':
-        with contextlib.suppress(BlfDscError), open_bag(bag) as opened:
+        with contextlib.suppress(blf.BlfDscError), open_bag(bag) as opened:
             list(opened.messages(opened.counts))
     elif way == 'replay':
         command('replay', bag)
@@ -205,7 +204,7 @@ def read(bag, way):
     elif way == 'pictures':
         command('report', bag, '--png', out)
     elif way == 'identify':
-        urdf = share_folder() / 'config' / 'two_link.urdf'
+        urdf = blf.share_folder() / 'config' / 'two_link.urdf'
         command('identify', bag, '--urdf', urdf, '--out', bag.parent / 'out.urdf')
     elif way == 'export':
         command('export', bag, '--out', bag.parent / 'out.csv')
@@ -500,15 +499,12 @@ def test_structure_of_the_journal_is_survived(data, way):
 )
 def test_parameters_are_survived(data, preset):
     """Parameter files: other values; lines repeated, removed or extended."""
-    text = (share_folder() / 'config' / f'{preset}.yaml').read_text()
+    text = (blf.share_folder() / 'config' / f'{preset}.yaml').read_text()
     with folder() as inside:
         path = inside / 'given.yaml'
         path.write_bytes(damaged(data, text))
-        with bounded():
-            from blf_dsc_controller.configuration.nodes import load_loop
-
-            with contextlib.suppress(BlfDscError):
-                load_loop(path)
+        with bounded(), contextlib.suppress(blf.BlfDscError):
+            blf.load_loop(path)
 
 
 NUMBERS_OF_XML = st.one_of(
@@ -538,7 +534,7 @@ def test_urdfs_are_survived(data, arm):
 
     Those removed or repeated.
     """
-    root = ET.fromstring((share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
+    root = ET.fromstring((blf.share_folder() / 'config' / f'{arm}.urdf').read_text())  # noqa: S314 - ours
     values = sorted(
         {value for element in root.iter() for value in element.attrib.values()}
     )
@@ -570,10 +566,8 @@ def test_urdfs_are_survived(data, arm):
             f'    barrier: {{bound: {[0.005] * (7 if arm == "panda" else 6)}}}\n'
         )
         with bounded():
-            from blf_dsc_controller.configuration.nodes import load_loop
-
-            with contextlib.suppress(BlfDscError):
-                load_loop(given_file)
+            with contextlib.suppress(blf.BlfDscError):
+                blf.load_loop(given_file)
             command('identify', base(), '--urdf', path, '--out', inside / 'out.urdf')
 
 

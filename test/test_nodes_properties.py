@@ -21,9 +21,8 @@ from rclpy.parameter import Parameter
 from ros_rig import START
 from std_srvs.srv import Trigger
 
+import blf_dsc_controller as blf
 from blf_dsc_controller.configuration import schema
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
@@ -88,7 +87,7 @@ VALUES = {
 }
 LIVE = {
     each.name: VALUES[each.kind]
-    for config in (ControllerConfig, PlantConfig)
+    for config in (blf.ControllerConfig, blf.PlantConfig)
     for each in schema.parameters(config)
     if not each.read_only
 }

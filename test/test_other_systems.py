@@ -14,7 +14,6 @@ from blf_dsc_controller.cli import computer, domains
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.control.realtime import request_realtime
-from blf_dsc_controller.errors import BlfDscError, DriveError
 
 COMPILED = 10 * PATIENCE
 
@@ -63,7 +62,7 @@ def test_a_run_over_ros_is_refused_elsewhere_with_what_to_do(tmp_path, capsys):
     assert main(['run', '--out', str(tmp_path / 'out')]) == 1
     told = capsys.readouterr().err
     assert 'on Linux only: run with --offline' in told
-    with pytest.raises(BlfDscError, match='ros2 run'):
+    with pytest.raises(blf.BlfDscError, match='ros2 run'):
         domains.check_network()
 
 
@@ -85,5 +84,5 @@ def test_the_self_check_leaves_out_what_only_linux_has(monkeypatch):
 
 def test_a_drive_without_processes_that_inherit_sockets_names_another_way(monkeypatch):
     monkeypatch.setattr('os.name', 'nt')
-    with pytest.raises(DriveError, match='use ArmController in a loop of yours'):
+    with pytest.raises(blf.DriveError, match='use ArmController in a loop of yours'):
         blf.Drive('panda', robot='simulated')
