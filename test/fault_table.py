@@ -19,9 +19,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change, flatten
+from blf_dsc_controller import (
+    ControllerConfig,
+    Phase,
+    PlantConfig,
+    TrajectoryError,
+    TrajectoryPoint,
+    change,
+)
+from blf_dsc_controller.configuration.schema import build, flatten
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
@@ -29,14 +35,10 @@ from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
 )
 from blf_dsc_controller.messages.errors import MessageError
-from blf_dsc_controller.reference.trajectory import (
-    Trajectory,
-    TrajectoryError,
-    TrajectoryPoint,
-)
+from blf_dsc_controller.reference.trajectory import Trajectory
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.state_watchdog import PERIOD
-from blf_dsc_controller.supervision.supervisor import Phase, Reason
+from blf_dsc_controller.supervision.supervisor import Reason
 from sim_plant.plant import plant_of
 from sim_plant.torque_input import TorqueInput
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import change
 from blf_dsc_controller.arms.inertia import inertia_of, moved
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.supervision.body_warnings import body_warnings
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 

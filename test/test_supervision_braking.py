@@ -6,10 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller import load_loop
+from blf_dsc_controller import ControllerConfig, change, load_loop
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
 

@@ -11,11 +11,10 @@ from paper_case import NO_DISTURBANCE, P, configured, run
 from scenario import carrying
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import ControllerConfig, change, load_loop
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load, load_loop, locate
+from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.configuration.robot import read_urdf
-from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import (

@@ -6,14 +6,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blf_dsc_controller import load_loop, simulate
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller import (
+    ConfigurationError,
+    ControllerConfig,
+    change,
+    load_loop,
+    simulate,
+)
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.expected_errors import expected_errors
 
 UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
 GAINS = {
@@ -39,42 +42,6 @@ def test_an_arm_of_which_nothing_is_known_is_held_softly_and_says_so():
     assert warning.startswith('feedback.joint_stiffness: nothing is known of the gears')
 
 
-def test_default_bound_has_room_for_friction_that_nobody_knows():
-    """5 % of the rated torque of 150 N m, of joints whose friction is not known."""
-    known = {'robot.coulomb': [6.0, 0.0, 6.0, 0.0, 1.1, 1.1]}
-    drives = {
-        'robot.drive_compensates': 'gravity_and_friction',
-        'robot.drive_payload': 0.0,
-    }
-    unknown, partly, compensated = (
-        np.array(built(**GAINS, **each).barrier.bound) for each in ({}, known, drives)
-    )
-    stiffness = np.array(GAINS['feedback.joint_stiffness'])
-    room = 1.5 * 0.05 * np.array([150.0] * 3 + [28.0] * 3) / stiffness
-    np.testing.assert_allclose(unknown - compensated, room, atol=1e-4)
-    np.testing.assert_allclose(unknown - partly, room * [1, 0, 1, 0, 1, 1], atol=1e-4)
-
-
-def test_errors_to_expect_count_friction_that_nobody_knows():
-    """7.5 N m of 150 in the shoulder, with either sign, over 900 N m/rad."""
-    slow = {**GAINS, 'disturbance.gain': [1e-3] * 6}
-    little, unknown = (
-        built(**slow, **given) for given in ({'robot.coulomb': [0.1] * 6}, {})
-    )
-    before, after = (
-        expected_errors(each, settings_of_config(each)).unmodelled
-        for each in (little, unknown)
-    )
-    more = 0.75 * 3.0 * 0.05 * np.array([150.0] * 3 + [28.0] * 3)
-    more /= GAINS['feedback.joint_stiffness']
-    np.testing.assert_allclose(after - before, more, rtol=0.3)
-    tight = built(**GAINS, **{'barrier.bound': [0.01] * 6})
-    told = '\n'.join(config_warnings(tight))
-    assert 'friction (5 % of the rated torque without robot.coulomb) and unmod' in told
-    given = built(**GAINS, **{'barrier.bound': [0.01] * 6, 'robot.coulomb': [9.0] * 6})
-    assert 'friction and unmodelled torque' in '\n'.join(config_warnings(given))
-
-
 def test_an_arm_of_which_nothing_is_known_begins_its_motion():
     """A UR5e with 9 N m of friction at rest, of which its file says nothing."""
     loop = load_loop('ur5e')
@@ -87,18 +54,6 @@ def test_an_arm_of_which_nothing_is_known_begins_its_motion():
     run = simulate(built(**moves), plant).run()
     assert not run.stops
     assert not run.oscillations
-
-
-def test_given_gains_of_joints_are_used_and_scaled():
-    config = built(**GAINS)
-    gains = law_gains(config)
-    assert gains.feedback == (60.0,) * 3 + (16.0,) * 3
-    assert not [text for text in config_warnings(config) if 'softly' in text]
-    half = law_gains(built(**GAINS, **{'feedback.stiffness': 0.5}))
-    assert half.feedback == (30.0,) * 3 + (8.0,) * 3
-    assert half.surface == gains.surface  # stiffness and damping, not their ratio
-    weights = np.array((gains.weight, half.weight))
-    np.testing.assert_allclose(weights[1], 0.5 * weights[0], rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -141,22 +96,11 @@ def test_known_gears_choose_the_gains_and_bear_them():
     assert not [text for text in config_warnings(known) if 'joint_stiffness' in text]
 
 
-def test_a_torque_loop_allows_feedback_through_the_inertia():
-    config = built(**GEARS, **{'robot.torque_loop': True})
-    assert config.feedback.inertia == 'whole'
-    assert 0.05 < config.feedback.stiffness < 1.0
-
-
 def test_gains_that_known_gears_do_not_bear_are_warned_of_with_the_frequency():
     config = built(**GEARS, **GAINS, **{'feedback.stiffness': 4.0})
     (warning,) = (text for text in config_warnings(config) if 'modulus margin' in text)
     assert warning.startswith('feedback.stiffness: with robot.joint_stiffness the loop')
     assert ' Hz, ' in warning
-
-
-def test_older_laws_keep_their_feedback_through_the_inertia():
-    assert built(law='slotine_li').feedback.inertia == 'whole'
-    assert build(ControllerConfig, {}).feedback.inertia == 'surface'
 
 
 def test_adaptation_integrates_no_faster_than_the_disturbance_estimate():

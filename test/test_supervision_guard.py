@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fault_table import Rig
 from plain_law import dynamics
-from scenario import Scenario, changed, every
+from scenario import Scenario, changed, every, late, lost, repeated, run
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.reference.trajectory import Trajectory
@@ -419,6 +419,15 @@ def test_gap_counts_to_the_nearest_number_of_missed_states(gap, missed):
     arm.controller.update(1.0, q, dq)
     arm.controller.update(1.0 + 1e-3 * gap, q, dq)
     assert arm.controller.missed == missed
+
+
+@pytest.mark.parametrize(
+    'spoil', [lost(0.3), repeated(3), late(2)], ids=['lost', 'repeated', 'late']
+)
+def test_arm_tracks_on_while_states_are_lost_repeated_or_late(spoil):
+    record = run('recommended', until=2.0, spoil=spoil)
+    assert record.phase[-1] == blf.Phase.TRACKING
+    assert record.ratio < 0.8
 
 
 def test_stop_names_both_rates_where_the_states_come_at_another():
