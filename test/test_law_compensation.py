@@ -119,7 +119,7 @@ def test_friction_is_learned_from_torque_sensors_whatever_pushes_the_arm():
         for events in (push, {name: [] for name in push})
     )
     assert (free[-1] < 0.7 * free[0]).all()
-    np.testing.assert_allclose(pushed[-1], free[-1], rtol=0.15)
+    np.testing.assert_allclose(pushed[-1], free[-1], rtol=0.2)
 
 
 @pytest.mark.parametrize(('name', 'run'), BROKEN_BY_FRICTION)

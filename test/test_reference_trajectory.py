@@ -341,6 +341,22 @@ def test_path_that_is_too_fast_is_stretched_and_passes_its_points_in_order():
     np.testing.assert_allclose(at(motion.vector, motion.end)[0], GOALS[-1], atol=1e-9)
 
 
+def test_path_is_stretched_no_more_than_the_limits_ask_for():
+    """From rest: its velocities are those that were sent, over the factor of its times."""
+    still = pack(2, [minimum_jerk(np.zeros(1), GOALS[:1])])
+    times = np.array([0.4, 0.8, 1.2])
+    rates = np.diff(GOALS, axis=0, prepend=GOALS[:1]) / 0.4
+    motion = plan(trajectory((GOALS, rates), times=times.tolist()), still, 0.0)
+    factor = motion.end / times[-1]
+    assert factor > 1.5
+    for k in (1, 2):
+        q, dq, _ = at(motion.vector, np.nextafter(factor * times[k], 0.0))
+        np.testing.assert_allclose(q, GOALS[k], atol=1e-6)
+        np.testing.assert_allclose(dq, rates[k] / factor, atol=1e-5)
+    # each try is 1 % slower than needed (`_MARGIN`)
+    assert max(limits_used(motion, 0.0, motion.end)) > 0.95
+
+
 def test_path_that_is_only_too_fast_is_stretched_by_the_ratio_of_its_velocity():
     """Over 3 rad within 3 s, by minimum jerk: at most 1.875 rad/s of 1.5, 1.9 rad/s^2 of 6."""
     at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
