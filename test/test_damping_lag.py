@@ -102,10 +102,14 @@ def test_joints_have_the_torques_of_laws_that_have_their_lag_at_all_joints(confi
 
 
 def test_the_lag_begins_anew_with_the_first_sample_after_a_reset(config):
+    """It damps what it finds, as a law without a lag does."""
     law = blf.controller_of(config)
+    prompt = blf.controller_of(blf.change(config, of_joints(*(0.0,) * 6)))
     qr = np.array(config.reference.offset)
     rest, moving = np.zeros(12), np.concatenate((np.full(6, 0.1), np.zeros(6)))
     first = law.update(0.0, T, np.concatenate((qr, moving))).copy()
+    at_once = prompt.update(0.0, T, np.concatenate((qr, moving)))
+    np.testing.assert_array_equal(first, at_once)
     for k in range(1, 5):
         law.update(k * T, T, np.concatenate((qr, rest)))
     law.reset()
@@ -118,8 +122,9 @@ def test_gains_that_change_leave_no_part_of_a_jump_behind(config):
     law = blf.controller_of(config)
     off = np.concatenate((np.add(config.reference.offset, 2e-3), np.zeros(12)))
     torques = [law.update(k * T, T, off).copy() for k in range(200)]
-    wider = [1.2 * each for each in config.barrier.bound]
-    apply_bumpless(law, blf.change(config, {'barrier.bound': wider}), 0.199, off)
+    stiffer = [1.2 * each for each in config.feedback.joint_stiffness]
+    other = blf.change(config, {'feedback.joint_stiffness': stiffer})
+    apply_bumpless(law, other, 0.199, off)
     torques += [law.update(k * T, T, off).copy() for k in range(200, 220)]
     steps = np.abs(np.diff(torques[150:], axis=0)).max(axis=1)
     assert steps[49:].max() < 1.3 * steps[:49].max()  # N m: the integral goes on
