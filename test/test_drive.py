@@ -153,16 +153,10 @@ def test_what_the_start_and_a_driver_advise_ends_with_an_arm_that_moves():
     """A simulated FR3 whose efforts lack gravity, though its driver knows that they have it."""
     facts = simulated(loop_of('fr3_direct').plant).facts
     lacking = {'robot.effort': 'commanded'}
-    advice = r'set robot\.effort to commanded and disturbance\.observer_bandwidth to 0'
+    advice = r'set robot\.effort to commanded, or set safety'
     with pytest.raises(blf.StartError, match=advice) as refused:
         run('fr3_direct', 0.01, {}, {}, lacking)
-    given = loop_of('fr3_direct').controller
-    # one of the two alone is refused, with the other
-    with pytest.raises(
-        blf.ConfigurationError, match=r'or set disturbance\.observer_bandwidth: 0'
-    ):
-        blf.change(given, lacking)
-    config = blf.change(given, lacking | {'disturbance.observer_bandwidth': 0.0})
+    config = blf.change(loop_of('fr3_direct').controller, lacking)
     (problem,) = disagreements(facts, config)
     assert 'of this robot it is whole: write whole' in problem
     sends = 'set safety.first_torque: send'

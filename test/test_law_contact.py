@@ -12,14 +12,12 @@ from law_part import part as part_of
 from blf_dsc_controller.law import contact
 from blf_dsc_controller.law.contact import (
     EXPLAINED,
-    QUIET,
     TOUCHED,
     Seen,
     Settings,
     State,
     TipLoad,
     Work,
-    next_phase,
 )
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 
@@ -40,31 +38,6 @@ def state():
     state = part(State)
     contact.forget_load(state)
     return state
-
-
-@pytest.mark.parametrize(
-    ('phase', 'distance', 'remaining', 'calm', 'explained', 'expected'),
-    [
-        (QUIET, 0.9 * H, 0.9 * H, 9.0, 0.0, QUIET),
-        (QUIET, 1.1 * H, 1.1 * H, 0.0, 0.0, TOUCHED),  # no load explains it
-        (QUIET, 1.1 * H, 0.9 * H, 0.0, 0.0, EXPLAINED),
-        (EXPLAINED, 1.1 * H, 0.9 * H, 0.0, 0.0, EXPLAINED),
-        (EXPLAINED, 1.1 * H, 1.1 * H, 0.0, 0.0, TOUCHED),  # the load no longer does
-        (EXPLAINED, 0.9 * H, 0.9 * H, 0.001, 0.0, QUIET),
-        # a contact ends below half of the threshold, after 0.2 s
-        (TOUCHED, 0.6 * H, 0.6 * H, 0.0, 0.0, TOUCHED),
-        (TOUCHED, 0.4 * H, 0.4 * H, 0.19, 0.0, TOUCHED),
-        (TOUCHED, 0.4 * H, 0.4 * H, 0.21, 0.0, QUIET),
-        # or once a load has explained it for 0.5 s
-        (TOUCHED, 1.1 * H, 0.9 * H, 0.0, 0.49, TOUCHED),
-        (TOUCHED, 1.1 * H, 0.9 * H, 0.0, 0.51, EXPLAINED),
-        (TOUCHED, 1.1 * H, 1.1 * H, 0.0, 0.51, TOUCHED),
-    ],
-)
-def test_phase_follows_from_distances_and_times(
-    phase, distance, remaining, calm, explained, expected
-):
-    assert next_phase(phase, distance, remaining, calm, explained, H) == expected
 
 
 def update(state, r, load, seconds, settings=SETTINGS, dt=DT):
@@ -129,15 +102,6 @@ def test_load_must_explain_a_contact_without_a_break(state):
     assert state.phase[0] == EXPLAINED
 
 
-@pytest.mark.parametrize('r', [[0.0, 0.0], [0.0, 10.0]])
-def test_load_is_forgotten_once_r_is_small_or_of_something_else(state, r):
-    update(state, [-10.0, 0.0], tip(0.0, 0.0), 0.1)
-    assert state.load[0] > 0.1
-    update(state, r, tip(0.0, 0.0), DT)
-    assert not state.load.any()
-    np.testing.assert_array_equal(state.load_covariance, np.eye(10))
-
-
 def test_only_a_contact_is_explained_by_a_load(state):
     """A load that is held says nothing of what touches the arm later."""
     update(state, [-10.0, 0.0], tip(0.0, 0.0), 1.0)
@@ -145,25 +109,6 @@ def test_only_a_contact_is_explained_by_a_load(state):
     update(state, [0.0, 10.0], tip(0.0, 0.0), DT)
     update(state, [-10.0, 0.0], tip(0.0, 0.0), 0.4)
     assert contact.is_touched(state)
-
-
-@pytest.mark.parametrize(
-    ('mass', 'deviation', 'variance', 'expected'),
-    [
-        (1.0, 0.0, 0.01, True),  # 1 kg less 1.5 kg: five deviations below nothing
-        (1.0, 0.0, 0.04, False),  # 2.5
-        (1.0, 0.2, 0.0, False),
-        (1.0, 0.2, 0.01, False),
-        (1.0, 0.1, 0.0, True),
-        (1.6, 0.0, 0.01, False),
-    ],
-)
-def test_mass_is_negative_beyond_three_deviations_of_what_is_held_and_of_the_load(
-    state, mass, deviation, variance, expected
-):
-    state.load[0] = -1.5
-    state.load_covariance[0, 0] = variance
-    assert contact.takes_away_too_much(state, tip(mass, deviation)) == expected
 
 
 def test_load_is_filtered_from_r_as_by_bayes(state):
@@ -183,15 +128,6 @@ def test_load_is_filtered_from_r_as_by_bayes(state):
     K = P @ C.T @ np.linalg.inv(S + 4.0 * np.eye(N))
     np.testing.assert_allclose(state.load, z + K @ e)
     np.testing.assert_allclose(state.load_covariance, P - K @ C @ P, atol=1e-12)
-
-
-def test_load_that_nothing_shows_any_longer_returns_to_its_prior(state):
-    """A tenth of the way in 0.1 s."""
-    state.load[:], state.load_covariance[:] = 1.0, 0.0
-    far = contact.filter_load(state, part(Work), np.array([3.0, 4.0]), 0.1)
-    assert far == 5.0  # no column explains anything
-    np.testing.assert_allclose(state.load, 0.9)
-    np.testing.assert_allclose(state.load_covariance, 0.1 * np.eye(10))
 
 
 def test_columns_of_the_load_are_whitened_as_r_is():

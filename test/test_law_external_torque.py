@@ -86,29 +86,6 @@ def test_distance_is_that_of_the_covariance_by_theta_and_noise(state):
         )
 
 
-def test_prior_is_that_of_theta_and_of_unmodelled_torque():
-    state = part(State)
-    information = np.diag([4.0, 1.0, 0.25])
-    external_torque.begin(SETTINGS, state, information)
-    state.filtered[0, 0] = 1.0  # whose standard deviation is 0.5
-    external_torque.update_spread(SETTINGS, state, part(Work), np.zeros(M))
-    np.testing.assert_allclose(np.diag(state.covariance), [0.25, 0.0])
-    np.testing.assert_allclose(state.noise, [[0.25, 0.01]] * 3)
-
-
-def test_joint_counts_as_reversing_until_its_filter_has_settled():
-    """Below 1.5 times 0.02 rad/s, and for 3 / L = 0.1 s after."""
-    state = part(State)
-    external_torque.follow_reversals(SETTINGS, state, np.array([0.029, 0.031]), DT)
-    assert [external_torque.regime(SETTINGS, state, i) for i in range(N)] == [1, 0]
-    for _ in range(99):
-        external_torque.follow_reversals(SETTINGS, state, np.array([-0.1, 0.1]), DT)
-    assert external_torque.regime(SETTINGS, state, 0) == 1
-    for _ in range(2):
-        external_torque.follow_reversals(SETTINGS, state, np.array([-0.1, 0.1]), DT)
-    assert external_torque.regime(SETTINGS, state, 0) == 0
-
-
 @pytest.mark.parametrize('is_touched', [False, True])
 def test_noise_is_measured_while_nothing_touches(state, is_touched):
     """The mean square of r = 0.5 N m, within 10 % after a window: e^-1 of 1 % is assumed."""
@@ -160,36 +137,6 @@ def test_noise_is_what_the_covariance_by_theta_leaves_up_to_four_times_what_it_w
                 update_noise(state, part(Work))
                 expected = 0.3 + (left - 0.3) / count
                 np.testing.assert_allclose(state.noise[k], expected, rtol=1e-9)
-
-
-def test_noise_is_measured_from_the_first_window_on(state):
-    state.latch_time[0] = 0.0
-    update_noise(state, part(Work))
-    assert not state.samples.any()
-    state.latch_time[0] = 1.0
-    assert not external_torque.is_settled(state, DT)
-    for _ in range(500):  # 0.5 s
-        update_noise(state, part(Work))
-    assert external_torque.is_settled(state, DT)
-
-
-def test_arm_counts_as_resting_once_its_filter_has_settled():
-    """All joints below 0.005 times 0.02 rad/s for 3 / L = 0.1 s; it begins to move at once."""
-    state = part(State)
-    state.held[0] = 1.0
-    for speeds, expected in (([0.9e-4, 1.1e-4], 1), ([0.9e-4, 0.9e-4], 2)):
-        for _ in range(102):
-            external_torque.follow_reversals(SETTINGS, state, np.array(speeds), DT)
-        for i in range(N):
-            assert external_torque.regime(SETTINGS, state, i) == expected
-    moving = np.array([0.0, 0.01])
-    state.held[0] = 1.0
-    assert external_torque.follow_reversals(SETTINGS, state, moving, DT)
-    assert not external_torque.follow_reversals(SETTINGS, state, moving, DT)
-    assert external_torque.regime(SETTINGS, state, 0) == 1
-    for _ in range(98):
-        external_torque.follow_reversals(SETTINGS, state, moving, DT)
-    assert state.held[0] == pytest.approx(np.exp(-3.0), rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -256,16 +203,6 @@ def test_tare_is_zero_where_the_arm_rests(tared):
     np.testing.assert_allclose(deviations, 0.1 * SETTINGS.unmodelled)  # the least
 
 
-def test_tare_after_a_tare_is_of_the_whole_torque(state):
-    state.filtered[:, M] = -3.0, 1.0
-    for u in ([-3.0, 1.0], [-5.0, 4.0]):
-        state.filtered[:, M] = u
-        external_torque.update_torque(state, np.zeros(M))
-        external_torque.tare(state, 0.0)
-        external_torque.update_torque(state, np.zeros(M))
-        np.testing.assert_allclose(state.torque, 0.0, atol=1e-12)
-
-
 def test_tare_says_of_r_what_their_covariance_says(tared):
     """The conditional mean and covariance of Gaussian r given r_0, as numpy finds it."""
     state, estimate, A, X_0 = tared
@@ -286,15 +223,6 @@ def test_tare_says_of_r_what_their_covariance_says(tared):
         variance = external_torque.variance_of(SETTINGS, state, work, i)
         assert variance == pytest.approx(left[i, i])
         assert variance < S[i, i]
-
-
-def test_tare_is_forgotten_with_the_next_start(tared):
-    state, estimate, _, _ = tared
-    external_torque.update_spread(SETTINGS, state, part(Work), estimate)
-    assert state.offset.any()
-    external_torque.begin(SETTINGS, state, np.eye(M))
-    assert state.tared[0] == 0.0
-    assert not state.offset.any()
 
 
 def test_rest_after_a_tare_says_nothing_of_the_noise(tared):

@@ -298,13 +298,12 @@ def _lag(config: ControllerConfig, found: Findings) -> float:
 def _sensed_loops(
     config: ControllerConfig, arm: Design, loops: Loops, lag: float
 ) -> SensedLoops | None:
-    """Return the loops with joint torque sensors, if the law uses them and all runs have efforts.
+    """Return the loops with joint torque sensors, if there are any and all runs have efforts.
 
     `lag` [s] is that of velocities and torques together.
     """
     sensed = tuple(each.sensed for each in loops.responses if each.sensed is not None)
-    is_used = config.disturbance.observer_bandwidth > 0.0
-    if not is_used or len(sensed) < len(loops.responses):
+    if not config.has_torque_sensors or len(sensed) < len(loops.responses):
         return None
     postures = np.array([each.posture for each in loops.responses])
     P_l = arm.parameters.of(arm.chain.inertias, np.zeros_like(arm.rotors))

@@ -10,7 +10,7 @@ F_L is the pole, F_s the lag of velocities, which efforts wait for, and D the di
 of a sample.  As r is faster, I + L comes nearer to being singular where gears resonate: an arm
 whose r shakes has next to no modulus margin there.  So poles are tried from slow to fast as long as
 `ENOUGH` is left, and `BARELY` with noise counted against it.  That is less than the gains alone
-must have, since r that shakes all the same becomes slower by itself, and a slow r costs accuracy.
+must have, since r that oscillates all the same is left out, and a slow r costs accuracy.
 
 Below `RESONANT`, r makes an arm that holds an unknown load as light as the model: of its torque
 no more than M_l / M is left, by design, whatever the pole.  There `BARELY` is enough, noise not

@@ -25,7 +25,6 @@ from blf_dsc_controller.configuration.law_traits import (
     GAINS,
     LAWS,
     OWN,
-    has_exact_rows,
 )
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
@@ -35,8 +34,6 @@ from blf_dsc_controller.configuration.robot import (
     parameters_of,
 )
 from blf_dsc_controller.configuration.schema import Value, parameters
-
-_OBSERVER = 150.0  # rad/s, below the drives' own loops
 
 
 def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
@@ -53,7 +50,6 @@ def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
     return {
         **described(robot, chain),
         'feedback.stiffness': arm.stiffness,
-        'disturbance.observer_bandwidth': _observer_bandwidth(given, robot, arm),
         **usual,
         **_gains_of_law(given, arm),
     }
@@ -108,16 +104,6 @@ def stated_design(
         given.get('sample_time', ArmConfig.sample_time),
     )
     return arm, gears
-
-
-def _observer_bandwidth(
-    given: Mapping[str, Any], robot: Robot, arm: tuning.Design
-) -> float:
-    """Return the pole of the load observer of an arm with joint torque sensors [rad/s]; else 0."""
-    has_sensors = robot.torque_loop and robot.effort == 'whole'
-    is_own = given.get('law', LAWS[0]) in OWN and has_exact_rows(given)
-    is_soft = arm.joints is not None
-    return _OBSERVER if has_sensors and is_own and is_soft else 0.0
 
 
 def _gears(robot: Robot, chain: Chain, motors: np.ndarray) -> Gears | None:

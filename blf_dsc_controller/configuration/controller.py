@@ -125,7 +125,6 @@ class ControllerConfig(ArmConfig):
         needed, count = self._sizes()
         yield from self._drive_load_problems()
         yield from self._contact_problems()
-        yield from self._observer_problems()
         yield from self._stiffness_problems()
         yield from self.arm_problems(f'model {self.model}', needed)
         yield from self.reference.problems()
@@ -156,6 +155,18 @@ class ControllerConfig(ArmConfig):
         """Whether friction that grows with the load is learned: a torque loop hides it."""
         is_soft = self.law in OWN and self.feedback.inertia == 'none'
         return self.weighs and is_soft and not self.robot.torque_loop
+
+    @property
+    def has_torque_sensors(self) -> bool:
+        """Whether efforts are said to be of joint torque sensors, for a law that uses them."""
+        says = self.robot.torque_loop and self.robot.effort == 'whole'
+        is_own = self.law in OWN and self.model == 'urdf'
+        return says and is_own and self._has_exact_rows()
+
+    @property
+    def observes_load(self) -> bool:
+        """Whether the load is observed by joint torque sensors."""
+        return self.disturbance.observer_bandwidth > 0.0 and self.has_torque_sensors
 
     def _has_exact_rows(self) -> bool:
         """Whether loads and contacts show in the rows that the law learns from."""
@@ -202,24 +213,6 @@ class ControllerConfig(ArmConfig):
             yield (
                 f'contact.reaction: got {contact.reaction}, but without contact.enabled nothing '
                 'finds contacts: set it to true'
-            )
-
-    def _observer_problems(self) -> Iterator[str]:
-        """Check that there are sensors for the load observer, and rows of the motion."""
-        bandwidth = self.disturbance.observer_bandwidth
-        has_sensors = self.robot.torque_loop and self.robot.effort == 'whole'
-        if bandwidth > 0.0 and not has_sensors:
-            yield (
-                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with robot.torque_loop '
-                f'{str(self.robot.torque_loop).lower()} and robot.effort {self.robot.effort}, but '
-                'needs joint torque sensors, which efforts show: write true and whole, or set '
-                'disturbance.observer_bandwidth: 0.0'
-            )
-        is_own = self.law in OWN and self.model == 'urdf'
-        if bandwidth > 0.0 and not (is_own and self._has_exact_rows()):
-            yield (
-                f'disturbance.observer_bandwidth: got {bandwidth:g} rad/s with model {self.model} '
-                f'and {self._rows()}, but needs {LAWS[0]} and robot.urdf{_FILTERED}'
             )
 
     def _stiffness_problems(self) -> Iterator[str]:

@@ -189,8 +189,8 @@ class DisturbanceEstimate:
     observer_bandwidth: float = non_negative(
         0.0,
         'pole of the load observer, which adds what joint torque sensors show and the '
-        'model lacks; 0: none. The default of arms with robot.torque_loop, robot.effort '
-        'whole and feedback.inertia none is 150; commissioning chooses it by measurement',
+        'model lacks; 0: none. It needs robot.torque_loop and robot.effort whole; '
+        'commissioning proves the sensors, and chooses it by measurement',
         'rad/s',
         'L',
         read_only='it sets the size of the state of the law',

@@ -133,8 +133,9 @@ class FrankaDriver(Driver):
             )
         elif not self.controller.robot.torque_loop:
             yield (
-                'note: this robot has joint torque sensors. With robot.torque_loop: true the law '
-                'takes up loads by them, with a third of the error'
+                'note: this robot has joint torque sensors. With robot.torque_loop: true and the '
+                'disturbance.observer_bandwidth that `blf_dsc commission` gives, the law takes up '
+                'loads by them, with a third of the error'
             )
         known = self.controller.robot.drive_payload
         if self.config.set_load and abs(state.m_ee) > _SAME_MASS:

@@ -235,7 +235,7 @@ def _follows_inertia(config: ControllerConfig) -> bool:
 def _observer(config: ControllerConfig, p: int, lag: float) -> load_observer.Settings:
     """Return how the load is observed by joint torque sensors; `lag` [s] is that of the rows."""
     robot = config.robot
-    is_on = config.disturbance.observer_bandwidth > 0.0
+    is_on = config.observes_load
     rotors = np.zeros(p if is_on else 0)
     if is_on:
         chain = robot.chain(config.joints)

@@ -28,7 +28,7 @@ OSCILLATES = 32
 """The arm oscillates: at the beginning, and again and again while it lasts."""
 
 NOT_SENSORS = 64
-"""What joint torque sensors show is used less, or not at all: see `torque_sensors`."""
+"""The load observer is left out from now on: see `torque_sensors`."""
 
 
 class Checks(NamedTuple):

@@ -10,7 +10,12 @@ from math import isfinite
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import effect, kept_estimates, oscillation
+from blf_dsc_controller.law import (
+    effect,
+    kept_estimates,
+    oscillation,
+    torque_sensors,
+)
 from blf_dsc_controller.law.check_state import (
     NO_EFFECT,
     OUTSIDE,
@@ -120,9 +125,11 @@ def check_sample(
     if flags & SUSPECT != 0:
         return flags
     estimates = checks.estimates
-    kept_estimates.keep(
-        estimates, state.estimate, state.disturbance, state.observer.torque
-    )
+    is_sound = not torque_sensors.is_fading(state.observer.faded)
+    if is_sound:
+        kept_estimates.keep(
+            estimates, state.estimate, state.disturbance, state.observer.steady
+        )
     T = checks.sample_time[0]
     if not T > 0.0:
         return flags
@@ -138,9 +145,9 @@ def check_sample(
         dt=T,
     )
     effect.average_steps(checks.effect, now)
-    oscillates = may_oscillate(checks)
+    is_sound = is_sound and not may_oscillate(checks)
     scale = state.rotors.gain_scale
-    kept_estimates.keep_consistent(estimates, scale, ratio, oscillates, begins, T)
+    kept_estimates.keep_consistent(estimates, scale, ratio, is_sound, begins, T)
     is_missing, moves = effect.check_effect(
         settings.torque, checks.effect, checks.sensor, now
     )

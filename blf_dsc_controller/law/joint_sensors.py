@@ -2,7 +2,7 @@
 """What joint torque sensors show in each sample, in an arm that has them.
 
 load_observer     the torque on the links beyond the model's, which is added to the law's
-torque_sensors    whether efforts are those of such sensors: else it is left out
+torque_sensors    whether it may go on: else it is left out
 motor_friction    friction of the motors, which the sensors do not see
 
 `learning` calls these functions.  What they show is of an interval, by the row of
@@ -28,7 +28,7 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
     """Let `load_observer` find r by the row of the last interval, before its poles."""
     of, now, row = settings.observer, state.observer, signals.row.Xu
     if state.samples[0] <= 1.0:
-        load_observer.begin(of, now, state.disturbance)
+        load_observer.begin(now, state.disturbance)
     if load_observer.is_missing(signals.effort):
         return
     had_settled = load_observer.has_settled(of, now)
@@ -50,26 +50,18 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
 def check_sensors(
     settings: Settings, state: State, signals: Signals, begins: bool, dt: float
 ) -> None:
-    """Fade r out where efforts are not those of torque sensors at the links."""
+    """Fade r out where it oscillates, or efforts are not those of torque sensors."""
     of, now, work = state.observer, state.sensors, signals.sensors
     limit = settings.torque.limit
-    links = Links(state.estimate, settings.observer.rotors, state.motors.absorbed)
     for i in range(settings.n):
-        work.differences[0, i] = of.filtered[i, settings.p] - now.command[i]
-        if now.is_distinct[0] == 0.0:
-            work.differences[1, i] = load_observer.residual(of, i, links)
+        work.differences[i] = of.filtered[i, settings.p] - now.command[i]
     if begins:
         torque_sensors.begin(now, of.torque)
-    torque_sensors.watch_shaking(now, work, limit, of.torque, of.slowed, dt)
-    if settings.observer.most[0] > 0.0:  # else a load is left out of r
-        falls = begins or of.elapsed[0] < torque_sensors.FALLS
-        if torque_sensors.compare_with_commands(now, work, signals.dqr, falls, dt):
-            load_observer.end_caution(of)
+    torque_sensors.watch_shaking(now, work, limit, of.torque, dt)
     is_off = torque_sensors.watch_following(
         now, work, limit, signals.dq, signals.dqr, dt
     )
     torque_sensors.fade(now, of.faded, is_off, dt)
-    torque_sensors.calm(of.slowed, of.calmed, dt)
 
 
 @inner

@@ -3,7 +3,7 @@
 
 Commands that do not reach the arm make its error grow, and the disturbance estimate
 with it.  What is learned while the arm may oscillate, or while no joint moves, is as
-wrong.
+wrong; so is r of `load_observer` while it is being left out.
 """
 
 from typing import Annotated, NamedTuple
@@ -31,7 +31,7 @@ class State(NamedTuple):
 def keep(state: State, estimate: Array, disturbance: Array, observed: Array) -> None:
     """Keep the estimate (m,), and d^3 (n,) with r (n,), of a sample that is not suspect.
 
-    `observed` is r of `load_observer`, empty without sensors.
+    `observed` is the steady r of `load_observer`, empty without sensors.
     """
     m = estimate.size
     for j in range(m):
@@ -54,17 +54,18 @@ def keep_consistent(
     state: State,
     gain_scale: Array,
     ratio: float,
-    oscillates: bool,
+    is_sound: bool,
     begins: bool,
     dt: float,
 ) -> None:
     """Keep the estimates of the smallest recent error, whose largest |xi1| / k is `ratio`.
 
-    `gain_scale` (n,) is the measured inertia of each joint over the assumed.
+    `gain_scale` (n,) is the measured inertia of each joint over the assumed.  `is_sound`: the
+    arm does not oscillate, and r of `load_observer` is not in doubt.
     """
     least = state.least_ratio[0] * (1.0 + dt / _RELAXED)
     least = max(_SMALL, least)
-    if (ratio > least or oscillates) and not begins:
+    if (ratio > least or not is_sound) and not begins:
         state.least_ratio[0] = least
         return
     state.least_ratio[0] = ratio

@@ -31,9 +31,6 @@ law continues with a d^3 of its own, which may have that already.
 have to give up the rest of H (P^ - P^_before): the torque of a load that has just gone, of an
 inertia that accelerates.  That is not of the arm, and fades with L (`hand_over`).
 
-*Slower.*  Where r has shaken, and until efforts are known to be those of sensors, its pole L_i is
-slower (`torque_sensors`).  With r behind that pole, r_s, it is r - (1 - L_i / L) (r - r_s) then.
-
 *Friction.*  What is learned describes the torque of the motors, with all their friction.  P_l
 is without what P^ has absorbed of that (`motor_friction`), or else r would take it back.
 """
@@ -51,12 +48,7 @@ _SETTLING = 4.0  # 1/L, until r is that of the arm
 _RELEASED = 10.0  # 1/L, in which a plausible bias fades
 _SIGMAS = 3.0  # of what the prior explains
 _MOST = 0.5  # of the torque limit
-_CAUTIOUS = 60.0  # rad/s, at most, until efforts are known to be those of sensors
-SLOWER = 0.4
-"""Factor on the pole of r in a joint, a step."""
-
-MOST_STEPS = 3.0
-"""Steps by which r of a joint may be slower."""
+_STEADY = 0.02  # s: oscillations have 8 Hz or more
 
 
 def most_load(limit: Array) -> Array:
@@ -70,7 +62,7 @@ class Settings(NamedTuple):
     enabled: int  # 1: there are joint torque sensors, which are used
     observer_bandwidth: float  # L, rad/s
     sensor_lag: float  # of velocities, which the torque waits for, s
-    most: Annotated[Array, 'n']  # largest |r|, N m; zero: the observer is off
+    most: Annotated[Array, 'n']  # largest |r|, N m
     unmodelled: Annotated[Array, 'n']  # rms torque that no column describes, N m
     # what the assumed rotors add to P^, kg m^2
     rotors: Annotated[Array, 'p * observer.enabled']
@@ -88,18 +80,14 @@ class State(NamedTuple):
     """What it keeps from one sample to the next."""
 
     torque: Annotated[Array, 'n * observer.enabled']  # r, N m
+    # r without what oscillates, which a stop may hold, N m
+    steady: Annotated[Array, 'n * observer.enabled']
     late: Annotated[Array, 'n * observer.enabled']  # tau_J behind the lag, N m
     filtered: Annotated[Array, 'n * observer.enabled', 'p + 1']  # [X_L | tau_J,L]
     bias: Annotated[Array, 'n * observer.enabled']  # N m
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
-    faded: Cell  # share of r that is left out, as the sensors are in doubt
-    cautious: Cell  # steps by which r begins slower than L
-    # steps by which r of a joint is slower than L
-    slowed: Annotated[Array, 'n * observer.enabled']
-    # share of what changes faster than that slower pole that is left out
-    calmed: Annotated[Array, 'n * observer.enabled']
-    slow: Annotated[Array, 'n * observer.enabled']  # r behind this slower pole, N m
+    faded: Cell  # share of r that is left out: see `torque_sensors`
     elapsed: Cell  # s, since the first interval
     # beyond the largest |r|, since what it takes over was learned, N m
     over: Annotated[Array, 'n * observer.enabled']
@@ -176,7 +164,7 @@ def take_over(
     """
     takes_over = has_settled(settings, state) and state.faded[0] == 0.0
     taken = abs(shown) - abs(before)
-    if takes_over and taken > 0.0 and settings.most[i] > 0.0:
+    if takes_over and taken > 0.0:
         beyond = abs(shown) - settings.most[i]
         state.over[i] = clip(beyond, 0.0, state.over[i] + taken)
 
@@ -201,33 +189,14 @@ def update(
         find_bias(settings, state, work, links, information)
     release_bias(settings, state, dt)
     passed = filter_gain(1.0 / settings.observer_bandwidth, dt)
+    steadied = filter_gain(_STEADY, dt)
     for i in range(state.torque.size):
         state.handover[i] -= passed * state.handover[i]
         shown = residual(state, i, links) - state.bias[i]
         state.over[i] = clip(abs(shown) - settings.most[i], 0.0, state.over[i])
         r = load_torque(settings, state, i, shown)
-        slower = slower_pole(settings, max(1.0, state.slowed[i]))
-        state.slow[i] += filter_gain(1.0 / slower, dt) * (r - state.slow[i])
-        fast = r - state.slow[i]
-        state.torque[i] = r - state.calmed[i] * fast + state.handover[i]
-
-
-@inner
-def slower_pole(settings: Settings, steps: float) -> float:
-    """Return the pole of r in a joint in which it is so many steps slower [rad/s]."""
-    pole = settings.observer_bandwidth
-    for _ in range(int(steps)):
-        pole *= SLOWER
-    return float(pole)
-
-
-@inner
-def calmed_share(steps: float) -> float:
-    """Return the share of r less r behind a slower pole that makes this pole that of r."""
-    left = 1.0
-    for _ in range(int(steps)):
-        left *= SLOWER
-    return 1.0 - left
+        state.torque[i] = r + state.handover[i]
+        state.steady[i] += steadied * (state.torque[i] - state.steady[i])
 
 
 @inner
@@ -261,27 +230,14 @@ def find_bias(
 
 
 @inner
-def begin(settings: Settings, state: State, disturbance: Array) -> None:
-    """Begin slower than L, and with d^3 (n,) [N m], which may have what the sensors show."""
-    steps = 1.0
-    while steps < MOST_STEPS and slower_pole(settings, steps) > _CAUTIOUS:
-        steps += 1.0
-    state.cautious[0] = steps
+def begin(state: State, disturbance: Array) -> None:
+    """Begin with d^3 (n,) [N m], which may have what the sensors show."""
     continues = 0.0
     for i in range(disturbance.size):
         if disturbance[i] != 0.0:
             continues = 1.0
     for i in range(state.keeps_bias.size):
         state.keeps_bias[i] = continues
-        state.slowed[i] = steps
-        state.calmed[i] = calmed_share(steps)
-
-
-@inner
-def end_caution(state: State) -> None:
-    """Let r be as fast as if it had not begun slower, but for the steps that it has shaken for."""
-    for i in range(state.slowed.size):
-        state.slowed[i] -= state.cautious[0]
 
 
 @inner
@@ -300,7 +256,7 @@ def transfer_learned(
         take_over(settings, state, i, shown, was)
         given_up -= load_torque(settings, state, i, shown)
         disturbance[i] += given_up
-        state.slow[i] -= given_up
+        state.steady[i] -= given_up
 
 
 @inner
@@ -328,3 +284,4 @@ def hand_over(
         late *= 1.0 - state.faded[0]
         disturbance[i] += late
         state.handover[i] -= late
+        state.steady[i] -= late

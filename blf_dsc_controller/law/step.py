@@ -161,22 +161,29 @@ def advance(
 
 
 @inner
-def blame_oscillation(settings: Settings, checks: Checks, state: State) -> int:
-    """Return the flag of an oscillation, or 0 while the load observer gives way to one.
+def blame_oscillation(
+    settings: Settings,
+    checks: Checks,
+    state: State,
+    oscillates: bool,
+    had_fault: float,
+) -> int:
+    """Return the flags of an arm that `oscillates`, and of a load observer that is left out.
 
-    The observer, which may be the cause, becomes slower before the arm is said to oscillate.
+    The observer, which may be the cause, is left out before the arm is said to oscillate, unless
+    that is violent.  `had_fault` is what was wrong with it before this sample.
     """
-    r = state.observer
-    if torque_sensors.is_fading(r.faded, r.slowed, r.calmed):
-        return 0
-    gives_way = torque_sensors.take_blame(
-        state.sensors,
-        checks.oscillation,
-        settings.torque.limit,
-        settings.observer.most,
-        r.slowed,
-    )
-    return NOT_SENSORS if gives_way else OSCILLATES
+    now, sensors = checks.oscillation, state.sensors
+    is_violent = oscillation.is_violent(now, settings.torque.limit)
+    if oscillates and not is_violent:
+        torque_sensors.take_blame(sensors, now)
+    flags = OSCILLATES if oscillates else 0
+    if sensors.fault[0] == had_fault:
+        return flags
+    if is_violent:
+        return flags | NOT_SENSORS
+    oscillation.forget_all(now)
+    return NOT_SENSORS
 
 
 @inner
@@ -205,21 +212,13 @@ def step(
     take_measurement(checks, signals, measurement, begins, dt)
     prepare(settings, state, signals, reference_vector, t)
     oscillates = watch_oscillation(settings, checks, signals, begins, dt)
-    noted = state.sensors.noted[0]
+    had_fault = state.sensors.fault[0]
     advance(law, settings, state, signals, t, dt)
     fill_sample(settings, state, signals, sample)
     if not are_on(checks):
         return 0
     flags = check_sample(settings, checks, state, signals, sample)
-    if state.sensors.noted[0] != noted:
-        flags |= NOT_SENSORS
-    if oscillation.is_violent(checks.oscillation, settings.torque.limit):
-        return flags | OSCILLATES
-    if state.sensors.noted[0] != noted:
-        oscillation.forget_all(checks.oscillation)  # r may have been the cause
-    elif oscillates:
-        flags |= blame_oscillation(settings, checks, state)
-    return flags
+    return flags | blame_oscillation(settings, checks, state, oscillates, had_fault)
 
 
 @kernel

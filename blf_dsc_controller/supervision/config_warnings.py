@@ -14,7 +14,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.law_traits import OWN
+from blf_dsc_controller.configuration.law_traits import LAWS, OWN
 from blf_dsc_controller.configuration.plausibility import LONGEST_LAG
 from blf_dsc_controller.configuration.robot import (
     implausible_friction,
@@ -120,6 +120,7 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
             f'that of a gripper, give the link that carries it: {chain.joints[-2].link}'
         )
     yield from _of_unknown_efforts(config)
+    yield from _of_torque_sensors(config)
     for joint, limit, inertia, units in zip(
         chain.joints, config.torque.limit, load.free_inertia, config.units, strict=True
     ):
@@ -129,6 +130,23 @@ def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
                 f'{units.position}/s^2 at its torque limit: are masses in kg, inertias in kg m^2, '
                 'lengths in m?'
             )
+
+
+def _of_torque_sensors(config: ControllerConfig) -> Iterator[str]:
+    """Check that joint torque sensors are used if they are declared, and only then."""
+    pole = config.disturbance.observer_bandwidth
+    if config.has_torque_sensors and not pole and not config.commissioning.friction:
+        yield (
+            'disturbance.observer_bandwidth: nothing has proven the joint torque sensors that '
+            'robot.effort and robot.torque_loop declare, so that no load is taken up by them: '
+            'commission the arm (`blf_dsc commission`), which measures them and gives this pole'
+        )
+    if pole and not config.has_torque_sensors:
+        yield (
+            f'disturbance.observer_bandwidth: {pole:g} rad/s is not used: the load observer needs '
+            'joint torque sensors (robot.torque_loop true and robot.effort whole) and '
+            f'{LAWS[0]} as law'
+        )
 
 
 def _of_unknown_efforts(config: ControllerConfig) -> Iterator[str]:

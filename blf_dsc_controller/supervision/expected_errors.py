@@ -154,9 +154,12 @@ def expectation(config: ControllerConfig) -> str:
         return 'none can be told, since errors grow from sample to sample: give lower gains'
     usual = largest_error(errors.unmodelled, config.units)
     most = largest_error(errors.pick_up, config.units, config.joints)
-    sensed = config.disturbance.observer_bandwidth > 0.0
     return (
         f'{usual} by {_causes(config)}; {most} when '
         f'{config.robot.payload:g} kg are picked up in motion'
-        + (', less what joint torque sensors show in time' if sensed else '')
+        + (
+            ', less what joint torque sensors show in time'
+            if config.observes_load
+            else ''
+        )
     )

@@ -163,13 +163,10 @@ def _check_compensated(
         )
     noticed = _NOTICED * np.linalg.norm(gravity)
     if not is_commanded and np.linalg.norm(effort) <= noticed:
-        # The load observer needs whole efforts.
-        observes = config.disturbance.observer_bandwidth > 0.0
-        off = ' and disturbance.observer_bandwidth to 0' if observes else ''
         raise StartError(
             f'{no_gravity} with an effort of {effort[worst]:.4g} {unit} where the drives should '
             f'hold {gravity[worst]:.4g} {unit}. The first torque, {torque[worst]:.4g} {unit}, '
             'would drop the arm. If the brakes hold it, release them. If the drives compensate '
             'nothing, set robot.drive_compensates to none. If the effort does not contain what the '
-            f'drives add, set robot.effort to commanded{off}, or {_SEND}{_DRIVER}'
+            f'drives add, set robot.effort to commanded, or {_SEND}{_DRIVER}'
         )

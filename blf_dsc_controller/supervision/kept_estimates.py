@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.torque_sensors import is_fading
 
 Vector = NDArray[np.float64]
 
@@ -35,10 +36,12 @@ class KeptEstimates:
         return self._past.kept[self._controller.settings.m :]
 
     def keep(self) -> None:
-        """Keep the estimates that the law has now."""
+        """Keep the estimates that the law has now, unless its load observer is in doubt."""
         state = self._controller.state
+        if is_fading(state.observer.faded):
+            return
         np.concatenate((state.estimate, state.disturbance), out=self._past.kept)
-        observed = state.observer.torque
+        observed = state.observer.steady
         self.disturbance[: observed.size] += observed
 
     def begin(self) -> None:

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.oscillation import PATIENCE, is_violent, oscillates
+from blf_dsc_controller.law.torque_sensors import NONE
 from blf_dsc_controller.supervision.digits import two_digits
+from blf_dsc_controller.supervision.not_sensors import fault_of
 
 _LOWER = 0.5  # of the present stiffness, which is advised
 _LATELY = 0.1  # s
@@ -117,6 +119,11 @@ class OscillationCheck:
     def _remedy(self) -> str:
         config = self._config
         too_stiff = 'the gains are too high for this arm or its base'
+        if config.observes_load and fault_of(self._controller) == NONE:
+            too_stiff += (
+                ', or the load observer is too fast for it, or its efforts are not those of '
+                'joint torque sensors'
+            )
         if config.model != 'urdf':
             return (
                 f'{too_stiff}; lower two_link.mu, two_link.surface_gain and '
