@@ -38,7 +38,6 @@ sim_plant:
     events: {begin: [0.0, 0.7], duration: [0.1, 0.0]}
 blf_dsc_controller:
   ros__parameters:
-    approach: {enabled: false}
     learning: {window: 0.1, excitation_threshold: 1.0e-12}
 """
 

@@ -136,23 +136,6 @@ def test_start_inside_the_bound_needs_no_approach():
     np.testing.assert_allclose(found.reference, nominal, atol=1e-14)
 
 
-def test_start_that_is_too_slow_is_rejected_if_approaches_are_disabled():
-    """The reference passes its middle at 0.3 rad/s at t = 0.
-
-    To catch up takes v^2 / (2 a) = 0.9 bounds at a = 2 rad/s^2, which leaves a tenth of it.
-    """
-    swinging = {'reference.phase': [-np.pi / 2], 'approach.enabled': False}
-    config = blf.change(CONFIG, swinging)
-    offset = np.array(config.reference.offset)
-    moving = np.full(2, 0.3)
-    slower = moving - np.sqrt(2.0 * 2.0 * 0.9 * BOUND)
-    for start, velocity in ((offset, moving), (offset + 0.09 * BOUND, slower)):
-        assert not run(config, start, 0.01, velocity).stops
-    for start, velocity in ((offset, STILL), (offset + 0.11 * BOUND, slower)):
-        with pytest.raises(blf.StartError, match='velocity'):
-            run(config, start, 0.01, velocity)
-
-
 @pytest.mark.parametrize(
     ('speed', 'frequency', 'upper', 'share'),
     [

@@ -111,8 +111,8 @@ def test_memory_of_a_run_into_a_bag_does_not_grow_with_its_length(tmp_path):
 
 
 def test_run_that_cannot_start_leaves_no_bag(tmp_path):
-    config = build(ControllerConfig, {'approach.enabled': False})
-    plant = build(PlantConfig, {'duration': 1.0, 'initial.position': [0.3, 0.3]})
+    config = build(ControllerConfig, {'reference.type': 'hold'})
+    plant = build(PlantConfig, {'duration': 1.0, 'initial.position': [9.0, 0.3]})
     with pytest.raises(StartError):
         simulate_into_bag(tmp_path / 'bag', config, plant)
     assert not (tmp_path / 'bag').exists()

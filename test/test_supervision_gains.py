@@ -154,7 +154,7 @@ STRONG = {'two_link.adaptation_gain': [0.02] * 3, 'two_link.learning_weight': 21
         ('', KNOWN | {'two_link.feedback_gain': [60.0, 60.0]}, 4.0, chatters),
         (
             'torque.limit: joint1',
-            {'torque.limit': [5.5, 20.0], 'approach.enabled': False},
+            {'torque.limit': [5.5, 20.0]},
             1.0,
             leaves_the_bound,
         ),

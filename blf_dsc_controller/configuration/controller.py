@@ -45,7 +45,6 @@ from blf_dsc_controller.configuration.law_traits import (
     traits_of,
 )
 from blf_dsc_controller.configuration.motion_groups import (
-    Approach,
     MotionLimits,
     Reference,
 )
@@ -74,7 +73,6 @@ class ControllerConfig(ArmConfig):
         kept=law_file.kept,
     )
     reference: Reference = Reference()
-    approach: Approach = Approach()
     limits: MotionLimits = MotionLimits()
     barrier: Barrier = Barrier()
     feedback: Feedback = Feedback()

@@ -73,17 +73,6 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Approach:
-    """Motion to the reference from a start outside the bound, which applies along it."""
-
-    enabled: bool = parameter(
-        True,
-        'guide an arm that starts outside the bound into it; false: refuse '
-        'such a start',
-    )
-
-
-@dataclass(frozen=True)
 class MotionLimits:
     """Limits of each joint for an approach or a received trajectory."""
 

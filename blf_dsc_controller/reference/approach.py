@@ -314,8 +314,7 @@ def check_takeover(
             raise StartError(
                 f'joint {joint!r} starts {difference:+.6g} {unit}/s from the velocity of the '
                 f'reference, but within its bound and limits.acceleration it can make up only '
-                f'{limit:.6g} {unit}/s: start with the velocity of the reference, or enable the '
-                'approach (approach.enabled)'
+                f'{limit:.6g} {unit}/s: start with the velocity of the reference'
             )
 
 
@@ -370,8 +369,7 @@ def plan_start(
     `again` does so with a share of the acceleration, also from rest.
 
     Raises:
-        StartError: the law cannot take over (`check_takeover`), and approach.enabled is false;
-            or the arm would be held far past its limits, or moves too fast to be held.
+        StartError: the arm would be held far past its limits, or moves too fast to be held.
         MotionError: no approach keeps the limits.
     """
     if config.reference.type == 'hold':
@@ -381,10 +379,9 @@ def plan_start(
     try:
         check_takeover(config, bound, q, dq, vector, t)
     except StartError:
-        if not config.approach.enabled:
-            raise
+        pass
     else:
-        if _joins(config, dq, vector, t) or not config.approach.enabled:
+        if _joins(config, dq, vector, t):
             return BlendedReference(vector, t)
     (target,) = unpack(vector)
     if again or np.abs(dq).max() > _MOVING:

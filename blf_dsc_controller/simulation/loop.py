@@ -67,9 +67,9 @@ def simulate(
     The plant's duration must not be 0.  If not `supervised`, the law runs alone, past
     its limits too.  A run whose law has been stopped for `after_stop` [s] may end early.
 
-    Raises StartError if the law cannot take over and approach.enabled is false, or stops
-    before its first torque, MotionError if there is no approach within the limits, and
-    ArgumentTypeError if the configurations are others.
+    Raises StartError if the law cannot take over, or stops before its first torque,
+    MotionError if there is no approach within the limits, and ArgumentTypeError if the
+    configurations are others.
     """
     remedy = 'simulate(loop.controller, loop.plant) runs what load_loop returns'
     check_type('controller_config', controller_config, ControllerConfig, remedy)
@@ -102,8 +102,8 @@ def simulate(
 def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
     """Fill a record, by its law alone from the beginning; `observed` as in `run_loop`.
 
-    Raises StartError if the law cannot take over and approach.enabled is false, and
-    MotionError if there is no approach within the limits; BlfDscError if the plant is
+    Raises StartError if the law cannot take over, and MotionError if there is no approach
+    within the limits; BlfDscError if the plant is
     not compiled, or a law of a file fails.
     """
     if not plant.is_compiled:
