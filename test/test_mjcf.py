@@ -316,6 +316,10 @@ def test_dynamics_of_joints_are_their_own_behind_a_free_body(tmp_path):
         ),
         # of two directions, what both allow
         ({'lower': 'actuatorfrcrange="-5 3"'}, 3.0),
+        (
+            {'more': '<actuator><motor joint="elbow" ctrlrange="-2 3"/></actuator>'},
+            2.0,
+        ),
         ({}, np.inf),
     ],
 )
