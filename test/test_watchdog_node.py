@@ -359,6 +359,10 @@ def test_second_controller_that_does_not_start_changes_nothing_for_the_first(ros
     loop.note('parameters', parameters={'torque.limit': [15.0, 9.0]})
     loop.go_on(0.02, commands=True)
     assert loop.watchdog.config.torque.limit == (15.0, 9.0)
+    loop.note(ENDED[0], **ENDED[1])
+    loop.go_on(0.1, commands=False)
+    loop.note('reset')
+    loop.go_on(0.02, commands=True)
     assert np.abs(loop.torque()).min() > 0.5
 
 
