@@ -38,7 +38,8 @@ sim_plant:
     events: {begin: [0.0, 0.7], duration: [0.1, 0.0]}
 blf_dsc_controller:
   ros__parameters:
-    learning: {window: 0.1, excitation_threshold: 1.0e-12}
+    learning: {window: 0.1}
+    two_link: {excitation_threshold: 1.0e-12}
 """
 
 STUDY = """\
@@ -122,13 +123,13 @@ def test_values_are_as_frequent_as_stated():
         (
             'arm.m2',
             'arm.m3',
-            r'line 15: vary.arm.m3: unknown parameter.* mean vary.arm.m[12]\?',
+            r'line 16: vary.arm.m3: unknown parameter.* mean vary.arm.m[12]\?',
         ),
         ('arm.m2', 'initial.position', r'vary.initial.position: unknown parameter'),
         (
             'uniform(0.3',
             'unifrm(0.3',
-            r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but",
+            r"line 16: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but",
         ),
         (MASS, 'uniform(0.3)', r'with 1 values, but uniform\(low, high\) is'),
         (MASS, 'uniform(a, 0.7)', r'but a number is expected between commas'),
@@ -172,7 +173,7 @@ def test_values_are_as_frequent_as_stated():
             '["uniform(0, 1)"]',
             r'got 1 distributions, .* 2 entries \(joint1',
         ),
-        ('runs: 24', 'runs: 0', r'line 11: runs: got 0, but it must be at least 1'),
+        ('runs: 24', 'runs: 0', r'line 12: runs: got 0, but it must be at least 1'),
         (
             'after: 0.2',
             'after: 0.3',

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import interfaces
-from ros_rig import RosRig, activate, cleanup, configure, deactivate
+from ros_rig import LIMIT, RosRig, activate, cleanup, configure, deactivate
 from std_srvs.srv import Trigger
 
 import blf_dsc_controller as blf
@@ -99,7 +99,9 @@ class Arm:
         return response
 
     def run_until(self, time):
-        self.ros.until(lambda: self.law.guard.reference.time > time)
+        self.ros.until(
+            lambda: self.law.guard.reference.time > time, limit=LIMIT + 10.0 * time
+        )
 
 
 def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tmp_path):
@@ -132,9 +134,12 @@ def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tm
 
 
 def test_driver_that_refuses_is_asked_once(services, ros):
-    """As that of a Franka does while a controller is active."""
+    """As that of a Franka does while a controller is active: it is asked at rest."""
     arm = Arm(ros, services['franka'], accepts=False)
     arm.run_until(8.0)
+    assert not arm.requests
+    arm.law.guard.motions.brake()
+    arm.run_until(9.5)
     assert len(arm.requests) == 1
     asked = f'/driver/set_load refused {arm.requests[0].mass:.2f} kg'
     assert arm.law.declaration.problem == f'{asked}: a controller is active'

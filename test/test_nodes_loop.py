@@ -16,6 +16,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from ros_rig import (
+    LIMIT,
     FakeClock,
     activate,
     cleanup,
@@ -70,7 +71,8 @@ def run_lockstep(ros, plant, controller=None):
     ros.add(ControllerNode, {**OBSERVED, **(controller or {})})
     truth = ros.listen(topics.TRUTH)
     samples = round(plant['duration'] * 1000) + 1
-    ros.until(lambda: arm.finished and len(commands) >= samples)
+    limit = LIMIT + 0.01 * samples
+    ros.until(lambda: arm.finished and len(commands) >= samples, limit)
     ros.until(lambda: len(joint_states) >= samples)
     ros.until(lambda: len(truth) == (samples - 1) // 10 + 1)
     return torques(commands), states(joint_states, arm.config.joints)[0]
