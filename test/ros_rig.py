@@ -146,6 +146,14 @@ class RosRig:
         )
         return messages
 
+    def observe(self, node):
+        """Subscribe to all that a node publishes, as a recorder does: it may wait for one."""
+        self.until(lambda: node.state_label != 'unconfigured')
+        for each in list(node.publishers):
+            self.tester.create_subscription(
+                each.msg_type, each.topic_name, lambda _: None, 10, raw=True
+            )
+
     def driver(self):
         """Start a node that takes torques, as an effort controller does."""
         node = self.keep(rclpy.create_node('driver', context=self.context))

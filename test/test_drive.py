@@ -153,7 +153,7 @@ def test_what_the_start_and_a_driver_advise_ends_with_an_arm_that_moves():
     """A simulated FR3 whose efforts lack gravity, though its driver knows that they have it."""
     facts = simulated(loop_of('fr3_direct').plant).facts
     lacking = {'robot.effort': 'commanded'}
-    advice = r'set robot\.effort to commanded, or set safety'
+    advice = r'set robot\.effort to commanded, or safety'
     with pytest.raises(blf.StartError, match=advice) as refused:
         run('fr3_direct', 0.01, {}, {}, lacking)
     config = blf.change(loop_of('fr3_direct').controller, lacking)

@@ -119,24 +119,22 @@ def test_repeated_reading_is_continued_at_its_velocity(readings, used):
 
 
 @pytest.mark.parametrize(
-    ('ratio', 'oscillates', 'begins', 'kept'),
+    ('ratio', 'is_sound', 'begins', 'kept'),
     [
-        (0.2, False, False, True),
-        (0.3, False, False, False),  # larger than the smallest recent one, 0.25
-        (0.3, False, True, True),
-        (0.2, True, False, False),
+        (0.2, True, False, True),
+        (0.3, True, False, False),  # larger than the smallest recent one, 0.25
+        (0.3, True, True, True),
+        (0.2, False, False, False),
     ],
 )
-def test_estimates_of_the_smallest_recent_error_are_kept(
-    ratio, oscillates, begins, kept
-):
+def test_estimates_of_the_smallest_recent_error_are_kept(ratio, is_sound, begins, kept):
     state = part(kept_estimates.State, n=N, m=3)
     observed = np.array([0.5, 0.0])
     kept_estimates.keep(state, np.arange(3.0), np.array([7.0, 8.0]), observed)
     assert state.kept.tolist() == [0.0, 1.0, 2.0, 7.5, 8.0]
     state.least_ratio[0] = 0.25
     scale = np.array([0.5, 0.6])
-    kept_estimates.keep_consistent(state, scale, ratio, oscillates, begins, DT)
+    kept_estimates.keep_consistent(state, scale, ratio, is_sound, begins, DT)
     assert (state.consistent[-1] == 8.0) == kept
     assert (state.consistent_scale[1] == 0.6) == kept
     # one that is not kept is relaxed: the least error doubles in a second or so

@@ -181,7 +181,7 @@ def test_other_study_or_version_is_rejected_and_the_difference_is_named(
             r'arm.m2: there uniform\(0.3, 0.7\), here uniform',
         ),
         ('arm.m2', 'arm.m1', r'arm.m2: there uniform\(0.3, 0.7\), here nothing'),
-        ('duration: 0.3', 'duration: 0.4', r'sim_plant.duration: there 0.3, here 0.4'),
+        ('duration: 0.75', 'duration: 0.8', r'duration: there 0.75, here 0.8'),
         ('window: 0.1', 'window: 0.12', r'learning.window: there 0.1, here 0.12'),
     ):
         other = study(tmp_path, (LOOP + STUDY).replace(before, after, 1))

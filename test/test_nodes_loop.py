@@ -68,7 +68,7 @@ def run_lockstep(ros, plant, controller=None):
     commands = ros.listen(topics.COMMANDS)
     joint_states = ros.listen(topics.JOINT_STATES, raw=True)
     arm = ros.add(PlantNode, {'mode': 'lockstep', **OBSERVED, **plant})
-    ros.add(ControllerNode, {**OBSERVED, **(controller or {})})
+    ros.observe(ros.add(ControllerNode, {**OBSERVED, **(controller or {})}))
     truth = ros.listen(topics.TRUTH)
     samples = round(plant['duration'] * 1000) + 1
     limit = LIMIT + 0.01 * samples
@@ -264,7 +264,7 @@ def test_parameter_change_takes_effect_at_the_published_sample(ros):
     ros.listen(topics.JOINT_STATES)
     ros.listen(topics.TRUTH)
     arm = ros.add(PlantNode, {'mode': 'lockstep', 'duration': 1.0, **OBSERVED})
-    ros.add(ControllerNode, OBSERVED)
+    ros.observe(ros.add(ControllerNode, OBSERVED))
     ros.until(lambda: arm.plant.sample > 50)
     request = SetParametersAtomically.Request()
     request.parameters = [
@@ -308,7 +308,7 @@ def assert_runs(ros, arm, law, samples=60):
 
 def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
     waiting = {'wait_for_subscribers': 1}
-    arm, _ = ros.loop(waiting, waiting)
+    arm, law = ros.loop(waiting, waiting)
     outputs = topics.JOINT_STATES, topics.TRUTH, topics.COMMANDS
     listener = ros.add(partial(Node, 'listener'))
     for topic in outputs:
@@ -318,6 +318,7 @@ def test_loop_waits_for_a_recorder_and_not_for_any_listener(ros):
     assert arm.plant.sample == 0
     for topic in outputs:
         ros.listen(topic)
+    ros.observe(law)
     ros.until(lambda: arm.plant.sample > 0)
 
 

@@ -112,7 +112,7 @@ def test_joint_pd_is_a_pd_over_gravity_with_the_published_gains():
     config = random_arms.law_of(own, 'panda', random_arms.STOCK)
     assert config.feedback.joint_stiffness == robot.stiffness
     assert config.feedback.joint_damping == robot.damping
-    controller = controller_of(own)
+    controller = controller_of(config)
     settings, signals = controller.settings, controller.signals
     rng = np.random.default_rng(1)
     for each in (signals.q, signals.dq, signals.qr, signals.dqr, signals.xi1):

@@ -88,6 +88,12 @@ def dotted(parameters, prefix=''):
             yield prefix + name, value
 
 
+def files_in(folder):
+    """Return when each file was changed, without what Python keeps of its own."""
+    paths = [each for each in folder.rglob('*') if '__pycache__' not in each.parts]
+    return {path: path.stat().st_mtime_ns for path in paths}
+
+
 def answered(case, capfd):
     """Return the exit code, and all that is said."""
     try:
@@ -113,15 +119,14 @@ def test_mistake_is_answered_with_what_to_do(
     monkeypatch.chdir(tmp_path)
     for name, content in {**table.get('files', {}), **case.get('files', {})}.items():
         write(tmp_path / name, content.copy() if isinstance(content, dict) else content)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob('*')}
+    before = files_in(tmp_path)
     run = case.get('run', '').replace('{folder}', str(tmp_path))
     if '{bag}' in run:
         run = run.replace('{bag}', str(request.getfixturevalue('bag')))
     code, said = answered({**case, 'run': run} if run else case, capfd)
     assert code == case.get('exit', 1), said
     if code in (1, 2):
-        after = {path: path.stat().st_mtime_ns for path in tmp_path.rglob('*')}
-        assert after == before
+        assert files_in(tmp_path) == before
     said = said.replace(str(tmp_path), '{folder}')
     assert 'Traceback' not in said
     assert 'Errno' not in said

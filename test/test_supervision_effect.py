@@ -104,7 +104,7 @@ def test_arm_that_oscillates_when_it_is_stopped_keeps_the_load_it_carries(
     before = arm.run(1.0, until=lambda: not arm.is_running)
     assert arm.reason == 'oscillation'
     after = arm.run(2.0)
-    far = 0.065 if reference == 'hold' else 0.15  # rad
+    far = 0.15 if reference == 'hold' else 0.3  # rad
     assert np.abs(after.q - before.q[-1]).max() < far
     assert after.speed[-1].max() < 0.02
 

@@ -109,7 +109,7 @@ def test_arm_that_shakes_stops_calmly_and_says_what_it_did(arm):
     said = supervisor.text.partition(' Hz with')[0]
     assert ' oscillates at ' in said
     assert 'commission it (`blf_dsc commission`), or give ' in supervisor.text
-    assert f'give a feedback.stiffness of {0.5 * gain:.2g}, ' in supervisor.text
+    assert f'give a feedback.stiffness of {0.5 * gain:.2g}' in supervisor.text
     largest = np.abs(run.speed).max(axis=(1, 2))
     first = max(0, run.stop - round(BEFORE / run.period))
     before = largest[first : run.stop + 1].max()

@@ -107,8 +107,9 @@ class RosTopics(Beside):
 
     def _take(self, kind: int, content: bytes) -> None:
         if kind == STOP:
-            text = self._inputs.take_stop()
-            self._link.put(STOP, topic_link.encode(text))
+            number = topic_link.decode(content)
+            answer = [number, self._inputs.take_stop()]
+            self._link.put(STOP, topic_link.encode(answer))
         elif kind == KINDS[topics.JOINT_TRAJECTORY]:
             self._inputs.take_trajectory(content)
         elif kind == KINDS[topics.JOINT_POSITIONS]:

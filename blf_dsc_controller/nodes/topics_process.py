@@ -13,8 +13,8 @@ import socket
 import sys
 import threading
 from collections.abc import Sequence
-from contextlib import suppress
 from queue import Empty, SimpleQueue
+from time import monotonic
 from typing import Any
 
 import rclpy
@@ -66,7 +66,8 @@ class LoopTopics:
         self._state = create_publisher(node, topics.STATE)
         self._diagnostics = DiagnosticsPublisher(node, joints)
         self._revision = -1
-        self._answers: SimpleQueue[str] = SimpleQueue()
+        self._answers: SimpleQueue[tuple[int, str]] = SimpleQueue()
+        self._stops = 0  # asked for
         connect(
             node,
             lambda raw: self._pass_on(topics.JOINT_TRAJECTORY, raw),
@@ -82,7 +83,8 @@ class LoopTopics:
         elif kind == STATUS:
             self._report(topic_link.decode(content))
         elif kind == STOP:
-            self._answers.put(topic_link.decode(content))
+            number, text = topic_link.decode(content)
+            self._answers.put((number, text))
         elif kind == LOG:
             self._write_log(**topic_link.decode(content))
 
@@ -115,15 +117,17 @@ class LoopTopics:
 
         Raises BlfDscError if it says nothing; a stop is never taken back.
         """
-        with suppress(Empty):  # what came too late for an earlier stop
-            while True:
-                self._answers.get_nowait()
-        self._link.put(STOP, b'null')
+        self._stops += 1
+        self._link.put(STOP, topic_link.encode(self._stops))
         self._link.flush()
-        try:
-            return self._answers.get(timeout=_PATIENCE)
-        except Empty:
-            raise BlfDscError(_SILENT) from None
+        end = monotonic() + _PATIENCE
+        number = 0
+        while number != self._stops:  # an answer to an earlier stop comes too late
+            try:
+                number, text = self._answers.get(timeout=max(0.0, end - monotonic()))
+            except Empty:
+                raise BlfDscError(_SILENT) from None
+        return text
 
 
 def _listen(link: Link, loop: LoopTopics) -> None:

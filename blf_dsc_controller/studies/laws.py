@@ -134,6 +134,8 @@ def law_changes(
     changes: dict[str, object] = {'law': studied.law}
     if studied.law != 'blf_dsc':  # which alone has a load observer
         changes['disturbance.observer_bandwidth'] = 0.0
+    if studied.gains is _FEEDBACK:  # those of joints
+        changes['feedback.inertia'] = 'none'
     config = change(config, changes)  # a law of a file has gains of its own
     if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         gains = law_gains(config)
