@@ -23,7 +23,6 @@ PRESETS = sorted({*NAMES} - {*IN_MOTORS})
 LAW = {
     'comparison': 'backstepping',
     'comparison_detuned': 'backstepping',
-    'composite_panda': 'slotine_li',
     'model_based': 'model_based',
     'paper': 'paper',
     'paper_tuned': 'paper',

@@ -257,11 +257,6 @@ class ControllerConfig(ArmConfig):
             )
 
 
-def law_gains_of(config: ControllerConfig) -> tuning.Gains:
-    """Return the gains of the law for an arm from a URDF."""
-    return tuning.gains_of(used_design_of(config))
-
-
 def used_design_of(config: ControllerConfig) -> tuning.Design:
     """Return what the gains of an arm from a URDF follow from: its gears, if nothing is given."""
     chain = config.robot.chain(config.joints)
