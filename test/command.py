@@ -16,6 +16,7 @@ PATIENT = """blf_dsc_controller:
   ros__parameters:
     insist: [safety.velocity_limit]
     safety:
+      oscillation: ignore
       state_timeout: 1000.0
       watchdog: 'off'
       velocity_limit: 1.0e+9

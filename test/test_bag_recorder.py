@@ -385,7 +385,7 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     config.write_text(fifo + PATIENT + at_rest)
     arguments = ('--config', config, '--mode', 'realtime', '--duration', DURATION)
     run = closed_loop(*arguments, '--out', out)
-    assert run.returncode == 0, run.stderr
+    assert run.returncode == 0, run.stdout + run.stderr
     assert 'late steps' in run.stdout
     timing = json.loads((out / 'summary.json').read_text())['timing']
     assert set(timing) == {'rate', 'latency', 'late_steps'}
