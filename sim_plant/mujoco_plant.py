@@ -42,8 +42,6 @@ class MujocoPlant(Plant):
         model, data: MuJoCo's.
     """
 
-    is_compiled = False
-
     def __init__(self, config: PlantConfig) -> None:
         """Build the arm of a configuration.
 

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct
 from blf_dsc_controller.compiled.layout import pack
 from sim_plant.elastic import REST, run_elastic_plant
@@ -21,7 +20,6 @@ from sim_plant.kernels import (
     drawn,
     generator,
     is_due,
-    is_repeat,
     plant_views,
     run_plant,
 )
@@ -37,12 +35,7 @@ class Plant:
 
     It starts at `position` (n,) [rad] with `velocity` (n,) [rad/s]; `seed` determines
     the noise, so the same seed repeats the run.
-
-    Attributes:
-        is_compiled: whether compiled loops can step it, from `arm`, `settings` and `state`.
     """
-
-    is_compiled = True
 
     def __init__(
         self,
@@ -69,11 +62,6 @@ class Plant:
             self._run(*self._arguments(REST, self._truth))
         self._now.reading.sample[0] = self._now.acting.sample[0] = -1.0
         self._initial = self.state.copy()
-
-    @functools.cached_property
-    def kernel(self) -> Entry:
-        """The kernel of `step`, `measure` and `truth`, for a compiled loop."""
-        return Entry(self._compiled, *self._arguments(STEP, self._truth))
 
     @functools.cached_property
     def _run(self) -> Callable[..., None]:
@@ -135,20 +123,6 @@ class Plant:
         self._run(*self._arguments(OBSERVE, self._truth))
         return self._measurement
 
-    def noise_of(self, samples: int) -> np.ndarray:
-        """Draw the noise (samples, 4n) of this sample and of those that follow.
-
-        It is for a compiled loop. A reading that is made already, or repeated, has none.
-        """
-        k = self.sample + np.arange(samples)
-        is_new = k != self._now.reading.sample[0]
-        due = is_new & ~is_repeat(self._settings.encoders, k)
-        noise = np.zeros((samples, 4 * self.joints))
-        columns = drawn(self._settings)
-        shape = np.count_nonzero(due), columns.stop - columns.start
-        noise[due, columns] = self.rng.standard_normal(shape)
-        return noise
-
     def step(self, torque: np.ndarray) -> None:
         """Apply the commanded torque (n,) [N m] and advance to the next sample."""
         self._run(*self._arguments(STEP, torque))
@@ -178,11 +152,3 @@ class Plant:
         self.step(np.zeros(self.measure().size // 3))
         self.truth()
         self.reset()
-
-    def save(self) -> tuple[np.ndarray, Mapping[str, Any]]:
-        """Return a copy of everything that changes, with the generator's state."""
-        return self.state.copy(), self.rng.bit_generator.state
-
-    def restore(self, saved: tuple[np.ndarray, Mapping[str, Any]]) -> None:
-        """Restore what was saved by a plant with the same settings."""
-        self.state[:], self.rng.bit_generator.state = saved

@@ -240,7 +240,7 @@ def states(messages, names=JOINTS):
 
 
 def simulated(plant, controller=None):
-    """Return the run of the compiled loop with the same parameters."""
+    """Return the simulated run with the same parameters."""
     return blf.simulate(
         build(blf.ControllerConfig, controller or {}), build(blf.PlantConfig, plant)
     ).run()

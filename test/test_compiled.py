@@ -67,8 +67,7 @@ from blf_dsc_controller.law.step import update
 from blf_dsc_controller.numerics import elementary
 from blf_dsc_controller.numerics.algebra import independent_columns, inverse, product
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
-from blf_dsc_controller.simulation import compiled_loop, loop
-from blf_dsc_controller.simulation.compiled_loop import run_loop
+from blf_dsc_controller.simulation import loop
 from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
@@ -108,7 +107,6 @@ def test_kernel_depends_on_the_files_and_constants_it_is_compiled_from():
     for kernel, needed, foreign in (
         (update, LAW, PLANT),
         (run_plant, PLANT, LAW),
-        (run_loop, set(), LAW),
     ):
         assert names(kernel) >= needed | ALWAYS
         assert not names(kernel) & foreign
@@ -156,10 +154,9 @@ FOLDERS = """
 from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.law.step import update
 from blf_dsc_controller.law.perception import weigh
-from blf_dsc_controller.simulation.compiled_loop import run_loop
 from sim_plant.kernels import run_plant
 
-assert {update, weigh, run_loop, run_plant} <= {*kernel_cache.KERNELS}
+assert {update, weigh, run_plant} <= {*kernel_cache.KERNELS}
 for kernel in kernel_cache.KERNELS:
     assert str(kernel_cache.cache_folder(kernel)) in kernel._cache.cache_path, kernel
 """
@@ -305,7 +302,7 @@ def test_linked_functions_compute_and_raise():
         mean_root(np.array([1.0, -9.0]))
 
 
-@entry.loop
+@jit.kernel
 def sum_of_means(mean, rows):
     total = 0.0
     for i in range(rows.shape[0]):
@@ -318,7 +315,7 @@ def test_kernel_calls_a_kernel_by_its_address():
     rows = np.array([[1.0, 9.0], [4.0, 16.0]])
     mean = entry.Entry(mean_root, rows[0])
     assert sum_of_means(mean, rows) == 5.0
-    assert getattr(sum_of_means, 'py_func', sum_of_means)(mean, rows) == 5.0
+    assert sum_of_means.py_func(mean, rows) == 5.0
     with pytest.raises(ValueError, match='no root of a negative number'):
         sum_of_means(mean, -rows)
 
@@ -338,21 +335,6 @@ def test_kernels_of_two_laws_with_the_same_name_are_told_apart():
     assert str(first) == str(other)
     assert first != other
     assert first == entry.EntryType(numba.types.none(numba.typeof(laws[0](2.0))))
-
-
-@compiling
-@pytest.mark.parametrize('preset', ['recommended', 'noisy'])
-def test_loop_that_is_not_compiled_computes_the_same_bits(preset, monkeypatch):
-    """As where numba's private parts are missing: it calls the same kernels."""
-    config = load_loop(preset)
-    plant = replace(config.plant, duration=0.2)
-    compiled = simulate(config.controller, plant)
-    monkeypatch.setattr(compiled_loop, 'run_loop', run_loop.py_func)
-    interpreted = simulate(config.controller, plant)
-    for name in ('measurements', 'samples', 'truths'):
-        np.testing.assert_array_equal(
-            getattr(compiled, name), getattr(interpreted, name)
-        )
 
 
 @compiling

@@ -101,10 +101,10 @@ def test_run_of_a_study_reacts_to_a_contact_though_nobody_observes_it():
     """The external torque is found where a reaction needs it, also if it is not recorded."""
     config = loop_of(pushed(PUSH), **{'contact.reaction': 'hold'})
     estimates = []
-    for observed in (True, False):
+    for perceives in (True, False):
         controller = blf.controller_of(config.controller)
         record = new_record(controller, config.controller, config.plant, Journal())
-        run_alone(record, plant_of(config.plant), observed=observed)
+        run_alone(record, plant_of(config.plant), perceives=perceives)
         estimates.append(columns(record)[0].estimate)
     np.testing.assert_array_equal(*estimates)
 

@@ -216,7 +216,7 @@ GEARS = {
 def test_simulated_arm_with_encoders_on_both_sides_shows_its_gears(tmp_path, capsys):
     """A Panda's torque sensors, ripple, friction and lags, in lock-step; seven intervals of 95 %.
 
-    The compiled loop, which does not read the motors, has the same torques.
+    With encoders at the links alone, the torques are the same.
     """
     loop = load_loop('panda', {PLANT: GEARS})
     simulate_into_bag(tmp_path / 'bag', loop.controller, loop.plant)

@@ -18,7 +18,6 @@ from plants import commands, rigid_gears, true_parameters
 from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller import (
-    BlfDscError,
     ConfigurationError,
     ControllerConfig,
     MissingExtraError,
@@ -168,8 +167,6 @@ def test_what_mujoco_has_not_is_an_error_with_a_remedy(monkeypatch):
     with pytest.raises(ConfigurationError, match='no sloshing loads: use own'):
         build(PlantConfig, sloshing)
     config = build(PlantConfig, {'physics': 'mujoco', 'duration': 1.0})
-    with pytest.raises(BlfDscError, match='a compiled loop: use own here'):
-        simulate(build(ControllerConfig, {}), config, supervised=False)
     monkeypatch.setitem(sys.modules, 'mujoco', None)
     with pytest.raises(MissingExtraError, match=r'physics: mujoco needs .*\[mujoco\]'):
         plant_of(config)

@@ -20,14 +20,10 @@ from blf_dsc_controller.messages.journal import decode_change
 from blf_dsc_controller.messages.topics import CHANGES
 from blf_dsc_controller.replay.verify import verify
 from blf_dsc_controller.simulation.loop import (
-    _run_supervised,
-    new_record,
     simulate,
     simulate_into_bag,
     write_bag,
 )
-from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import plant_of
 
 HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
 NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed': 3}
@@ -126,34 +122,6 @@ def test_unguarded_law_continues_past_every_limit():
     np.testing.assert_array_equal(stopped.samples[:row], alone.samples[:row])
     assert np.isfinite(alone.samples[row:, :10]).all()
     assert np.isnan(stopped.samples[row:, :6]).all()
-
-
-def test_switching_between_guard_and_compiled_loop_does_not_change_the_run():
-    """A run in chunks, the first of them run by the guard, equals the run of the law alone."""
-    chunked = run(SATURATED).run()
-    assert not chunked.stops
-    np.testing.assert_array_equal(
-        chunked.torque, run(SATURATED, supervised=False).run().torque
-    )
-    assert (np.abs(chunked.torque[:1000]) == SATURATED['torque.limit']).any()
-    assert not (np.abs(chunked.torque[1001:2000]) == SATURATED['torque.limit']).any()
-
-
-def test_law_that_was_stopped_does_not_go_on_in_the_compiled_loop():
-    """An arm at rest, in which the law by itself would find nothing to stop for."""
-    config = build(ControllerConfig, HELD | {'reference.type': 'hold'})
-    plant_config = build(PlantConfig, {'duration': 3.0})
-    plant = plant_of(plant_config)
-    guard = Guard(config)
-    guard.starting.activate()
-    record = new_record(guard.controller, config, plant_config, guard.journal)
-    parts = _run_supervised(guard, plant, record.rows, record.stamps.size)
-    for _ in range(2):  # the first sample, and a chunk of a second
-        next(parts)
-    assert guard.supervisor.running
-    guard.fail('a test')
-    assert np.isnan(next(parts).samples[:, 0]).all()  # none of them the law's
-    assert not guard.supervisor.running
 
 
 def test_panda_rests_with_a_load_that_it_was_stopped_by():

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels that another kernel calls: compiled once, whoever calls them.
 
-A function that a kernel calls is compiled into it.  A loop over controller and arm would
-thus compile both again, for each law and each kind of arm.  Here a loop gets the
-address of a kernel as an argument:
+A function that a kernel calls is compiled into it, so that each law would compile the
+loop again.  Here a kernel gets the address of another one as an argument:
 
-    @loop
-    def run(update: Entry, x):
-        for _ in range(1000):
-            invoke(update, x)
+    @kernel
+    def update(compute: Entry, x):
+        invoke(compute, x)
 
-    run(Entry(update, x), x)
+    update(Entry(compute, x), x)
 
 A call costs some nanoseconds, and the optimiser does not see both sides of it.
 """
@@ -18,7 +16,7 @@ A call costs some nanoseconds, and the optimiser does not see both sides of it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numba
 from numba.core import cgutils, config, types
@@ -33,12 +31,10 @@ from numba.extending import (
     unbox,
 )
 
-from blf_dsc_controller.compiled.jit import INLINED, SLOW, kernel
+from blf_dsc_controller.compiled.jit import INLINED, SLOW
 
 if not SLOW:
     from blf_dsc_controller.compiled.linked import address_of, call_at
-
-F = TypeVar('F', bound=Callable[..., object])
 
 
 class Entry:
@@ -62,11 +58,6 @@ class Entry:
         self.type = EntryType(compiled.signature)
         if not SLOW:
             self.address = address_of(compiled)
-
-
-def loop(function: F) -> F:
-    """Compile a function that calls others by `invoke`; without numba's private parts, do not."""
-    return function if SLOW else kernel(function)
 
 
 def invoke(entry: Entry, *arguments: object) -> Any:

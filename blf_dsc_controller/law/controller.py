@@ -6,12 +6,8 @@ What a sample does is in `step`, what follows after its torque in `perception`.
 
 from __future__ import annotations
 
-import functools
-from typing import NamedTuple
-
 import numpy as np
 
-from blf_dsc_controller.compiled.entry import Entry
 from blf_dsc_controller.compiled.jit import direct
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
@@ -19,12 +15,7 @@ from blf_dsc_controller.law import barrier, external_torque, friction
 from blf_dsc_controller.law.check_state import checks_of, checks_size
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
-from blf_dsc_controller.law.perception import (
-    sense,
-    sense_nothing,
-    weigh,
-    weigh_nothing,
-)
+from blf_dsc_controller.law.perception import sense, weigh
 from blf_dsc_controller.law.state import (
     Settings,
     sample_of,
@@ -38,14 +29,6 @@ from blf_dsc_controller.law.state import (
 from blf_dsc_controller.law.step import compare, update
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference import terms as reference
-
-
-class LawKernels(NamedTuple):
-    """What a compiled loop calls of a controller."""
-
-    update: Entry
-    weigh: Entry
-    sense: Entry
 
 
 class Controller:
@@ -114,25 +97,6 @@ class Controller:
             self._weigh = direct(weigh, *self._vectors[:4], 0.0)
         if self.settings.contact.enabled:
             self._sense = direct(sense, *self._vectors[:5], 0.0)
-
-    @functools.cached_property
-    def kernels(self) -> LawKernels:
-        """The kernels of `update` and `perceive`, for a compiled loop."""
-        law = self.given_law
-        given = (*self._vectors, self.reference_vector, 0.0, 0.0, True)
-        weighs = weigh if self.settings.weighing.size else weigh_nothing
-        senses = sense if self.settings.contact.enabled else sense_nothing
-        return LawKernels(
-            Entry(for_law(update, law), law, *given),
-            Entry(weighs, *self._vectors[:4], 0.0),
-            Entry(senses, *self._vectors[:5], 0.0),
-        )
-
-    @property
-    def torque_at(self) -> int:
-        """Entry of `sample_vector` at which the torque begins."""
-        torque = self.sample.torque
-        return int(torque.ctypes.data - self.sample_vector.ctypes.data) // 8
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""

@@ -145,19 +145,6 @@ def sense(
     return is_touched and not was_touched
 
 
-@kernel
-def sense_nothing(
-    _model: ArmModel,
-    _settings_vector: Array,
-    _state_vector: Array,
-    _signals_vector: Array,
-    _sample_vector: Array,
-    dt: float,
-) -> bool:
-    """Stand in for `sense` where no external torque is found: no contact begins."""
-    return dt < 0.0  # numba: a literal False would have another type
-
-
 @inner
 def fill_breakaway(settings: Settings, state: State, signals: Signals) -> None:
     """Compute the shapes of breakaway, filtered and weighted as the row."""
@@ -196,14 +183,3 @@ def weigh(
             dt,
         ),
     )
-
-
-@kernel
-def weigh_nothing(
-    _model: ArmModel,
-    _settings_vector: Array,
-    _state_vector: Array,
-    _signals_vector: Array,
-    _dt: float,
-) -> None:
-    """Stand in for `weigh` where nothing is weighed."""

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop without ROS, in one compiled loop."""
+"""The closed loop without ROS."""

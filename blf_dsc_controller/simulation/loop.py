@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop without ROS: the kernels that the nodes run, in one compiled loop; its bag.
+"""The closed loop without ROS: the node's guard and the simulated arm, in turn; its bag.
 
 A lock-step run over ROS and an offline run of the same configuration agree bit for bit,
-stops and safe torques included: the compiled loop runs as long as its checks pass.  A
-chunk of samples in which one fails is run again, sample by sample, by the node's guard,
-and so is everything after a stop.
+stops and safe torques included.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from blf_dsc_controller.configuration.law_file import errors_told_with_line
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
-from blf_dsc_controller.errors import BlfDscError, StartError, check_type
+from blf_dsc_controller.errors import StartError, check_type
 from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.controller import Controller
@@ -44,14 +42,13 @@ from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
 from blf_dsc_controller.messages.topics import Message
 from blf_dsc_controller.run import FIRST_STAMP, Run, Series, Stop
-from blf_dsc_controller.simulation.compiled_loop import CompiledLoop, Rows, Span
 from blf_dsc_controller.simulation.sampled_run import run_of
 from blf_dsc_controller.supervision.guard import Guard
 from sim_plant.plant import plant_of
 from sim_plant.sampled_plant import Plant
 from sim_plant.settings import parameter_names_of, steps_of
 
-_CHUNK = 1000  # samples; the guard takes about 20 ms for them
+_CHUNK = 1000  # samples that are kept in memory while a bag is written
 
 
 @logged_compilation()
@@ -99,23 +96,31 @@ def simulate(
     return record
 
 
-def run_alone(record: Record, plant: Plant, *, observed: bool = True) -> None:
-    """Fill a record, by its law alone from the beginning; `observed` as in `run_loop`.
+def run_alone(record: Record, plant: Plant, *, perceives: bool = True) -> None:
+    """Fill a record, by its law alone from the beginning.
 
-    Raises StartError if the law cannot take over, and MotionError if there is no approach
-    within the limits; BlfDscError if the plant is
-    not compiled, or a law of a file fails.
+    If it `perceives`, also find what no torque depends on: load and external torque.
+
+    Raises StartError if the law cannot take over, MotionError if there is no approach
+    within the limits, and BlfDscError if a law of a file fails.
     """
-    if not plant.is_compiled:
-        raise BlfDscError(
-            'physics: got mujoco, but this computes in a compiled loop: use own here, or '
-            '`blf_dsc run`'
-        )
+    controller = record.controller
+    perceives = perceives or controller.settings.contact.freezes == 1
     q, dq, _ = plant.measure().reshape(3, -1)
-    begin(record.controller, record.config, q, dq)
-    span = Span(0, record.stamps.size - 1, is_end=True, observed=observed)
+    begin(controller, record.config, q, dq)
+    dt = plant.period_ns * 1e-9
+    last = record.stamps.size - 1
     with errors_told_with_line(record.config.law):
-        CompiledLoop(record.controller, plant).run(span, record.rows_to_fill())
+        for row, stamp in enumerate(record.stamps.tolist()):
+            measurement = plant.measure()
+            record.measurements[row] = measurement
+            record.truths[row] = plant.truth()
+            torque = controller.update(stamp * 1e-9, dt, measurement)
+            if perceives:
+                controller.perceive(dt)
+            record.samples[row] = controller.sample_vector
+            if row < last:
+                plant.step(torque)
 
 
 def _run_supervised(
@@ -123,17 +128,12 @@ def _run_supervised(
 ) -> Iterator[Record]:
     """Run `size` samples in chunks; fill and yield the rows of each, which come from `rows_of`."""
     bound = np.zeros(len(guard.config.joints))
-    loop = CompiledLoop(guard.controller, plant)
     for first in (0, *range(1, size, _CHUNK)):
         chunk = range(first, min(first + _CHUNK, size) if first else 1)
         record = rows_of(chunk)
         is_end = chunk.stop == size
         with errors_told_with_line(guard.config.law):
-            if not (
-                first
-                and _run_compiled(loop, guard, plant, record, chunk, is_end=is_end)
-            ):
-                _run_guarded(guard, plant, record, bound, is_end=is_end)
+            _run_guarded(guard, plant, record, bound, is_end=is_end)
         if guard.starting.error is not None:
             raise guard.starting.error
         if guard.supervisor.stops and not guard.commanding:  # nothing would ever move
@@ -149,36 +149,6 @@ def _release(guard: Guard, record: Record) -> None:
     torque = guard.release()
     if torque is not None:
         record.left[:] = torque
-
-
-def _run_compiled(
-    loop: CompiledLoop,
-    guard: Guard,
-    plant: Plant,
-    record: Record,
-    chunk: range,
-    *,
-    is_end: bool,
-) -> bool:
-    """Run a chunk in the compiled loop; return False, with nothing changed, if a check fails."""
-    controller = guard.controller
-    if not (plant.is_compiled and guard.supervisor.running):
-        return False
-    if record.motors.size:  # the compiled loop does not read them
-        return False
-    if guard.config.safety.velocity != 'measured':
-        return False
-    before = controller.save(), plant.save(), controller.checks_vector.copy()
-    span = Span(chunk.start, chunk.stop - 1, is_end, observed=True)
-    if loop.run(span, record.rows_to_fill()):
-        at = controller.torque_at
-        torques = record.samples[:, at : at + controller.settings.n]
-        guard.advance(FIRST_STAMP + record.stamps, record.measurements, torques)
-        return True
-    controller.restore(before[0])
-    plant.restore(before[1])
-    controller.checks_vector[:] = before[2]
-    return False
 
 
 def _run_guarded(
@@ -231,10 +201,6 @@ class Record:
         stops = (e.stamp for e in self.journal.pending if e.type is EventType.STOP)
         first = next(stops, None)
         return math.inf if first is None else 1e-9 * (first - FIRST_STAMP)
-
-    def rows_to_fill(self) -> Rows:
-        """Return the matrices with a row for each sample."""
-        return Rows(self.measurements, self.samples, self.truths)
 
     def rows(self, chosen: range) -> Record:
         """Return some rows, as views."""

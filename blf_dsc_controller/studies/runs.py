@@ -50,7 +50,6 @@ from blf_dsc_controller.law.step import update
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.simulation.compiled_loop import run_loop
 from blf_dsc_controller.simulation.loop import Record, new_record, run_alone
 from blf_dsc_controller.studies.distributions import Drawn
 from blf_dsc_controller.studies.monte_carlo import (
@@ -196,7 +195,7 @@ def _run(study: Study, run: int, records: dict[str, Record]) -> Row:
         record.controller.reset()
         with np.errstate(all='ignore'):  # a run that diverges has figures too
             try:
-                run_alone(record, plant, observed=False)
+                run_alone(record, plant, perceives=False)
                 found = figures_of(study, record, config)
             except (StartError, MotionError):  # the record is that of the run before
                 found = dict.fromkeys(figures_of(study, record, config), nan)
@@ -217,7 +216,7 @@ def versions() -> dict[str, str]:
         'blf_dsc_controller': blf_dsc_controller.__version__,
         'kernels': ' '.join(
             cache_folder(each).name
-            for each in (update, sense, run_plant, run_elastic_plant, run_loop)
+            for each in (update, sense, run_plant, run_elastic_plant)
         ),
         'numpy': np.__version__,
         # `missing` goes by the names of the chunks

@@ -15,7 +15,7 @@ declared to the drives.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
@@ -146,7 +146,7 @@ class Guard(InCommand):
                 self._wait_for_valid(measurement)
                 return self._safe_at(stamp, measurement)
             self.starting.forget_load_after_gap(stamp, measurement)
-            self._take((stamp,), measurement)
+            self._take(stamp, measurement)
             if not self.starting.start(stamp, measurement):
                 return self.safe(self.config.sample_time)
         elif self.held.after_gap is not None and not self.starting.rejoin(
@@ -158,7 +158,7 @@ class Guard(InCommand):
         if self.controller.flags & INVALID:
             self.findings.stop_at_invalid(stamp, measurement)
             return self._safe_at(stamp, measurement)
-        self._take((stamp,), measurement)
+        self._take(stamp, measurement)
         self._advance_to(stamp)
         self.findings.check_efforts()
         fault = self.samples.check(dt) or self.findings.check_oscillation()
@@ -201,11 +201,11 @@ class Guard(InCommand):
         self.findings.compare_velocities(stamp, measurement)
         return self.safe_at(stamp, measurement)
 
-    def _take(self, stamps: Sequence[int], measurement: Vector) -> None:
-        """Keep the last of some states that the law uses, with their stamps [ns]."""
+    def _take(self, stamp: int, measurement: Vector) -> None:
+        """Keep a state that the law uses, with its stamp [ns]."""
         last = self.safe_torque.last
-        last.measure_gaps(stamps, self.config.sample_time)
-        last.take(stamps[-1], measurement, self.slow)
+        last.measure_gap(stamp, self.config.sample_time)
+        last.take(stamp, measurement, self.slow)
 
     def _advance_to(self, stamp: int) -> None:
         self.reference.last_stamp = stamp
@@ -214,30 +214,6 @@ class Guard(InCommand):
             and self.reference.time >= self.reference.settled
         ):
             self.supervisor.enter(Phase.TRACKING)
-
-    def advance(
-        self, stamps: Vector, measurements: np.ndarray, torques: np.ndarray
-    ) -> None:
-        """Advance by k states, all used by the law, with their stamps (k,) [ns].
-
-        `measurements` (k, 3n) and `torques` (k, n) [N m] have a row for each.  All checks
-        passed, and `samples.ratio` and the kept estimates are up to date.
-        """
-        recent = self.held.recent
-        self.held.after_gap = None
-        for k in range(max(0, stamps.size - recent.size), stamps.size):
-            recent.take(int(stamps[k]), measurements[k], torques[k])
-        count, stamp, measurement = stamps.size, int(stamps[-1]), measurements[-1]
-        self.journal.stamp = stamp
-        self.readings.advance(stamp, measurement)
-        self.journal.messages += count
-        self.journal.commands += count
-        self.has_sample = True
-        self._take(stamps.tolist(), measurement)
-        self.safe_torque.commanded[:] = self.controller.state.torque
-        self.states.advance(stamp, count)
-        self.samples.relax((stamp - self.reference.last_stamp) * NANOSECOND)
-        self._advance_to(stamp)
 
     def reject(self, error: MessageError) -> Vector | None:
         """Return the torque for an unreadable message, None if it is another arm's."""

@@ -12,7 +12,6 @@ to be braked, and cannot keep up an oscillation of the arm.  It is that of
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from math import inf
 
 import numpy as np
@@ -74,7 +73,7 @@ class LastState:
             self.miss(period)
             return
         elapsed = (stamp - self._stamp) * 1e-9
-        self.measure_gaps((stamp,), period)
+        self.measure_gap(stamp, period)
         is_late = is_gap(elapsed, period)
         is_next = self.age == 0.0 and elapsed > 0.0 and not is_late
         differenced = np.zeros_like(q)
@@ -108,16 +107,15 @@ class LastState:
         self.ddq = None
         self.age += period
 
-    def measure_gaps(self, stamps: Iterable[int], period: float) -> None:
-        """Measure the gaps that states with these stamps [ns] end, before one is stored.
+    def measure_gap(self, stamp: int, period: float) -> None:
+        """Measure the gap that a state with this stamp [ns] ends, before it is stored.
 
         `period` [s] is the usual time between two states.
         """
-        for stamp in stamps:
-            gap = (stamp - self._stamp) * 1e-9
-            if stamp - self._gap_ended > _REMEMBERED:
-                self.gap = 0.0
-            if self._stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
-                self.gap = min(gap, _LONGEST)
-                self._gap_ended = stamp
-            self._stamp = stamp
+        gap = (stamp - self._stamp) * 1e-9
+        if stamp - self._gap_ended > _REMEMBERED:
+            self.gap = 0.0
+        if self._stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
+            self.gap = min(gap, _LONGEST)
+            self._gap_ended = stamp
+        self._stamp = stamp

@@ -95,11 +95,6 @@ class Readings:
         if self._velocity is not None:
             self._velocity = Velocity(self._n)
 
-    def advance(self, stamp: int, measurement: Vector) -> None:
-        """Take the last of some states that have been checked elsewhere."""
-        self._seen = stamp
-        self._wraps.follow(measurement)
-
     @property
     def velocity(self) -> Vector:
         """Velocity (n,) [rad/s] that the positions show, behind a low pass."""

@@ -72,11 +72,6 @@ class StateCheck:
         self._last_stamp = -1
         self._repeats = 0
 
-    def advance(self, stamp: int, count: int) -> None:
-        """Mark `count` states as checked, up to a stamp [ns]."""
-        self._last_stamp = stamp
-        self._taken += count
-
     def check(self, safety: Safety, stamp: int) -> Fault | None:
         """Return why the controller must stop; SKIP: ignore the state; None: use it.
 
