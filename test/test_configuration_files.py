@@ -7,7 +7,6 @@ Which section applies.
 from __future__ import annotations
 
 import copy
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,9 +18,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from paper_case import instead
 
+from blf_dsc_controller import (
+    ConfigurationError,
+    ControllerConfig,
+    PlantConfig,
+    load_loop,
+    share_folder,
+)
 from blf_dsc_controller.compiled.layout import pack
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.files import parse, share_folder
+from blf_dsc_controller.configuration.files import parse
 from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
@@ -29,16 +34,12 @@ from blf_dsc_controller.configuration.nodes import (
     format_value,
     known_names,
     load,
-    load_loop,
     locate,
     read,
 )
-from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.configuration.side_nodes import RecorderConfig
-from blf_dsc_controller.errors import ConfigurationError
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.messages import topics
 
 CHANGED = LoopConfig(
     build(
@@ -178,80 +179,6 @@ def test_presets_and_written_files_have_the_values_of_ros(
     } == expected
 
 
-MALFORMED = [
-    ('- 1\n', 'line 1: expected node names or ros__parameters at the top'),
-    ('a: [1\n', 'line 2: not valid YAML'),
-    ('a:\n\tb: 1\n', 'line 2: not valid YAML'),
-    ('<robot name="a">\n<!-- it: is -->\n</robot>', 'line 2: not valid YAML'),
-    (section('n', 'a: [\u22121.0, 2.0]'), 'line 2: a mixes types'),
-    ('n:\n  seed: 1\n', 'line 2: seed has a value, but is outside of ros__parameters'),
-    ('n:\n', 'line 1: n has a value, but is outside of ros__parameters'),
-    (
-        'n:\n  ros_parameters: {seed: 1}\n',
-        'line 2: seed has a value, but is outside of ros__p',
-    ),
-    ('n:\n  ros__parameters:\n', 'line 2: ros__parameters of /n has no parameters'),
-    ('n:\n  ros__parameters:\n    seed:\n', 'line 3: seed has no value'),
-    (section('n', 'a: [1, 2.0]'), 'line 2: a mixes types'),
-    (section('n', 'a: [[1], [2]]'), 'line 2: a has a list in a list'),
-    (section('n', 'a: &x 1, b: *x'), 'line 2: ROS does not support the alias'),
-    (section('n-1', 'a: 1'), 'line 2: /n-1 is not a valid node name'),
-    (
-        's:\n  /n:\n    ros__parameters: {a: 1}\n',
-        'line 3: /s//n is not a valid node name',
-    ),
-    (
-        section('n', 'a: 1') + '  m: {b: 1}\n',
-        'line 3: ros__parameters and m cannot be n',
-    ),
-]
-IGNORED = [
-    ('# a comment\n', 'line 1: the file is empty'),
-    ('n:\n  ros__parameters: {a: 1}\n---\nm: {}\n', 'line 3: not valid YAML'),
-    (
-        'n:\n  ros__parameters:\n    a: 1\n    a: 2\n',
-        'line 4: a is repeated, first given on l',
-    ),
-    (
-        'n:\n  ros__parameters:\n    a.b: 1\n    a:\n      b: 2\n',
-        'line 5: a.b is repeated, f',
-    ),
-    (
-        'n:\n  ros__parameters: {a: 1}\nn:\n  ros__parameters: {b: 1}\n',
-        'line 3: n is repeated',
-    ),
-    (section('n', 'a: {}'), 'line 2: a has no parameters'),
-]
-"""What ROS would silently ignore, or read in part."""
-
-
-REMEDIES = [
-    ('a:\n\tb: 1\n', 'indent with spaces, not with tabs'),
-    ('<robot name="a">\n<!-- it: is -->\n</robot>', 'names it as robot.urdf'),
-    (section('n', 'a: 1') + '---\nm: {}\n', 'leave out the line ---'),
-    (section('n', 'a: [0,08, 0,09]'), 'if 0,035 is to be one number, write 0.035'),
-    (section('n', 'a: [0.5, -0,35]'), 'if 0,035 is to be one number, write 0.035'),
-    (section('n', 'a: [0, 0, 1.0]'), 'write all entries alike (1.0, not 1)'),
-    (section('n', 'a: 0,035'), ': 035 has no value: a comma separates entries'),
-    (
-        'm:\n    a: {}\n  b:\n    c: 1\n',
-        'in the column of the other lines of its group',
-    ),
-    ('- 1\n', 'at the top, such as {/**: {ros__parameters: '),
-    ('n:\n  ros_parameters: {a: 1}\n', 'ros_parameters has to be ros__parameters'),
-    ('n:\n  seed: 1\n', 'write ros__parameters: below the name of the node'),
-    (section('n', '') + '\u00a0 a: 1\n', r"'\xa0 a' has other letters than those of"),
-    (section('n', 'a: [\u22121.0, 2.0]'), r"('\u22121.0' is text)"),
-]
-"""Mistakes whose cause is seen in the text, not in the word of the parser."""
-
-
-@pytest.mark.parametrize(('text', 'remedy'), REMEDIES)
-def test_frequent_mistake_is_told_with_its_remedy(file, text, remedy):
-    (problem,) = problems_of(file(text))
-    assert remedy in problem
-
-
 @pytest.mark.parametrize('encoding', ['utf-16', 'latin-1'])
 def test_file_that_is_not_utf_8_is_to_be_saved_so(tmp_path, encoding):
     text = section('sim_plant', 'seed: 1 # groß')
@@ -265,15 +192,14 @@ def test_file_that_is_not_utf_8_is_to_be_saved_so(tmp_path, encoding):
     assert 'a.urdf is no text in UTF-8' in problem
 
 
-@pytest.mark.parametrize(('text', 'message'), MALFORMED + IGNORED)
-def test_malformed_file_is_rejected_with_its_line_and_by_ros(
-    with_ros, file, text, message
-):
-    path = file(text)
-    (problem,) = problems_of(path)
-    assert problem.startswith(message)
-    if (text, message) in MALFORMED:
-        assert with_ros(path, '/n') is None
+def test_file_that_ros_rejects_is_refused_as_well(with_ros, file):
+    """`test_refusals.py` tests what is said of each."""
+    table = Path(__file__).with_name('refusals') / 'parameter_files.yaml'
+    cases = yaml.safe_load(table.read_text(encoding='utf-8'))['cases']
+    rejected = [case['files']['my.yaml'] for case in cases if 'ros' in case]
+    assert len(rejected) > 10
+    for text in rejected:
+        assert with_ros(file(text), '/n') is None
 
 
 # Written and documented.
@@ -329,14 +255,6 @@ def test_parameter_page_is_what_its_command_writes(tmp_path):
     assert {row.replace('\\|', '').count('|') for row in rows} == {7}
 
 
-def test_topic_page_lists_every_topic_with_its_type():
-    page = (COMMITTED.parent / 'topics.md').read_text(encoding='utf-8')
-    for topic in vars(topics).values():
-        if isinstance(topic, topics.Topic):
-            name = topic.resolved if topic.name.startswith('/') else topic.relative
-            assert f'| `{name}` | {topic.type.replace("/msg/", "/")} |' in page
-
-
 # Which section applies.
 
 
@@ -367,16 +285,6 @@ def test_overrides_take_precedence_over_the_file(file):
     ]
 
 
-@pytest.mark.parametrize(
-    'overrides', [{'plant': {'duration': 1.0}}, {'duration': 1.0}, {'sim_plant': 1.0}]
-)
-def test_overrides_of_no_node_are_not_ignored(overrides):
-    with pytest.raises(
-        ConfigurationError, match=r"such as \{'sim_plant': \{'duration'"
-    ):
-        load_loop('recommended', overrides)
-
-
 def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_section(
     file,
 ):
@@ -398,17 +306,6 @@ def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_s
     of_ros = 'use_sim_time: true, qos_overrides: {/clock: {subscription: {depth: 1}}}, seed: 2'
     for pattern in ('sim_plant', '/**'):
         assert load_plant(file(section(pattern, of_ros))).seed == 2
-
-
-@pytest.mark.parametrize('name', ['use_sim_time', 'start_type_description_service'])
-def test_switches_of_ros_are_checked_as_a_node_would(file, name):
-    """A word in quotes is a text, with which no node starts. Sections of others are theirs."""
-    expected = 'but a bool is expected: write true or false, without quotes'
-    for pattern in ('sim_plant', '/**'):
-        (problem,) = problems_of(file(section(pattern, f"{name}: 'true'")))
-        assert problem == f'line 2: {name}: got "true", {expected}'
-    others = section('other_node', f"{name}: 'true'") + section('sim_plant', 'seed: 2')
-    assert load_plant(file(others)).seed == 2
 
 
 def test_known_data_of_the_arm_is_there_if_it_is_given_or_needed(file):
@@ -444,23 +341,6 @@ def test_a_law_of_the_package_has_its_gains_and_others_have_not(file):
     assert copy.deepcopy(config) == config  # through `__reduce__`, as pickle does
     with pytest.raises(ConfigurationError, match=r'gains\.surface_gain: unknown'):
         load(file(section('/**', gains)), 'blf_dsc_controller', ControllerConfig)
-
-
-def test_missing_file_error_lists_the_presets(tmp_path):
-    assert locate('recommended') == locate('recommended.yaml')
-    for name in ('recomended', tmp_path / 'absent.yaml', tmp_path):
-        with pytest.raises(ConfigurationError) as caught:
-            locate(name)
-        assert str(name) in str(caught.value)
-        assert re.search('a preset: .*noisy.* recommended', str(caught.value))
-    with pytest.raises(
-        ConfigurationError, match=r'did you mean recommended\? give a parameter'
-    ):
-        load_loop('recomended')
-    (tmp_path / 'binary.yaml').write_bytes(b'\xff\xfe\x00')
-    for file in ('absent.yaml', 'binary.yaml'):
-        with pytest.raises(ConfigurationError, match=file):
-            read(tmp_path / file)
 
 
 def test_preset_name_takes_precedence_over_files_in_the_folder(tmp_path, monkeypatch):
@@ -509,53 +389,6 @@ def test_nodes_of_a_loop_agree_on_sample_time_and_joints(file):
     assert swapped.plant.joints != swapped.controller.joints
 
 
-def test_misspelt_node_name_is_reported(file):
-    assert problems_of(file(section('sim_plnat', 'seed: 1')), load_loop) == [
-        'line 2: unknown node sim_plnat, did you mean sim_plant?'
-    ]
-    loop = load_loop(
-        file(section('sim_plant', 'seed: 1') + section('sim_plant2', 'seed: 2'))
-    )
-    assert loop.plant.seed == 1
-    (problem,) = problems_of(
-        file(section('/left/bag_recorder', 'output: here')), load_loop
-    )
-    assert '/left/bag_recorder does not match /bag_rec' in problem
-    assert (
-        load_loop(file(section('robot_state_publisher', 'a: 1'))).plant == PlantConfig()
-    )
-
-
-def test_wrong_joints_are_reported_with_their_own_line(tmp_path):
-    path = tmp_path / 'given.yaml'
-    path.write_text(
-        '/**:\n  ros__parameters:\n    robot: {urdf: panda.urdf, tip: panda_hand_tcp}\n'
-        '    joints: [panda_joint1, wrist]\n'
-    )
-    with pytest.raises(ConfigurationError, match="line 4: joints: no joint 'wrist'"):
-        load_loop(path)
-
-
-def test_missing_urdf_is_reported_with_the_places_where_it_was_looked_for(
-    tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / 'given.yaml'
-    path.write_text(
-        '/**:\n  ros__parameters:\n    robot: {urdf: no.urdf, tip: tool0}\n'
-    )
-    with pytest.raises(ConfigurationError) as error:
-        load_loop(path)
-    own = share_folder() / 'config' / 'no.urdf'
-    assert f'there is no {tmp_path / "no.urdf"}, nor {own}' in str(error.value)
-
-
-def test_missing_urdf_of_an_absolute_path_is_looked_for_once(file, tmp_path):
-    missing = tmp_path / 'no.urdf'
-    (problem,) = problems_of(file(section('/**', f'robot.urdf: {missing}')))
-    assert problem.count(str(missing)) == 2  # what was given, and where it is not
-
-
 def test_long_lists_of_problems_are_cut(file):
     names = ', '.join(f'x{k}: 1' for k in range(1000))
     with pytest.raises(ConfigurationError) as caught:
@@ -572,11 +405,3 @@ def test_arm_may_be_named_by_the_url_of_a_file(file, tmp_path):
     )
     arm = f'robot: {{urdf: "file://{tmp_path}/mine.urdf", tip: tool0}}'
     assert len(load_plant(file(section('sim_plant', arm))).joints) == 6
-
-
-@pytest.mark.parametrize(
-    ('name', 'what'), [('', 'an empty name is a folder'), ('/dev/null', 'no regular f')]
-)
-def test_what_is_no_parameter_file_is_said(name, what):
-    with pytest.raises(ConfigurationError, match=what):
-        locate(name)

@@ -224,51 +224,6 @@ def arm():
         yield found
 
 
-def test_what_cannot_be_done_is_refused_with_the_reason_and_the_arm_holds(arm):
-    before = arm.state.reference
-    with pytest.raises(blf.DriveError, match='7 finite values are needed'):
-        arm.move_to([0.0, 1.0])
-    with pytest.raises(blf.DriveError, match='7 finite values are needed'):
-        arm.stream([np.nan] * 7)
-    for wrong in ('home', [[0.1, 0.2], [0.3]]):
-        with pytest.raises(blf.DriveError, match='7 finite values are needed'):
-            arm.move_to(wrong)
-    with pytest.raises(blf.DriveError, match='must be a time and positions'):
-        arm.follow([('now', [0.1] * 7)])
-    with pytest.raises(blf.DriveError, match='where a list of numbers belongs'):
-        arm.follow([[1.0, *before]])  # a row of a table
-    with pytest.raises(blf.DriveError, match='points: got none'):
-        arm.follow([])
-    with pytest.raises(blf.DriveError, match='the last one is at 0 s'):
-        arm.follow([(0.0, before + 0.1)])
-    with pytest.raises(blf.MotionFailedError, match=r"panda_joint\d' at .* rad, past"):
-        arm.move_to(before + 9.0)
-    with pytest.raises(blf.MotionFailedError, match='elbow'):
-        arm.follow([(1.0, [0.0])], ['elbow'])
-    np.testing.assert_array_equal(arm.state.reference, before)
-    assert not arm.is_moving
-
-
-def test_arguments_that_are_none_are_refused_before_the_arm_moves(arm):
-    before = arm.state.reference
-    there = before + 0.1
-    for wrong in (0.0, 1.5, np.nan, [0.1] * 7, None):
-        with pytest.raises(blf.DriveError, match=r'speed: got .* above 0, up to 1'):
-            arm.move_to(there, speed=wrong)
-    for wrong in (-1.0, np.nan, '5'):
-        with pytest.raises(blf.DriveError, match=r'timeout: got .* or None: for ever'):
-            arm.move_to(there, timeout=wrong)
-        with pytest.raises(blf.DriveError, match='timeout: got'):
-            arm.stop(timeout=wrong)
-    with pytest.raises(blf.DriveError, match=r'joints: got .*, but a list of names'):
-        arm.follow([(1.0, there)], 'panda_joint1')
-    for wrong in ('2 kg',), (1.0, 'tip'), (1.0, [0.0, np.inf, 0.0]):
-        with pytest.raises(blf.DriveError, match=r'load: got .* three coordinates'):
-            arm.load(*wrong)
-    np.testing.assert_array_equal(arm.state.reference, before)
-    assert not arm.is_moving
-
-
 def test_stream_without_ruckig_says_what_to_install(arm, monkeypatch):
     monkeypatch.setitem(sys.modules, 'ruckig', None)
     with pytest.raises(
@@ -289,20 +244,6 @@ def test_streamed_degrees_are_not_followed_and_said_once(arm, caplog):
     )
     assert caplog.text.count('deg2rad') == 1
     assert not arm.ended
-
-
-def test_a_pose_that_is_none_is_refused(arm):
-    for wrong in ('home', [0.1, [0.2], 0.3], arm.pose):
-        with pytest.raises(
-            blf.DriveError, match=r'position: got .* such as pose\.position'
-        ):
-            arm.move_to_pose(wrong)
-    with pytest.raises(
-        blf.DriveError, match=r'rotation: got str.* such as pose\.rotation'
-    ):
-        arm.move_to_pose(arm.pose.position, 'down')
-    with pytest.raises(blf.DriveError, match='of determinant 1'):
-        arm.move_to_pose(arm.pose.position, arm.pose.rotation * [-1.0, 1.0, 1.0])
 
 
 def test_a_motion_is_waited_for_stopped_and_given_up(arm):
@@ -358,17 +299,3 @@ def test_a_fork_of_the_script_neither_commands_nor_closes_the_arm(arm):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 42
     arm.stop()
     assert arm.state.phase == 'tracking'
-
-
-def test_settings_that_other_packages_have_are_refused(arm):
-    """`robot.relative_dynamics_factor = 0.05` would leave the arm ten times as fast."""
-    for name in ('relative_dynamics_factor', 'speed'):
-        with pytest.raises(
-            blf.DriveError, match=rf'{name}: .*move_to\(q, speed=0\.1\)'
-        ):
-            setattr(arm, name, 0.05)
-
-
-def test_load_is_not_declared_to_drives_that_add_nothing(arm):
-    with pytest.raises(blf.MotionFailedError, match='drive_compensates: got none'):
-        arm.load(1.0)

@@ -11,12 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_arm import random_urdf
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.plausibility import CHECKED
-from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller import (
+    ConfigurationError,
+    ControllerConfig,
+    PlantConfig,
+    change,
+    load_loop,
+)
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 
 UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}  # reaches 1.04 m
@@ -125,31 +127,12 @@ def test_what_follows_from_any_urdf_is_accepted(
     build(PlantConfig, arm)
 
 
-def test_every_checked_parameter_has_a_case():
-    assert {name for _, name, *_ in CASES.values()} | {
-        name for name, *_ in OF_PLANT.values()
-    } == set(CHECKED)
-
-
 def test_change_at_run_time_is_refused_alike():
     config = build(ControllerConfig, UR5E)
     with pytest.raises(
         ConfigurationError, match=r'torque.limit: got 300 N m .* insist'
     ):
         change(config, {'torque.limit': tuple(2.0 * EFFORTS)})
-
-
-@pytest.mark.parametrize(
-    ('name', 'words'),
-    [
-        ('torque.limits', 'did you mean torque.limit?'),
-        ('learning.window', 'not compared with the arm'),
-    ],
-)
-def test_word_that_insists_on_nothing_is_refused(name, words):
-    for cls in (ControllerConfig, PlantConfig):
-        with pytest.raises(ConfigurationError, match=re.escape(words)):
-            build(cls, {'insist': [name]})
 
 
 def test_joints_without_an_effort_have_that_of_an_arm_of_their_weight():
@@ -188,15 +171,3 @@ def test_value_that_may_be_of_another_unit_is_named_before_the_start(given, word
     assert [text for text in found if re.match(words, text)], found
     usual = config_warnings(build(ControllerConfig, UR5E))
     assert not [text for text in usual if re.match(words, text)]
-
-
-def test_times_are_compared_with_the_slowest_joint():
-    slow = UR5E | {'limits.velocity': [0.1, *each(3.0)[1:]]}
-    limits = build(ControllerConfig, slow).limits
-    crossed = (limits.position_upper[0] - limits.position_lower[0]) / 0.1
-    for share, named in ((0.9, False), (1.1, True)):
-        given = slow | {'safety.state_timeout': share * crossed}
-        found = config_warnings(build(ControllerConfig, given))
-        assert (
-            any(text.startswith('safety.state_timeout: in') for text in found) == named
-        )

@@ -11,8 +11,8 @@ pytest.importorskip('pink', reason='needs pink')
 import pinocchio
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import MotionFailedError
 from blf_dsc_controller.drive.pose import Poses
-from blf_dsc_controller.errors import DriveError, MotionFailedError
 
 CONFIG = blf.load_loop('panda').controller
 START = np.array([-0.04, 0.09, 0.01, -1.41, -0.26, 2.16, -0.52])  # rad
@@ -52,17 +52,6 @@ def test_tip_moves_along_a_line_and_turns_evenly(poses, turn):
     np.testing.assert_allclose(pose.position, begin.position + shift, atol=2 * NEAR)
     wanted = 0.0 if turn is None else 0.4
     assert turned[2] == pytest.approx(wanted, abs=2 * NEAR)
-
-
-def test_what_is_no_pose_or_out_of_reach_is_refused(poses):
-    with pytest.raises(DriveError, match='three finite values'):
-        poses.line(START, [0.5, 0.0], None, 0.5)
-    with pytest.raises(DriveError, match='an orthonormal matrix'):
-        poses.line(START, [0.5, 0.0, 0.5], np.ones((3, 3)), 0.5)
-    with pytest.raises(MotionFailedError, match=r'cannot be at .* mm and .* are left'):
-        poses.line(START, [2.0, 0.0, 0.5], None, 0.5)
-    with pytest.raises(DriveError, match=r'give robot\.urdf'):
-        Poses(blf.load_loop('recommended').controller)
 
 
 def test_simulated_arm_moves_its_tip_to_a_pose():

@@ -7,19 +7,23 @@ shown (`case`), and one of
 - `run`: what is typed behind `blf_dsc`; {bag} is a made-up bag, {folder} the folder;
 - `config`: a preset or file to load, with nested parameters of the controller (`given`)
   and of the simulated arm (`plant`);
-- `call`: Python that raises an error of the package, with `blf` and `np`.
+- `call`: Python that raises an error of the package, with `blf`, `np`, and `arm`, the
+  `blf.Drive` of a simulated Panda, which keeps its reference.
 
 `files` are written into an empty folder, in which all is run: their text by name; nothing
-for a name with a slash at its end, which is a folder; or the number of `rows` of a table
-and each of its columns, as Python of the row number k. `says` is what must be in what is
+for a name with a slash at its end, which is a folder; the number of `rows` of a table
+and each of its columns, as Python of the row number k; or a `copy` of one of the presets'
+files, in which `new` stands for each match of `old`. `says` is what must be in what is
 said, a text or a list of texts, however the lines are broken. `exit` is the code of the
-command, 1 unless given; with code 1 or 2 no file is written or changed.
+command, 1 unless given; with code 1 or 2 no file is written or changed.  A case of a
+parameter file with `ros` is one that ROS rejects, too (`test_configuration_files.py`).
 `pytest test/test_refusals.py --regenerate-refusals` replaces each `says` that no longer
 holds by the lines said now.
 """
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 
@@ -49,6 +53,12 @@ def bag(tmp_path_factory):
     return recorded_run.write_made(path, recorded_run.Synthetic(100).messages())
 
 
+@pytest.fixture(scope='module')
+def arm():
+    with blf.Drive('panda', robot='simulated') as arm:
+        yield arm
+
+
 @pytest.fixture(scope='module', autouse=True)
 def changed():
     """Hold the tables to write again, with what was said."""
@@ -72,6 +82,9 @@ def write(path, content):
         path.mkdir()
     elif isinstance(content, str):
         path.write_text(content)
+    elif 'copy' in content:
+        text = (blf.share_folder() / 'config' / content['copy']).read_text()
+        path.write_text(re.sub(content.get('old', '$^'), content.get('new', ''), text))
     else:
         k = np.arange(content.pop('rows'))
         columns = [eval(each, {'np': np, 'k': k}) + 0 * k for each in content.values()]  # noqa: S307
@@ -94,7 +107,7 @@ def files_in(folder):
     return {path: path.stat().st_mtime_ns for path in paths}
 
 
-def answered(case, capfd):
+def answered(case, arm, capfd):
     """Return the exit code, and all that is said."""
     try:
         if 'run' in case:
@@ -104,7 +117,7 @@ def answered(case, capfd):
             given = {k: dict(dotted(case.get(nodes[k], {}))) for k in nodes}
             code = blf.load_loop(case['config'], given) and 0
         else:
-            code = exec(case['call'], {'blf': blf, 'np': np})  # noqa: S102
+            code = exec(case['call'], {'blf': blf, 'np': np, 'arm': arm})  # noqa: S102
     except SystemExit as ended:
         code = ended.code
     except blf.BlfDscError as error:
@@ -123,8 +136,14 @@ def test_mistake_is_answered_with_what_to_do(
     run = case.get('run', '').replace('{folder}', str(tmp_path))
     if '{bag}' in run:
         run = run.replace('{bag}', str(request.getfixturevalue('bag')))
-    code, said = answered({**case, 'run': run} if run else case, capfd)
+    arm = reference = None
+    if 'arm.' in case.get('call', ''):
+        arm = request.getfixturevalue('arm')
+        reference = arm.state.reference
+    code, said = answered({**case, 'run': run} if run else case, arm, capfd)
     assert code == case.get('exit', 1), said
+    if arm is not None:
+        np.testing.assert_array_equal(arm.state.reference, reference)
     if code in (1, 2):
         assert files_in(tmp_path) == before
     said = said.replace(str(tmp_path), '{folder}')
