@@ -7,15 +7,13 @@ from itertools import product
 
 import numpy as np
 import pytest
-from paper_case import instead
 
+from blf_dsc_controller import ControllerConfig, load_loop
 from blf_dsc_controller.arms.joint_gains import (
     JointGains,
-    damped_arm,
     linear,
     unknown_arm,
 )
-from blf_dsc_controller.arms.known_gears import MARGIN, GearedArm, Gears
 from blf_dsc_controller.arms.linear_loop import (
     Feedback,
     Joints,
@@ -26,10 +24,8 @@ from blf_dsc_controller.arms.linear_loop import (
     law_response,
 )
 from blf_dsc_controller.arms.model import inertia_matrices
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load, load_loop, locate
+from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.settings import settings_of_config
 
 ONE = np.ones((1, 1, 1))  # one joint with a link of 1 kg m^2, in one posture
@@ -108,28 +104,6 @@ def test_margin_is_the_distance_to_instability():
     assert not loop(2000.0).is_stable()
 
 
-def test_an_encoder_beyond_the_spring_costs_phase_that_one_at_the_motor_does_not():
-    """At 20 Hz and above the link's antiresonance; d is 0.1 of what the motor bears."""
-    law = by_velocity(20.0)
-    at_link = Loop(ONE, joints(3e3), TIMING, law).margin()
-    at_motor = Loop(ONE, joints(3e3, motor_side=True), TIMING, law).margin()
-    assert at_link.value == 0.0
-    assert at_motor.value > 0.3
-
-
-def test_a_lag_of_the_damping_helps_an_encoder_beyond_the_spring_alone():
-    """With 3e4 N m/rad and motors of 2 kg m^2, as at the shoulder of a UR5e."""
-    law = by_velocity(60.0)
-    late = law._replace(damping_lag=0.003)
-
-    def margin(feedback, **given):
-        arm = joints(3e4, motors=2.0, **given)
-        return Loop(ONE, arm, TIMING, feedback).margin().value
-
-    assert margin(late) > 2.0 * margin(law)
-    assert margin(late, motor_side=True) < margin(law, motor_side=True)
-
-
 def test_a_torque_loop_hides_the_motor():
     """Far below its bandwidth the arm responds as a link with a motor of B / (1 + k_T)."""
     loop = TorqueLoop(gain=4.0, damping=0.0, lag=0.0003)
@@ -166,17 +140,6 @@ def test_gains_of_an_unknown_arm_hold_whatever_its_gears_are(preset, payload):
         assert loop_.is_stable(), (stiffness, side, loop, factor)
 
 
-def test_gains_of_known_gears_have_the_margin_and_no_more():
-    """Of a UR5e with springs of 3e4 N m/rad; 1.5 times as stiff, the margin is gone."""
-    links, guess, viscous = links_of('ur5e')
-    gears = Gears(np.full(6, 3e4), 5.0 * guess, viscous, has_torque_loop=False)
-    arm = GearedArm(links, gears, TIMING)
-    gains = arm.joint_gains()
-    assert arm.margin(linear(gains, arm.inertia, 4)).value >= MARGIN
-    stiffer = damped_arm(1.5 * gains.damping, arm.inertia)
-    assert arm.margin(linear(stiffer, arm.inertia, 4)).value < MARGIN
-
-
 @pytest.mark.parametrize('preset', ['panda', 'ur5e', 'openarm'])
 def test_gains_of_the_law_add_up_to_stiffness_and_damping(preset):
     """Of a static error: w + K_p (K / 2 + mu) is the stiffness; of a velocity, K_p the damping."""
@@ -186,49 +149,3 @@ def test_gains_of_the_law_add_up_to_stiffness_and_damping(preset):
     found = law.barrier.weight + law.feedback.gain * rate
     np.testing.assert_allclose(found, config.feedback.joint_stiffness, rtol=1e-3)
     np.testing.assert_allclose(law.feedback.gain, config.feedback.joint_damping)
-
-
-def test_the_slow_oscillation_is_damped_with_motors_of_seven_times_the_guess_too():
-    """A Panda at a tenth of its gains; without this its last joint has 0.6 times what it needs."""
-    changes = {'robot.torque_loop': False, 'feedback.stiffness': 0.1}
-    config = load_loop('panda', {CONTROLLER: changes}).controller
-    links, guess, _ = links_of('panda', payload=3.0)
-    heavy = np.diagonal(links, axis1=1, axis2=2).max(axis=0) + 7.0 * guess
-    law = settings_of_config(config)
-    d, rate = law.feedback.gain, law.surface.gain / 0.4
-    damping = d * 1.8 * rate * d / (heavy * 1.5 * rate * law.disturbance.gain)
-    assert damping.min() > 1.7  # the rule knows twenty postures, these are others
-
-
-@pytest.mark.parametrize('preset', ['ur5e', 'ur5e_driver', 'panda', 'fr3'])
-def test_the_integral_is_weaker_beside_the_load_observer_of_a_torque_loop(preset):
-    config = load_loop(preset).controller
-    law = settings_of_config(config)
-    rate = law.surface.gain[-2] / 0.4
-    share = law.disturbance.gain[-2] / (rate * law.feedback.gain[-2])
-    most = 0.15 if config.robot.torque_loop else 0.45
-    assert share == pytest.approx(most, rel=1e-3)
-
-
-def test_a_law_of_joints_does_not_multiply_its_feedback_by_inertias():
-    """The torque changes with an error by the joint's own gains, at any posture."""
-    preset = {
-        **instead(),
-        'feedback.inertia': 'none',
-        'feedback.joint_stiffness': [600.0] * 6,
-        'feedback.joint_damping': [30.0] * 6,
-        'disturbance.gain': [0.0] * 6,
-        'barrier.bound': [0.5] * 6,
-    }
-    config = load(locate('ur5e'), 'blf_dsc_controller', ControllerConfig, preset)
-    law = controller_of(config)
-    qr, dqr, _ = law.reference_at(0.0)
-    base = np.concatenate((qr, dqr, np.zeros(6)))
-    for i in range(6):
-        off, rest = base.copy(), base.copy()
-        off[6 + i] += 1e-4  # rad/s, of joint i alone
-        change = law.trial(0.0, 0.001, off) - law.trial(0.0, 0.001, rest)
-        expected = np.zeros(6)
-        expected[i] = -30.0 * 1e-4
-        # H(q, dq, dqr, ddqr) P^(0) has the Coriolis torques of dq
-        np.testing.assert_allclose(change, expected, atol=1e-4)

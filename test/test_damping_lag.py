@@ -77,30 +77,6 @@ def test_the_law_has_the_frequency_response_of_its_linear_form(
     assert found / size == pytest.approx(-C[SHAKEN, SHAKEN], rel=1e-5)
 
 
-def test_joints_have_the_torques_of_laws_that_have_their_lag_at_all_joints(config):
-    """Bit for bit, for a motion in which all joints move."""
-    rng = np.random.default_rng(1)
-    measured = np.concatenate((config.reference.offset, np.zeros(12)))
-    moved = measured + 1e-4 * rng.standard_normal((200, 18))
-
-    def torques(lags):
-        law = blf.controller_of(blf.change(config, lags))
-        return np.array(
-            [law.update(LATE + k * T, T, row).copy() for k, row in enumerate(moved)]
-        )
-
-    some = torques(of_joints(0.003, 0.0, 0.005, 0.0, 0.0, 0.003))
-    for lag, joints in ((0.003, [0, 5]), (0.0, [1, 3, 4]), (0.005, [2])):
-        alike = torques({'feedback.joint_damping_lag': [lag] * 6})
-        np.testing.assert_array_equal(some[:, joints], alike[:, joints])
-        others = np.delete(np.arange(6), joints)
-        assert (some[1:, others] != alike[1:, others]).any(axis=0).all()
-    same = torques(of_joints(*(0.003,) * 6))
-    np.testing.assert_array_equal(
-        same, torques({'feedback.joint_damping_lag': [0.003] * 6})
-    )
-
-
 def test_the_lag_begins_anew_with_the_first_sample_after_a_reset(config):
     """It damps what it finds, as a law without a lag does."""
     law = blf.controller_of(config)

@@ -14,7 +14,6 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.drive.driver import disagreements
 from blf_dsc_controller.drive.simulated import simulated
-from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.simulation.loop import write_bag
 from blf_dsc_controller.supervision.guard import Guard
@@ -67,22 +66,6 @@ def test_added_torque_is_the_gravity_of_the_urdf_and_of_the_payload_told():
     np.testing.assert_allclose(
         added_torque(settings.torque, POSITION), expected, atol=1e-9
     )
-
-
-def test_command_is_the_whole_torque_without_what_the_drive_adds():
-    laws = [
-        blf.controller_of(build(blf.ControllerConfig, PANDA | given))
-        for given in ({}, HELD | TOLD)
-    ]
-    added = added_torque(laws[1].settings.torque, POSITION)
-    measurement = np.concatenate((POSITION, 0.01 * POSITION, np.zeros(7)))
-    for law in laws:
-        law.reference_vector = law.reference_vector.copy()
-    whole, command = (law.update(0.0, 1e-3, measurement).copy() for law in laws)
-    unlimited = laws[0].signals.demand
-    np.testing.assert_allclose(laws[1].signals.demand, unlimited, rtol=1e-12)
-    inside = np.abs(unlimited) < laws[0].settings.torque.limit
-    np.testing.assert_allclose(command[inside], (whole - added)[inside], atol=1e-9)
 
 
 def test_neither_the_command_nor_the_whole_torque_exceeds_the_limit():
@@ -170,39 +153,6 @@ def test_what_the_start_and_a_driver_advise_ends_with_an_arm_that_moves():
     assert disagreements(facts, config) == []
 
 
-@pytest.mark.parametrize('effort', ['unknown', 'commanded', 'whole', 'current'])
-@pytest.mark.parametrize('parameter', ['none', 'gravity'])
-def test_live_arm_gets_gravity_only_if_something_shows_what_holds_it(effort, parameter):
-    """An effort of nothing shows brakes only if it would contain what the drives add."""
-    given = {'robot.effort': effort, 'robot.drive_compensates': parameter}
-    loop = loop_of('panda_rigid')
-    n = len(loop.controller.joints)
-    for steps, is_limited in (({}, False), ({'torque.first_step': [200.0] * n}, True)):
-        config = blf.change(loop.controller, given | steps)
-        measurement = np.concatenate((loop.plant.initial.position, np.zeros(2 * n)))
-        guard = Guard(config)
-        guard.starting.activate()
-        guard.starting.check_support(measurement)
-        is_shown = effort in ('whole', 'current')
-        assert (guard.starting.error is None) == (
-            is_shown or is_limited or parameter == 'gravity'
-        )
-        if guard.starting.error is not None:
-            assert 'what holds the arm?' in str(guard.starting.error)
-            assert guard.supervisor.reason == 'start rejected'
-            guard = Guard(config)
-            guard.journal.commands = 1  # its own torque holds the arm
-            guard.starting.activate()
-            guard.starting.check_support(measurement)
-            assert guard.starting.error is None
-        asked = blf.change(config, {'safety.first_torque': 'send'})
-        for each, state in ((config, measurement + 0.1), (asked, measurement)):
-            guard = Guard(each)
-            guard.starting.activate()
-            guard.starting.check_support(state)
-            assert guard.starting.error is None
-
-
 def test_restart_on_a_drive_that_holds_a_torque():
     """The first torque replaces the one held, if the effort never contains anything else."""
     config = blf.change(
@@ -225,42 +175,6 @@ def test_restart_on_a_drive_that_holds_a_torque():
     guard = Guard(blf.change(config, steps))
     guard.starting.activate()
     assert guard.update(10**9, held * np.repeat([1.0, 0.0], [14, 7])) is None
-
-
-@pytest.mark.parametrize(
-    ('drive', 'effort'),
-    [('none', 'commanded'), ('gravity', 'whole'), ('gravity', 'current')],
-)
-def test_slow_drift_of_commands_without_effect_shows_in_the_effort(drive, effort):
-    """The law believes that the braked arm moves by 0.5 mrad/s: its torque drifts away from it.
-
-    Too slowly to be told from an arm that a hand holds, without a measured torque.
-    """
-    given = {
-        'robot.effort': effort,
-        'robot.drive_compensates': drive,
-        'safety.error_ratio': 0.0,
-    }
-    config = blf.change(
-        loop_of('panda_rigid').controller, given | {'reference.type': 'hold'}
-    )
-    q = np.array(loop_of('panda_rigid').plant.initial.position)
-    added = added_torque(blf.controller_of(config).settings.torque, q)
-    for follows in (True, False):
-        guard = Guard(config)
-        guard.starting.activate()
-        torque = braked = np.zeros(7)
-        for k in range(3200):
-            applied = (torque if follows else braked) + (
-                added if effort != 'commanded' else 0.0
-            )
-            measurement = np.concatenate((q, np.full(7, 5e-4), applied))
-            torque = guard.update((1000 + k) * 10**6, measurement).copy()
-            if k == 500:
-                braked = torque
-        is_seen = not follows and effort != 'current'
-        assert guard.supervisor.running != is_seen, guard.supervisor.text
-        assert ('lacks' in guard.supervisor.text) == is_seen
 
 
 @pytest.mark.parametrize(
@@ -300,35 +214,3 @@ def test_stop_in_motion_comes_to_rest_and_replays_bit_for_bit(tmp_path):
     assert np.abs(dq[-1]).max() < 0.005
     write_bag(tmp_path / 'bag', record)
     assert blf.verify(tmp_path / 'bag').difference is None
-
-
-def test_friction_that_the_drive_compensates_is_not_fed_forward_a_second_time():
-    """80 % are compensated.
-
-    What is left is learned, and fits the bound better than all of it.
-    """
-    none = {
-        'robot.viscous': [],
-        'robot.coulomb': [],
-        'robot.drive_compensates': 'gravity',
-    }
-    compensated = none | {'robot.drive_compensates': 'gravity_and_friction'}
-    # and robot.coulomb of 6 N m
-    told = {'robot.drive_compensates': 'gravity_and_friction'}
-    names = estimate_names(loop_of('ur5e_rigid').controller)
-    coulomb = [
-        names.index(f'coulomb {joint}')
-        for joint in loop_of('ur5e_rigid').controller.joints
-    ]
-    errors, learned = {}, {}
-    for name, both in {'all': none, 'rest': compensated, 'twice': told}.items():
-        record = run('ur5e_rigid', 12.0, both, None, OWN | {'events.begin': [50.0]})
-        assert record.run().stops == ()
-        errors[name] = ratios(record).max(), ratios(record, 8.0).max()
-        learned[name] = record.sample(-1).estimate[coulomb]
-    assert errors['rest'][0] < 0.8 * errors['twice'][0]  # 0.29, 0.39
-    assert errors['rest'][0] < 0.5 * errors['all'][0]  # 0.29, 0.66
-    assert errors['rest'][1] < errors['all'][1]
-    # in motion; at a reversal Stribeck's friction adds up to half of 6 N m
-    left = 0.2 * 6.0
-    assert np.all((learned['rest'][:3] > left) & (learned['rest'][:3] < left + 3.0))

@@ -8,7 +8,6 @@ import shlex
 from types import SimpleNamespace
 
 import numpy as np
-import pinocchio
 import pytest
 import yaml
 from markdown_it import MarkdownIt
@@ -19,21 +18,19 @@ from random_arm import CONFIG, UR5E
 from rclpy.serialization import serialize_message
 from rclpy.wait_for_message import wait_for_message
 from ros_rig import PATIENCE
+from scenario import Scenario
 from std_msgs.msg import String
 from test_nodes_process import NODES, arguments_of, launched, start  # noqa: F401 - fixtures
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, load
+from blf_dsc_controller.configuration.nodes import load
 from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.guard import Guard
-from sim_plant.plant import plant_of
 
 # What the sources of a driver say; each is named beside it.
 FACTS = {
@@ -94,24 +91,6 @@ def test_file_has_the_joints_and_the_rate_of_the_driver(robot):
         assert tuple(section[1]['ros__parameters']['joints']) == facts.joints
 
 
-def test_urdf_of_the_fr3_has_its_mass_and_its_reach():
-    """franka_description: 2.3966 kg of base and 15.4948 kg of links.
-
-    The flange at q = 0.
-    """
-    model = pinocchio.buildModelFromXML((CONFIG / 'fr3.urdf').read_text())
-    assert sum(inertia.mass for inertia in model.inertias) == pytest.approx(
-        2.3966 + 15.4948, abs=1e-3
-    )
-    data = model.createData()
-    q = np.zeros(7)
-    pinocchio.framesForwardKinematics(model, data, q)
-    flange = data.oMf[model.getFrameId('fr3_link8')].translation
-    np.testing.assert_allclose(
-        flange, [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107], atol=1e-6
-    )
-
-
 @ROBOTS
 def test_launched_nodes_use_the_topics_of_the_driver(launched, start, tmp_path, robot):  # noqa: F811
     facts = FACTS[robot]
@@ -168,22 +147,10 @@ def test_parameter_files_of_the_pages_on_robots_get_no_warning(tmp_path):
     for text in (block.content for block in fences() if 'urdf:' in block.content):
         file = tmp_path / 'my.yaml'
         file.write_text(text.replace('topic://robot_description', 'ur5e.urdf'))
-        config = load(file, CONTROLLER, blf.ControllerConfig)
-        if load(file, DRIVE, DriveConfig).feedback == 'motor':
+        config = load(file, 'blf_dsc_controller', blf.ControllerConfig)
+        if load(file, 'drive', DriveConfig).feedback == 'motor':
             config = as_in_motors(config)
         assert config_warnings(config) == []
-
-
-def test_repeated_reading_does_not_make_the_torque_of_the_ur5e_jump():
-    """It looks like a joint that stops for 2 ms: once 222 N m without a rate limit, usually 8."""
-    loop = blf.load_loop('ur5e_driver')
-    law = blf.change(loop.controller, {'torque.rate_limit': [0.0] * 6})
-    steps = []
-    for every in (0, 100):
-        plant = blf.change(loop.plant, {'duration': 5.0, 'sensor.repeat_every': every})
-        torques = blf.simulate(law, plant).run().torque[500:]
-        steps.append(np.abs(np.diff(torques, axis=0)).max())
-    assert steps[1] < 1.5 * steps[0]
 
 
 @ROBOTS
@@ -192,30 +159,24 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot):
 
     2 kg are picked up at 4 s, and put down at 7 s.
     """
-    loop = blf.load_loop(FACTS[robot].preset)
-    events = {'events.begin': [4.0], 'events.duration': [3.0]}
-    guard = Guard(loop.controller)
-    plant = plant_of(blf.change(loop.plant, events))
-    guard.starting.activate()
-    ratio = 0.0
     random = np.random.default_rng(0)
-    left = 0
-    for k in range(round(9.0 / loop.plant.sample_time)):
-        torque = guard.update(
-            FIRST_STAMP + k * loop.plant.sample_time_ns, plant.measure()
-        )
+    applied, left = None, 0
+
+    def lossy(torque):
+        nonlocal applied, left
         if left == 0:
             applied = torque.copy()
             left = 3 if random.random() < 0.05 else 0
         else:
             left -= 1
-        plant.step(applied)
-        sample = guard.controller.sample
-        ratio = max(ratio, np.max(np.abs(sample.xi1) / sample.bound))
-    assert guard.supervisor.phase == 'tracking'
-    assert not plant.is_stopped
+        return applied
+
+    events = {'events.begin': [4.0], 'events.duration': [3.0]}
+    arm = Scenario(FACTS[robot].preset, plant=events)
+    found = arm.run(9.0, reach=lossy)
+    assert (found.phase[-1], arm.plant.is_stopped) == ('tracking', False)
     # of bounds of 40 and 30 mrad: 2 kg on an outstretched arm take half of either
-    assert ratio < 0.6
+    assert found.ratio < 0.6
 
 
 @pytest.mark.usefixtures('blank_pictures')

@@ -4,14 +4,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
-from math import nan, pi, tau
+from math import pi, tau
 
 import numpy as np
 import pytest
-from fault_table import JOINTS, MILLISECOND, Rig
-from hypothesis import given
-from hypothesis import strategies as st
+from fault_table import JOINTS, Rig
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import (
@@ -23,14 +20,10 @@ from blf_dsc_controller import (
 )
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.control.motion_input import MotionInput
-from blf_dsc_controller.identification.recording import resampled
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryError
-from blf_dsc_controller.reference.turns import short_way
+from blf_dsc_controller.reference.trajectory import Trajectory
 from blf_dsc_controller.supervision.supervisor import Reason
-from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
-from blf_dsc_controller.supervision.wraps import Wraps
 from sim_plant.plant import plant_of
 
 BOUNDED = (share_folder() / 'config' / 'two_link.urdf').read_text()
@@ -69,17 +62,6 @@ def rig_of(urdf=ENDLESS, wrap=None, start=START, **law):
 # Positions that wrap.
 
 
-@pytest.mark.parametrize('lost', [np.nan, np.inf])
-def test_a_turn_is_counted_across_a_state_whose_position_is_lost(lost):
-    wraps = Wraps(build(ControllerConfig, {**ARM, **SWING}))
-    for q in (np.pi - 1e-3, lost, -np.pi + 1e-3):
-        measurement = np.zeros(6)
-        measurement[0] = q
-        got, fault = wraps.count(measurement, 1e-3, 3.0)
-    assert fault is None
-    assert got[0] == pytest.approx(np.pi + 1e-3)
-
-
 @pytest.mark.parametrize('velocity', ['measured', 'estimated'])
 @pytest.mark.parametrize('wrap', [within_a_turn, from_zero])
 def test_wrapping_positions_of_continuous_joints_change_no_torque(wrap, velocity):
@@ -93,23 +75,6 @@ def test_wrapping_positions_of_continuous_joints_change_no_torque(wrap, velocity
         assert rig.supervisor.phase is Phase.TRACKING, rig.supervisor.text
         sent.append(np.array(rig.commands))
     # Rounding of a turn, 4e-16 rad, times the gains, which are below 1e6 N m/rad.
-    np.testing.assert_allclose(sent[1], sent[0], atol=1e-8)
-
-
-@pytest.mark.parametrize('damaged', [nan, 0.0])
-def test_safe_torque_sees_no_wrap_when_velocities_are_lost(damaged):
-    """They are then differenced from the positions, or contradicted by them."""
-    sent = []
-    for wrap in (None, within_a_turn):
-        rig = rig_of(wrap=wrap, **{'safety.damping': [5.0, 5.0]})
-        rig.step(200)
-        sense = rig.sense
-        rig.sense = lambda state, sense=sense: sense(
-            state._replace(dq=np.full(2, damaged))
-        )
-        rig.step(1500)
-        assert rig.supervisor.phase is Phase.SAFE_STOP
-        sent.append(np.array(rig.commands))
     np.testing.assert_allclose(sent[1], sent[0], atol=1e-8)
 
 
@@ -153,17 +118,6 @@ def test_positions_are_believed_at_the_next_start_after_a_wrap():
         assert rig.guard.controller.signals.q[0] == pytest.approx(3.0 - tau, abs=0.01)
 
 
-def test_watchdog_sees_no_wrap_in_its_differenced_velocities():
-    watchdog = TorqueWatchdog(build(ControllerConfig, ARM), 0.05)
-    for k in range(200):  # at 1 rad/s past pi
-        q = within_a_turn([3.1 + 1e-3 * k, 0.0])
-        watchdog.take_state(
-            1 + k * MILLISECOND, np.array([*q, nan, nan, 0, 0]), 1e-3 * k
-        )
-        if k:
-            np.testing.assert_allclose(watchdog._safe.last.dq, [1.0, 0.0], atol=1e-9)
-
-
 def test_bag_of_wrapping_positions_replays_and_its_reference_goes_with_them(tmp_path):
     """What was measured is recorded as it was."""
     config = build(ControllerConfig, ARM | SWING)
@@ -181,59 +135,7 @@ def test_bag_of_wrapping_positions_replays_and_its_reference_goes_with_them(tmp_
     )
 
 
-def test_identification_counts_turns_of_any_source():
-    stamp = np.arange(2000) * MILLISECOND
-    q = np.column_stack((1e-3 * np.arange(2000) * 8.0, np.sin(stamp * 1e-9)))
-    torque = np.zeros_like(q)
-    turning = np.ones(2, bool)
-    plain, counted = (
-        resampled(JOINTS, stamp, each, torque, 'a test', turning)
-        for each in (q, within_a_turn(q))
-    )
-    np.testing.assert_allclose(counted.q[:], plain.q[:], atol=1e-12)
-
-
 # Motions.
-
-ANGLES = st.floats(-50.0, 50.0)
-
-
-@given(
-    positions=st.lists(st.tuples(ANGLES, ANGLES), min_size=1, max_size=6),
-    start=st.tuples(ANGLES, ANGLES),
-)
-def test_each_angle_is_the_same_posture_and_nearest_to_the_one_before(positions, start):
-    config = build(ControllerConfig, {**ARM, 'robot.urdf': HALF_ENDLESS})
-    given = np.array(positions)
-    shifted, told = short_way(given, np.array(start), config)
-    np.testing.assert_array_equal(shifted[:, 1], given[:, 1])  # has a range
-    turns = (shifted - given)[:, 0] / tau
-    np.testing.assert_allclose(turns, np.rint(turns), atol=1e-9)
-    steps = np.diff(shifted[:, 0], prepend=start[0])
-    assert np.abs(steps).max() <= pi + 1e-9
-    assert bool(told) == bool(np.rint(turns).any())
-    kept = np.rint(turns) == 0.0
-    np.testing.assert_array_equal(shifted[kept, 0], given[kept, 0])
-
-
-HALF_ENDLESS = BOUNDED.replace('revolute', 'continuous', 1)
-
-
-@pytest.mark.parametrize(
-    ('limits', 'sent', 'followed'),
-    [
-        ((-20.0, 20.0), -2.9, tau - 2.9),  # the short way from 2.9
-        ((-3.0, 3.0), -2.9, -2.9),  # which a cable forbids
-        ((1.0, 5.0), -2.0, tau - 2.0),  # the only one
-    ],
-)
-def test_limits_of_less_than_a_turn_leave_one_angle(limits, sent, followed):
-    config = build(ControllerConfig, ARM)
-    lower, upper = ((limit,) * 2 for limit in limits)
-    within = replace(config.limits, position_lower=lower, position_upper=upper)
-    config = replace(config, limits=within)
-    (shifted,), _ = short_way(np.full((1, 2), sent), np.full(2, 2.9), config)
-    np.testing.assert_allclose(shifted, followed, atol=1e-12)
 
 
 def resting(q, urdf=ENDLESS, **law):
@@ -278,19 +180,6 @@ def test_normalised_plan_is_followed_the_short_way(start, points):
     np.testing.assert_allclose(q[-1], end, atol=1e-9)
     assert np.abs(q - start).max() < 0.11
     assert np.abs(dq).max() < 0.3  # 0.1 rad/s on average
-
-
-def test_joints_with_a_range_go_where_they_are_sent():
-    """An angle beyond the range stays an error."""
-    rig = resting((3.3, -1.0), BOUNDED)
-    points = tuple(planned(np.array([3.3, -1.0]), [3.4, -1.0])[-1:])
-    late = points[0]._replace(time=30.0)
-    plan = rig.guard.motions.plan(Trajectory(JOINTS, (late,)))
-    assert plan.motion.turned == ''
-    assert sampled(plan.motion.vector, [99.0])[0, 0, 0] == pytest.approx(3.4 - tau)
-    beyond = TrajectoryPoint(5.0, (6.4, -1.0))
-    with pytest.raises(TrajectoryError, match='position_upper'):
-        rig.guard.motions.plan(Trajectory(JOINTS, (beyond,)))
 
 
 class Kept:
