@@ -10,10 +10,10 @@ pytest.importorskip('ruckig', reason='needs ruckig')
 
 from fault_table import Rig
 
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller import TrajectoryPoint, change
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
+from blf_dsc_controller.reference.trajectory import Trajectory
 
 AT_REST = np.array([1.85, 1.6])  # rad
 FIRST = np.array([1.9, 1.4])  # rad

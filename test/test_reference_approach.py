@@ -83,26 +83,12 @@ def test_approach_leads_from_the_measured_state_to_the_reference_as_fast_as_allo
 
 
 def test_motion_beyond_the_limits_is_rejected_with_the_name_of_the_joint():
-    with pytest.raises(blf.MotionError, match=r'limits\.velocity') as rejection:
+    with pytest.raises(blf.MotionError, match=r"'elbow' .*limits\.velocity"):
         approach_to(PAPER, AT_REST, limits(velocity=(1.0, 0.25)))
-    violation = rejection.value.violation
-    assert (violation.joint, violation.quantity) == ('elbow', 'velocity')
-    assert abs(violation.value) == pytest.approx(0.3, rel=1e-4)  # 0.3 sin t
-    assert abs(violation.limit) == 0.25
-
     start = MOVING.copy()
     start[1, 0] = -1.7  # too fast already
-    with pytest.raises(blf.MotionError) as rejection:
+    with pytest.raises(blf.MotionError, match=r"at most 30 s.*'shoulder'.*-1\.5 rad/s"):
         approach_to(PAPER, start, limits())
-    violation = rejection.value.violation
-    assert (violation.joint, violation.quantity, violation.limit) == (
-        'shoulder',
-        'velocity',
-        -1.5,
-    )
-    assert violation.value <= -1.7
-    for part in ('shoulder', '-1.5 rad/s', 'at most 30 s'):
-        assert part in str(rejection.value)
 
 
 CONFIG = blf.ControllerConfig()
@@ -128,12 +114,6 @@ def test_arm_reaches_the_reference_from_anywhere_within_the_bound(start):
     away = np.abs(found.reference - nominal).max(axis=1)
     settled = found.time[away > 1e-14].max()
     assert 0.5 < settled < 5.0  # a step of 2 rad at 1.5 rad/s takes 2.5 s
-
-
-def test_start_inside_the_bound_needs_no_approach():
-    found = run(CONFIG, FIRST + 0.9 * BOUND, 1.0)
-    nominal = sampled(reference_of(CONFIG), found.time)[:, 0]
-    np.testing.assert_allclose(found.reference, nominal, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -198,32 +178,6 @@ def test_hold_reference_stays_where_the_arm_is_or_where_it_comes_to_rest():
     assert np.abs(found.error).max() < 0.5 * BOUND
 
 
-@pytest.mark.parametrize('velocity', ['measured', 'estimated'])
-@pytest.mark.parametrize('rest', [True, False])
-def test_reactivation_on_the_reference_tracks_at_once_only_at_its_velocity(
-    rest, velocity
-):
-    """An arm that the brakes hold needs an approach.
-
-    One that moves with the reference joins it within 0.1 s.
-    """
-    rig = Rig({'safety.velocity': velocity, 'torque.limit': [40.0, 40.0]})
-    rig.step(1500)  # at 0.3 rad/s
-    rig.guard.deactivate()
-    if rest:
-        rig.plant.state[3:5] = 0.0
-    rig.step(1)
-    rig.guard.starting.activate()
-    first = len(rig.commands)
-    rig.step(1500)
-    assert rig.guard.supervisor.running, rig.supervisor.text
-    assert rig.guard.samples.ratio.max() < 0.6
-    # it starts from the beginning, or goes on
-    assert (rig.guard.reference.time < 2.0) == rest
-    assert rest or rig.guard.reference.settled < 1.6
-    assert np.abs(rig.commands[first:]).max() < 15.0
-
-
 def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop():
     rig = Rig()
     rig.step(500)
@@ -238,27 +192,3 @@ def test_reference_continues_after_a_deactivation_but_begins_anew_after_a_stop()
     rig.step(1)
     assert rig.supervisor.running
     assert rig.guard.reference.time == 0.0
-
-
-def test_waypoints_are_read_point_by_point_and_passed_at_their_times():
-    points = np.array([[2.0, 1.0], [2.4, 1.5], [1.8, 1.2]])
-    times = {'reference.type': 'waypoints', 'reference.times': [0.0, 1.5, 3.5]}
-    config = blf.change(
-        CONFIG, times | {'reference.waypoints': points.ravel().tolist()}
-    )
-    motion = sampled(reference_of(config), [0.0, 1.5, 3.5, 5.0])
-    np.testing.assert_allclose(motion[:, 0], points[[0, 1, 2, 2]], atol=1e-12)
-    np.testing.assert_array_equal(motion[[0, 2, 3], 1], 0.0)
-
-
-@pytest.mark.parametrize('at', [120.0, -2.0 * np.pi - 0.11])
-def test_arm_far_beyond_its_limits_is_not_held(at):
-    """For example, an arm that reports degrees."""
-    config = blf.change(CONFIG, {'reference.type': 'hold'})
-    with pytest.raises(
-        blf.StartError,
-        match=r"joint 'joint2' would be held at .* rad, and its limits are -6.2.*degrees, give",
-    ):
-        plan_start(config, np.full(2, BOUND), np.array([0.0, at]), STILL)
-    at_rest = np.array([0.0, 2.0 * np.pi + 0.09])
-    assert plan_start(config, np.full(2, BOUND), at_rest, STILL).settled == 0.0

@@ -52,20 +52,6 @@ def value_at(terms, t):
     return out
 
 
-def test_terms_are_sums_of_tones_or_polynomials_of_the_current_piece():
-    for t in (0.0, 1.234, 60.0):
-        tones = np.cos(np.array(FREQUENCY) * t + PHASE)
-        expected = OFFSET + np.array(AMPLITUDE) @ tones
-        np.testing.assert_allclose(value_at([SINUSOIDS], t)[0], expected, atol=1e-15)
-    for piece, t in ((0, 0.4), (0, 0.9), (1, 1.0), (2, 1.5), (3, 3.0), (3, 5)):
-        expected = np.polynomial.polynomial.polyval(
-            t - KNOTS[piece], COEFFICIENTS[piece].T
-        )
-        np.testing.assert_allclose(value_at([SPLINE], t)[0], expected, rtol=1e-13)
-    before = value_at([SPLINE], 0.39)  # at rest at its first point
-    np.testing.assert_array_equal(before, [COEFFICIENTS[0, :, 0], [0] * 3, [0] * 3])
-
-
 @pytest.mark.parametrize('terms', KINDS.values(), ids=KINDS)
 @pytest.mark.parametrize('t', [0.1, 0.7, 1.05, 1.234, 3.5])
 def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t):
@@ -78,29 +64,6 @@ def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t
 
     np.testing.assert_allclose(dqr, rate[0], atol=1e-9)
     np.testing.assert_allclose(ddqr, rate[1], atol=1e-9)
-
-
-def test_terms_are_blended_by_the_minimum_jerk_step():
-    both = [SINUSOIDS, LATER]
-    for t, s in ((0.5, 0.0), (1.3, 0.5), (2.1, 1.0)):
-        expected = (1.0 - s) * value_at([SINUSOIDS], t)[0] + s * value_at([SPLINE], t)[
-            0
-        ]
-        np.testing.assert_allclose(value_at(both, t)[0], expected, rtol=1e-13)
-    # Before and after only one of them counts, to the last bit; also without a blend.
-    at_once = [SINUSOIDS, SPLINE._replace(begin=1.5)]
-    for terms, alone, times in (
-        (both, SINUSOIDS, (0.0, 0.49, 0.5)),
-        (both, SPLINE, (2.1, 2.2, 50.0)),
-        (at_once, SINUSOIDS, (1.4999,)),
-        (at_once, SPLINE, (1.5,)),
-    ):
-        for t in times:
-            np.testing.assert_array_equal(value_at(terms, t), value_at([alone], t))
-    # over 2e-9 s the jerk, below 1e4 here, moves the acceleration by 2e-5
-    for t in (0.5, 2.1):
-        before, after = (value_at(both, t + side) for side in (-1e-9, 1e-9))
-        np.testing.assert_allclose(before, after, atol=1e-4)
 
 
 MOMENTS = np.array([0.5, 1.0, 1.2, 2.5, 4.0])
@@ -183,16 +146,6 @@ def test_trajectory_continues_the_reference_passes_its_points_and_holds_the_last
     np.testing.assert_array_equal(plan(swapped).vector, motion.vector)
 
 
-def test_trajectory_that_begins_now_at_another_position_is_blended_in():
-    """A second one, planned while the blend is under way, is settled with that blend."""
-    first = plan(trajectory((GOALS[::-1],), times=(0.0, 4.0, 8.0)))
-    assert NOW + 0.1 < first.settled < NOW + 4.0
-    np.testing.assert_allclose(at(first.vector, NOW), at(PAPER, NOW), atol=1e-13)
-    np.testing.assert_allclose(at(first.vector, NOW + 4.0)[0], GOALS[1], atol=1e-12)
-    later = plan(trajectory(begin=first.settled + 0.5), first.vector, NOW + 0.05)
-    assert later.settled == first.settled
-
-
 def test_present_reference_continues_until_the_trajectory_begins_and_past_points_are_skipped():
     later = plan(trajectory(begin=5.0)).vector
     for t in (NOW, 4.0, 4.999):
@@ -202,19 +155,6 @@ def test_present_reference_continues_until_the_trajectory_begins_and_past_points
     late = plan(trajectory(begin=NOW - 1.5)).vector
     np.testing.assert_allclose(at(late, NOW), at(PAPER, NOW), atol=1e-13)
     np.testing.assert_allclose(at(late, NOW + 0.5)[0], GOALS[1], atol=1e-12)
-
-
-def test_later_trajectory_replaces_running_and_waiting_ones():
-    first = plan(trajectory()).vector
-    waiting = plan(trajectory(begin=20.0), first, NOW + 1.0).vector
-    last = plan(trajectory((GOALS[::-1] + 0.1,)), waiting, NOW + 1.5).vector
-    np.testing.assert_allclose(at(last, NOW + 1.5), at(first, NOW + 1.5), atol=1e-12)
-    for t in (NOW + 5.0, 22.0):
-        np.testing.assert_allclose(at(last, t)[0], GOALS[0] + 0.1, atol=1e-12)
-    for k in range(20):  # what is finished is forgotten
-        last = plan(trajectory((GOALS + 0.01 * k,)), last, NOW + 2.0 + k).vector
-        last = remaining(last, NOW + 2.0 + k)
-        assert len(unpack(last)) == 1
 
 
 REPEATED = trajectory((np.hstack((GOALS, GOALS[:, 1:])),), joints=(*JOINTS, 'elbow'))
@@ -251,13 +191,6 @@ def test_invalid_trajectory_is_rejected_with_the_reason():
         with pytest.raises(blf.TrajectoryError) as rejection:
             plan(bad)
         assert reason in str(rejection.value)
-
-
-def test_all_problems_are_reported_at_once():
-    points = blf.TrajectoryPoint(1.0, (1.0,)), blf.TrajectoryPoint(2.0, (np.nan, 1.0))
-    with pytest.raises(blf.TrajectoryError) as rejection:
-        plan(Trajectory(('shoulder', 'wrist'), points))
-    assert len(rejection.value.problems) == 3
 
 
 def moving(velocity, acceleration=(0.0, 0.0)):
@@ -301,20 +234,6 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
 MIDDLE = limited([-3.07, -1.0], [-0.07, 3.0])
 
 
-@pytest.mark.parametrize(
-    ('goal', 'limit'),
-    [((-0.05, 1.0), -0.07), ((-3.09, 1.0), -3.07), ((-1.0, -1.02), -1.0)],
-)
-def test_position_limits_about_a_middle_that_is_not_zero_are_kept(goal, limit):
-    """Also where the position itself is smaller than the other limit of the joint."""
-    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
-    sent = trajectory((np.array([goal]),), times=(6.0,))
-    with pytest.raises(blf.TrajectoryError, match=f'past its limit of {limit:g} rad'):
-        plan_trajectory(sent, at_rest, 0.0, MIDDLE)
-    inside = np.array([goal]) + 0.04 * np.sign([-1.57 - goal[0], 1.0 - goal[1]])
-    plan_trajectory(trajectory((inside,), times=(6.0,)), at_rest, 0.0, MIDDLE)
-
-
 # Trajectories that the limits do not allow as they are sent.
 
 
@@ -355,17 +274,6 @@ def test_path_is_stretched_no_more_than_the_limits_ask_for():
         np.testing.assert_allclose(dq, rates[k] / factor, atol=1e-5)
     # each try is 1 % slower than needed (`_MARGIN`)
     assert max(limits_used(motion, 0.0, motion.end)) > 0.95
-
-
-def test_path_that_is_only_too_fast_is_stretched_by_the_ratio_of_its_velocity():
-    """Over 3 rad within 3 s, by minimum jerk: at most 1.875 rad/s of 1.5, 1.9 rad/s^2 of 6."""
-    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
-    middle = np.array([[1.5, 0.0]]), np.array([[1.875, 0.0]]), np.zeros((1, 2))
-    end = np.array([[3.0, 0.0]]), np.zeros((1, 2)), np.zeros((1, 2))
-    points = tuple(np.vstack(each) for each in zip(middle, end, strict=True))
-    motion = plan(trajectory(points, times=(1.5, 3.0)), at_rest, 0.0)
-    assert motion.end == pytest.approx(3.0 * 1.875 / 1.5, rel=2e-3)
-    assert max(limits_used(motion, 0.0, motion.end)) == pytest.approx(1.0, rel=2e-3)
 
 
 def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow():
