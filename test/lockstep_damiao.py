@@ -18,14 +18,14 @@ from motor_arm import RIGID
 import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.motor_options import limits_of, mounting_of
-from blf_dsc_controller.configuration.nodes import DRIVE, load, locate
+from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.drive.damiao import DamiaoDriver
 from blf_dsc_controller.drive.ticks import Ticks
 from sim_plant.damiao import DamiaoArm
 
 PATIENCE = 20.0  # s, for an answer of a thread
 _CLOSED = 0.05  # s, after which it is seen that the bus is closed
-OPENARM = load(locate('openarm'), DRIVE, DriveConfig)
+OPENARM = load(locate('openarm'), 'drive', DriveConfig)
 LIMITS, MODELS = limits_of(OPENARM, 7), OPENARM.motor_models
 YAM = 6  # joints
 

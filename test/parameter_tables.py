@@ -13,7 +13,7 @@ from pathlib import Path
 
 from blf_dsc_controller.configuration import known_arm, law_file, two_link
 from blf_dsc_controller.configuration.law_traits import GAINS
-from blf_dsc_controller.configuration.nodes import CONTROLLER, NODES
+from blf_dsc_controller.configuration.nodes import NODES
 from blf_dsc_controller.configuration.schema import (
     Parameter,
     format_value,
@@ -32,7 +32,7 @@ def with_tables(page: str) -> str:
     tables: dict[str, str] = {}
     sections = [
         _section(node, parameters(cls), tables)
-        + (_optional() if node == CONTROLLER else '')
+        + (_optional() if node == 'blf_dsc_controller' else '')
         for node, cls in NODES.items()
     ]
     return above + ''.join(sections)

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller import PlantConfig
 from blf_dsc_controller.configuration.schema import build, parameters
 from sim_plant.arm import PointMassArm
 from sim_plant.plant import plant_of

@@ -14,12 +14,8 @@ import recorded_run
 from command import finished
 from recorded_run import Synthetic, limited_files, small_disk
 
-from blf_dsc_controller import load_loop
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.parser import make_parser
-from blf_dsc_controller.cli.run import loop_configuration, notes_on_ideal_arm
 from blf_dsc_controller.compiled.announcement import COMPILING
-from blf_dsc_controller.configuration.nodes import CONTROLLER
 
 INTERRUPTED_WHILE_COMPILING = """
 import os, signal, sys
@@ -96,40 +92,6 @@ def test_place_that_cannot_be_written_is_refused_before_minutes_of_work(
     assert main([str(bag) if each == 'BAG' else each for each in words.split()]) == 1
     assert 'there is no folder no: make it, or choose' in capfd.readouterr().err
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize(
-    ('command', 'what'),
-    [
-        ('report', 'drawn'),
-        ('replay', 'run through the controller again'),
-        ('commission --config ur5e', 'read'),
-    ],
-)
-def test_work_on_a_large_bag_is_announced(tmp_path, monkeypatch, capsys, command, what):
-    monkeypatch.chdir(tmp_path)
-    large = tmp_path / 'long' / 'bag_0.mcap'
-    large.parent.mkdir()
-    for size, lines in ((9_000_000, 1), (12_000_000, 2)):
-        with large.open('wb') as file:
-            file.truncate(size)  # takes no space on the disk
-        assert main([*command.split(), 'long']) == 1  # it is no bag
-        told = capsys.readouterr().err.splitlines()
-        assert len(told) == lines
-    assert told[0] == f'long: 12 MB are {what}'
-
-
-def test_run_says_that_its_simulated_arm_is_ideal_and_that_nothing_moves(tmp_path):
-    path = tmp_path / 'my.yaml'
-    path.write_text('/**: {ros__parameters: {robot: {urdf: ur5e.urdf, tip: tool0}}}\n')
-    rigid, holds = notes_on_ideal_arm(load_loop(path))
-    assert 'exactly that of the URDF, on rigid gears' in rigid
-    assert 'reference.type is hold' in holds
-    still = {CONTROLLER: {'reference.type': 'sinusoids'}}
-    assert (
-        'reference.amplitude is 0' in [*notes_on_ideal_arm(load_loop(path, still))][1]
-    )
-    assert [*notes_on_ideal_arm(load_loop('ur5e'))] == []
 
 
 def test_interrupt_during_kernel_compilation_ends_the_command():
@@ -276,59 +238,6 @@ def test_output_that_nobody_takes_ends_in_a_sentence_or_silently(
     assert run.stderr.startswith(said)
     assert len(run.stderr.splitlines()) == bool(said)
     assert (tmp_path / 'a.csv').stat().st_size > 1000
-
-
-def test_name_that_the_shell_cannot_write_is_told_with_the_remedy(
-    tmp_path, monkeypatch, capsys
-):
-    def report(_):
-        'ü'.encode('ascii')
-
-    monkeypatch.setattr('blf_dsc_controller.cli.bags.report', report)
-    assert main(['report', str(tmp_path)]) == 1
-    assert "'\\xfc' cannot be written" in capsys.readouterr().err
-
-
-def test_run_over_ros_without_a_limit_gets_a_plant_without_a_limit():
-    options = make_parser().parse_args(['run', '--duration', '0'])
-    assert loop_configuration(options).plant.duration == 0.0
-    options = make_parser().parse_args(['run'])
-    assert loop_configuration(options).plant.duration == 60.0
-
-
-def test_sections_that_no_node_reads_are_named_once(tmp_path, capsys):
-    path = tmp_path / 'given.yaml'
-    names = ['controller', '/**/blf_dsc', '/robot/**', 'joint_state_broadcaster']
-    path.write_text(
-        ''.join(f'{name}:\n  ros__parameters: {{seed: 1}}\n' for name in names)
-        + 'sim_plant:\n  ros__parameters: {seed: 1}\n'
-        + 'monte_carlo:\n  ros__parameters: {runs: 10}\n'
-    )
-    words = '--config', path, '--offline', '--duration', 0.1, '--out', tmp_path / 'out'
-    (warning,) = (
-        line for line in here(capsys, *words).stderr.splitlines() if 'no node' in line
-    )
-    found = warning.partition(' the sections ')[2].partition(': ')[0]
-    assert found == (
-        '/controller (line 2), /**/blf_dsc (line 4), /joint_state_broadcaster (line 8), '
-        '/robot/** (line 6)'
-    )
-
-
-def test_node_names_the_sections_that_it_does_not_read(tmp_path):
-    pytest.importorskip('rclpy', reason='needs ROS 2')
-    path = tmp_path / 'given.yaml'
-    path.write_text(
-        '/**:\n  ros__parameters: {seed: 1}\n'
-        'controller:\n  ros__parameters: {duration: 0.1}\n'
-        'sim_plant:\n  ros__parameters: {sede: 1}\n'
-    )
-    from blf_dsc_controller.nodes.ros_arguments import check_sections
-
-    argv = ['node', '--ros-args', '--params-file', str(path)]
-    (remark,) = check_sections(argv, '/sim_plant')
-    assert 'reads the sections /controller (line 4)' in remark
-    assert '(line 2)' not in remark
 
 
 @pytest.mark.parametrize(

@@ -160,34 +160,6 @@ def test_positions_of_motors_are_recorded_and_identification_reads_them(wire):
     assert_replays(wire.folder / 'bag')
 
 
-# In a process of its own: libfranka raises the priority of the thread that connects.
-DECLARED = """
-import sys, pylibfranka
-robot = pylibfranka.Robot(sys.argv[1], pylibfranka.RealtimeConfig.kIgnore)
-robot.set_load(1.0, [0.0, 0.0, 0.1], [0.001, 0, 0, 0, 0.001, 0, 0, 0, 0.001])
-"""
-
-
-def test_load_that_is_declared_and_not_there_makes_no_step(wire, tmp_path):
-    """1 kg in Desk, of which nobody tells the law.
-
-    It lifts the arm, which is taken over in motion, or refused if it is too fast for that.
-    """
-    preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()
-    untold = preset.replace('driver: franka', 'driver: franka\n    set_load: false')
-    # the gains of the preset are so soft that they take the load without a step
-    untold = re.sub(r'joint_stiffness: .*', 'inertia: whole', untold)
-    untold = re.sub(r' *joint_damping: .*\n', '', untold)
-    (tmp_path / 'my.yaml').write_text(untold)
-    wire.simulate()
-    assert ended(wire.start('-c', DECLARED, wire.address))[0] == 0
-    code, output = ended(wire.drive(1, '--config', tmp_path / 'my.yaml'))
-    refused = 'more than the 1 N m that its drive tolerates'
-    held = 'end           the duration is over'
-    assert (held if code == 0 else refused) in output
-    assert 'reflex' not in output
-
-
 def told_config():
     """Return the preset with `load.tell_drive`."""
     preset = (blf.share_folder() / 'config/fr3_direct.yaml').read_text()

@@ -18,16 +18,13 @@ from recorded_run import limited_files
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.drive.driver import (
     DriverError,
     Facts,
     disagreements,
 )
-from blf_dsc_controller.drive.driver_declaration import DriverDeclaration
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 from sim_plant.plant import plant_of
 from sim_plant.settings import plant_settings
 
@@ -94,19 +91,6 @@ def test_it_ends_at_rest_and_the_bag_replays_bit_equal(address, end, tmp_path):
     np.testing.assert_array_equal(
         recorded.torque, driver.torques[: len(recorded.torque)]
     )
-
-
-def test_arm_that_does_not_come_to_rest_is_left_after_settle_time(monkeypatch):
-    """0.3 s of 1 ms each, and 0.2 s, but for the rounding of stamps."""
-    driver = PlantDriver('mistaken@1000', CONFIG, DriveConfig())  # if it goes on
-    driver.connect()
-    monkeypatch.setattr(blf.ArmController, 'is_settled', False)
-    with blf.ArmController(CONFIG) as controller:
-        loop = DriveLoop(driver, controller, duration=0.3, settle_time=0.2)
-        outcome = loop.run()
-    assert outcome.end is End.DURATION
-    assert outcome.states == pytest.approx(501, abs=1)
-    assert driver.calls[-1] == 'finish'
 
 
 def test_a_second_request_ends_at_once(tmp_path):
@@ -248,7 +232,7 @@ class LoadedDriver(PlantDriver):
 
 
 def run_with_load(driver, duration, given=TOLD, record=None):
-    config = blf.load_loop('fr3_direct', {CONTROLLER: given}).controller
+    config = blf.load_loop('fr3_direct', {'blf_dsc_controller': given}).controller
     made = driver('plant', config, DriveConfig())
     made.connect()
     with blf.ArmController(config, record=record) as controller:
@@ -314,58 +298,6 @@ def test_run_with_all_of_it_replays_bit_for_bit(all_of_it):
     t = run.time_of(run.monitor.stamp)
     assert PUSHED < t[contact > 0.0].min() < PUSHED + 0.1
     assert latched[-1] == 1.0
-
-
-def test_drives_that_refuse_a_load_are_asked_once():
-    class Refusing(LoadedDriver):
-        refuses = True
-
-    driver, loop, _ = run_with_load(Refusing, 8.0)
-    assert loop.remark == 'the load was refused: see Desk'
-    assert driver.mass == 0
-
-
-def test_drives_that_forbid_it_are_not_told_while_they_move():
-    class Forbidding(LoadedDriver):
-        facts = LoadedDriver.facts._replace(load_in_motion=False)
-
-    driver, loop, _ = run_with_load(Forbidding, 8.0)
-    assert not driver.told
-    assert not loop.remark
-
-
-class ReportingDriver(PlantDriver):
-    """A robot that says which load is in force, or None."""
-
-    facts = LoadedDriver.facts
-    in_force = None
-
-    def tell_load(self, load):
-        pass
-
-    def load_in_force(self):
-        return self.in_force
-
-
-def test_load_is_taken_over_when_it_is_in_force_not_when_it_is_accepted(monkeypatch):
-    """A robot that reports its load may add it some states after its answer."""
-    config = blf.load_loop('fr3_direct', {CONTROLLER: TOLD}).controller
-    controller = blf.ArmController(config)
-    load = DriveLoad(1.0, (0.0, 0.0, 0.0))
-    taken = []
-    monkeypatch.setattr(controller, 'load_to_tell', lambda: load)
-    monkeypatch.setattr(controller, 'take_over', taken.append)
-    driver = ReportingDriver('', config, DriveConfig())
-    driver.in_force = 0.0
-    declaration = DriverDeclaration(driver)
-    for _ in range(20):  # from one step to the next
-        declaration.follow(controller, in_motion=True)
-    declaration.close()  # it has answered
-    declaration.follow(controller, in_motion=True)
-    assert taken == []
-    driver.in_force = np.float32(1.0 + 5e-6)
-    declaration.follow(controller, in_motion=True)
-    assert taken == [load]
 
 
 FACTS = Facts(2, 0.001, 'none', 'unknown', (20.0, 20.0), (inf, inf))

@@ -17,7 +17,7 @@ import pytest
 from command import wait_for
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.errors import LoopEndedError
+from blf_dsc_controller import LoopEndedError
 
 pytest.importorskip('lerobot', reason='needs LeRobot')
 pytest.importorskip('ruckig', reason='needs ruckig')

@@ -6,24 +6,25 @@ What no serial chain has is refused by name.
 
 from __future__ import annotations
 
-import re
 import sys
-from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 from random_arm import CONFIG, PANDA, UR5E
 
+from blf_dsc_controller import (
+    BlfDscError,
+    ConfigurationError,
+    ControllerConfig,
+    PlantConfig,
+)
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import serial_chain
 from blf_dsc_controller.arms.urdf import frames, read_chain
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.files import resolve
-from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.configuration.schema import build, flatten
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 
 OPENARM = 'package://openarm_mujoco/v2/openarm_bimanual.xml'
 FR3 = 'package://franky_sim/assets/fr3.xml'
@@ -222,37 +223,6 @@ def test_mjcf_and_urdf_of_an_arm_are_the_same_chain(name, joints, tip):
         assert each.friction == pytest.approx(expected.friction)
 
 
-def test_preset_widowx_has_the_armatures_and_limits_of_its_mjcf():
-    """As trossen_arm_sim 0.2.3 has them."""
-    robot, chain = robot_of({'robot.urdf': 'widowx.urdf', 'robot.tip': 'ee_site'})
-    assert robot.rotor_inertia == (0.032,) * 3 + (0.0018,) * 3
-    assert [each.effort for each in chain.joints] == [27.0] * 3 + [7.0] * 3
-    guessed = [each.effort / 400.0 for each in chain.joints]
-    ratios = np.array(guessed) / robot.rotor_inertia
-    np.testing.assert_allclose(ratios, [2.1] * 3 + [9.7] * 3, atol=0.05)
-
-
-def test_preset_yam_has_the_weight_the_zero_posture_and_the_limits_that_its_maker_states():
-    """As the README of i2rt 1.2.4 beside its MJCF has them, which its gripper adds to."""
-    robot, chain = robot_of({'robot.urdf': 'yam.urdf', 'robot.tip': 'link6'})
-    moved = 4.291977 - 0.873654  # kg, all but the base
-    gripper = 0.553219 + 2.0 * 0.0710042
-    masses = [each.inertia[0] for each in chain.joints]
-    assert sum(masses) == pytest.approx(moved + gripper, abs=1e-6)
-    home = frames(chain, np.zeros((1, 6)))[-1][0]
-    wanted = [
-        [0.0, 0.0, -1.0, 0.110597],
-        [0.0, -1.0, 0.0, 0.0],
-        [-1.0, 0.0, 0.0, 0.173502],
-    ]
-    np.testing.assert_allclose(home[:3], wanted, atol=6e-6)  # axes are off by 4e-6 rad
-    lower = np.degrees([each.lower for each in chain.joints])
-    upper = np.degrees([each.upper for each in chain.joints])
-    np.testing.assert_allclose(lower, [-150, 0, 0, -97, -90, -120], atol=1e-3)
-    np.testing.assert_allclose(upper, [180, 210, 180, 90, 90, 120], atol=1e-3)
-    assert robot.rotor_inertia == (0.032,) * 3 + (0.0018,) * 3
-
-
 ARM = """<mujoco>
   <compiler angle="radian"/>
   <default>
@@ -273,29 +243,10 @@ ARM = """<mujoco>
   {more}
 </mujoco>
 """
-FINGERS = """<body name="left"><inertial pos="0 0 0" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>
-<joint name="left" type="slide"/></body><body name="right">
-<inertial pos="0 0 0" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/><joint name="right" type="slide"/>
-</body>"""
 
 
 def arm(**parts):
     return ARM.format(**{'upper': '', 'lower': '', 'beyond': '', 'more': ''} | parts)
-
-
-def test_dynamics_of_joints_are_their_own_behind_a_free_body(tmp_path):
-    """It has one joint, but six degrees of freedom."""
-    ball = (
-        '<body name="ball"><freejoint/>'
-        '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body>'
-    )
-    path = tmp_path / 'arm.xml'
-    text = arm(lower='frictionloss="0.7" damping="0.9" armature="0.3"')
-    path.write_text(text.replace('<worldbody>', f'<worldbody>{ball}'))
-    robot, chain = robot_of({'robot.urdf': str(path), 'robot.tip': 'tool'})
-    assert [each.friction for each in chain.joints] == [0.2, 0.7]
-    assert [each.damping for each in chain.joints] == [0.5, 0.9]
-    assert tuple(robot.rotors(chain)) == (0.1, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -338,28 +289,7 @@ def test_actuators_add_to_armature_and_damping_through_their_gear():
     agrees(robot, chain, mujoco.MjModel.from_xml_string(text))
 
 
-GRIP = (
-    '<tendon><fixed name="grip" range="0 1" limited="true">'
-    '<joint joint="left" coef="1"/></fixed></tendon>'
-)
 POST = '</body></body><body name="post"><site name="wall"/><body name="beside"><site/>'
-COUPLED = '<equality><joint name="pair" joint1="left" joint2="right"/></equality>'
-
-
-@pytest.mark.parametrize(
-    'more',
-    [
-        COUPLED,
-        '<equality><connect body1="left" body2="right" anchor="0 0 0"/></equality>',
-        GRIP,
-        '<equality><joint joint1="elbow" active="false"/></equality>',
-    ],
-)
-def test_what_couples_only_held_joints_is_no_matter(more):
-    text = arm(beyond=FINGERS, more=more)
-    chain = robot_of({'robot.urdf': text, 'robot.tip': 'tool'})[1]
-    assert [joint.name for joint in chain.joints] == ['shoulder', 'elbow']
-    assert chain.joints[-1].inertia[0] == pytest.approx(1.2)
 
 
 def cable(acts, more=''):
@@ -416,16 +346,6 @@ def test_what_no_serial_chain_has_is_refused_by_name(parts, expected):
         assert each in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ('upper', 'kind'), [('type="ball"', 'ball'), ('type="free"', 'free')]
-)
-def test_other_joints_are_refused_with_mujocos_word(upper, kind):
-    given = 'name="shoulder" class="drive" axis="0 1 0"'
-    text = arm(upper=upper).replace(given, 'name="shoulder"')
-    with pytest.raises(ConfigurationError, match=f"joint 'shoulder' is {kind}"):
-        build(PlantConfig, {'robot.urdf': text, 'robot.tip': 'tool'})
-
-
 def test_file_with_includes_becomes_one_text_that_needs_neither_files_nor_mujoco(
     tmp_path, monkeypatch
 ):
@@ -452,35 +372,3 @@ def test_without_mujoco_the_error_says_how_to_install_it(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, 'mujoco', None)
     with pytest.raises(BlfDscError, match=r'arm\.xml is MJCF.*pip install'):
         Robot(urdf=str(file)).chain(())
-
-
-def test_an_error_names_file_and_element(tmp_path):
-    file = tmp_path / 'arm.xml'
-    file.write_text(arm(lower='type="hing"'), encoding='utf-8')
-    with pytest.raises(
-        BlfDscError, match=r"arm\.xml: .*'hing'.*Element 'joint', line 12"
-    ):
-        Robot(urdf=str(file)).chain(())
-
-
-@pytest.mark.parametrize(
-    ('old', 'new', 'problem'),
-    [
-        ('armature="0.1"', 'armature="-1"', 'cannot be negative'),
-        ('armature="0.1"', 'armature="much"', 'expected 1 finite number'),
-        ('gravity="0.0 0.0 -9.81"', 'gravity="0 nan 0"', 'expected 3 finite number'),
-    ],
-)
-def test_a_urdf_can_say_the_same_and_is_checked(old, new, problem):
-    robot = build(PlantConfig, {'robot.urdf': arm(), 'robot.tip': 'tool'}).robot
-    text = robot.urdf.replace(old, new)
-    with pytest.raises(ConfigurationError, match=problem):
-        build(PlantConfig, {'robot.urdf': text, 'robot.tip': 'tool'})
-
-
-def test_space_before_the_value_of_an_attribute_is_no_matter():
-    """XML allows it: an armature that is not read would be guessed."""
-    robot = build(PlantConfig, {'robot.urdf': arm(), 'robot.tip': 'tool'}).robot
-    spaced = re.sub(r'(armature|gravity)=', r'\1 = ', robot.urdf)
-    given = {'robot.urdf': spaced, 'robot.tip': 'tool'}
-    assert build(PlantConfig, given).robot == replace(robot, urdf=spaced)

@@ -9,13 +9,12 @@ import re
 import pytest
 import recorded_run
 
+from blf_dsc_controller import BlfDscError, load_loop, simulate
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration import mjcf
-from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import CHANGES, JOURNAL
-from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.simulation.loop import write_bag
 
 REPLICAS = (
     '<replicate count="1000">' * 3

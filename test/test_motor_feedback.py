@@ -8,21 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from motor_arm import ELASTIC, LEROBOT, RANGES, TORQUE, MotorDriver, loop_of
-from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
+from blf_dsc_controller import Phase, load_loop
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.motor_options import limits_of
-from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load, load_loop, locate
-from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.drive.driver import DriverError, check_feedback
+from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.drive.motor_feedback import MotorFeedback, as_in_motors
-from blf_dsc_controller.drive.simulated import simulated
-from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law.local_gains import LocalGains
+from blf_dsc_controller.drive.motor_feedback import MotorFeedback
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.frame import (
     Gains,
@@ -30,13 +24,9 @@ from blf_dsc_controller.motors.frame import (
     split,
     torque_alone,
 )
-from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
-from blf_dsc_controller.supervision.expected_errors import expected_errors
-from blf_dsc_controller.supervision.supervisor import Phase
 from sim_plant.motors import MotorPlant
 
 SLOW = 0.004  # s
-MODELS = ['8009', '8009', '4340', '4340', '4310', '4310', '4310']
 
 
 def test_sum_of_a_frame_is_the_torque_up_to_the_rounding_of_the_last_field():
@@ -55,59 +45,6 @@ def test_sum_of_a_frame_is_the_torque_up_to_the_rounding_of_the_last_field():
         assert whole.sum() >= 3  # of most joints, the rest fits into its range
         wanted = np.minimum(gains.stiffness, 500.0)
         assert (np.abs(frame.stiffness - wanted)[whole] < 0.07).all()  # half a step
-
-
-def test_mean_torque_of_an_arm_that_follows_is_that_of_the_law():
-    """The frame is held for a period, in which the reference moves on by dq T."""
-    dq, half = np.full(7, 2.0), 0.5 * SLOW
-    q, rest = np.zeros(7), np.zeros(7)
-    gains = Gains(np.full(7, 200.0), rest)
-    ahead = Motion(q + dq * half, dq)
-    frame = split(rest, Motion(q, dq), Motion(q, dq), ahead, gains, RANGES)
-    begins, ends = (frame.torque_at(q + dq * t, dq) for t in (0.0, SLOW))
-    step = RANGES.torque.step
-    assert (np.abs(begins + ends) <= step + 1e-12).all()
-    assert (begins > 0.5).all()  # with q_r in the frame, 0 N m to -1.6 N m instead
-
-
-def test_a_remainder_beyond_its_range_leaves_the_torque_alone():
-    q = np.zeros(7)
-    far = Motion(q + 0.5, q)
-    gains = Gains(np.full(7, 400.0), np.ones(7))
-    frame = split(q + 1.0, Motion(q, q), far, far, gains, RANGES)
-    assert not frame.stiffness.any()
-    assert not frame.damping.any()
-    np.testing.assert_allclose(frame.torque, 1.0, atol=0.5 * RANGES.torque.step.max())
-
-
-@pytest.mark.parametrize('inside', [0.0, 0.5, 0.9])
-def test_local_gains_are_what_a_lasting_deviation_changes(inside):
-    """By differences, with the filter of the surface settled; `inside` of the bound."""
-    config = change(
-        loop_of(SLOW, LEROBOT).controller,
-        {'reference.type': 'hold', 'disturbance.gain': [0.0] * 7},
-    )
-    found = []
-    bound = np.array(config.barrier.bound)
-    for deviation, speed in ((0.0, 0.0), (1e-6, 0.0), (0.0, 1e-6)):
-        law = blf.ArmController(config).guard.controller
-        law.state.alpha2[:] = 0.0
-        q = np.array(config.reference.offset) + inside * bound + deviation
-        law.settings.adaptation.adaptation_gain[:] = 0.0
-        for k in range(200 if speed == 0.0 else 1):
-            law.update(100.0 + k * SLOW, SLOW, np.concatenate((q, np.zeros(14))))
-        saved = law.save()
-        q0 = np.concatenate((q, np.full(7, speed), np.zeros(7)))
-        law.restore(saved)
-        law.update(100.0 + 201 * SLOW, SLOW, q0)
-        signals = law.signals
-        found.append(signals.demand - signals.model_torque)
-        gains = LocalGains(law).now().copy()
-    stiffness = (found[0] - found[1]) / 1e-6
-    np.testing.assert_allclose(gains[0], stiffness, rtol=1e-3)
-    if inside == 0.0:
-        wanted = np.array(LEROBOT['feedback.joint_damping'])
-        np.testing.assert_allclose(gains[1], wanted, rtol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -149,8 +86,8 @@ def test_motion_by_hand_sends_motors_the_torque_that_a_bag_records(
     ]
     assert main(['commission', '--config', 'my.yaml', *words]) == 0
     assert 'measures with torques over the bus' in capsys.readouterr().err
-    assert load(Path('my.yaml'), DRIVE, DriveConfig).feedback == 'motor'
-    assert load(Path('motion_1.yaml'), DRIVE, DriveConfig).feedback == 'host'
+    assert load(Path('my.yaml'), 'drive', DriveConfig).feedback == 'motor'
+    assert load(Path('motion_1.yaml'), 'drive', DriveConfig).feedback == 'host'
 
 
 def run(loop, feedback, duration, dies_after=2.0, loses=0):
@@ -214,11 +151,13 @@ def test_yam_of_the_preset_takes_up_its_rated_payload_with_the_gains_of_its_make
     """20 s, 1 kg at 8 s: doc/motor_arms.md.  Play of 15 minutes of arc, frames of 0.38 mrad."""
     if physics == 'mujoco':
         pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
-    config = load(locate('yam'), DRIVE, DriveConfig)
+    config = load(locate('yam'), 'drive', DriveConfig)
     assert config.feedback == 'motor'
     events = {'begin': [8.0], 'duration': [0.0], 'payload': [1.0]}
     given = {f'events.{name}': value for name, value in events.items()}
-    loop = load_loop('yam', {PLANT: {'physics': physics, 'duration': 0.0} | given})
+    loop = load_loop(
+        'yam', {'sim_plant': {'physics': physics, 'duration': 0.0} | given}
+    )
     ranges = damiao.ranges_of(limits_of(config, 6))
     plant = MotorPlant(loop.plant, ranges, rate=2000.0)
     controller = blf.ArmController(loop.controller)
@@ -242,33 +181,6 @@ def test_yam_of_the_preset_takes_up_its_rated_payload_with_the_gains_of_its_make
     assert controller.load.mass == pytest.approx(1.0, abs=0.02)
 
 
-@pytest.mark.parametrize('feedback', ['host', 'motor'])
-def test_motors_of_the_simulated_robot_are_those_of_the_plant(feedback, tmp_path):
-    """Half a second of an OpenArm, by the driver and by hand: the same positions."""
-    config = build(DriveConfig, {'feedback': 'motor', 'motor_models': MODELS})
-    loop = loop_of(SLOW)
-    driver = simulated(loop.plant, 'motor')('simulated', loop.controller, config)
-    driver.connect()
-    with blf.ArmController(loop.controller, record=tmp_path / 'bag') as controller:
-        outcome = DriveLoop(driver, controller, duration=0.5, feedback=feedback).run()
-    assert outcome.end is End.DURATION
-    assert controller.missed == 0
-    driven = blf.read_run(tmp_path / 'bag')
-    plant = MotorPlant(loop.plant, driver.ranges, rate=2000.0)
-    with blf.ArmController(loop.controller) as by_hand:
-        motor = MotorFeedback(by_hand, driver.ranges, driver.latency)
-        for k in range(120):
-            measured = plant.measure()
-            np.testing.assert_array_equal(measured[0], driven.position[k])
-            torque = by_hand.update(1.0 + (k + 1) * SLOW, *measured)
-            plant.step(
-                motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
-            )
-    rests = driver.positions()
-    driver.recover()
-    np.testing.assert_allclose(driver.positions(), rests, atol=1e-3)  # 0.38 mrad
-
-
 def test_lost_frames_cost_motors_less_than_the_host():
     """Every third: the motors go on with the gains and the reference that they have."""
     loop = loop_of(SLOW, LEROBOT)
@@ -278,30 +190,6 @@ def test_lost_frames_cost_motors_less_than_the_host():
     controller, _, _ = run(loop, 'host', 4.0, loses=3)
     assert controller.phase is Phase.SAFE_STOP
     assert ' oscillates at ' in controller.reason
-
-
-@pytest.mark.parametrize('feedback', ['host', 'motor'])
-def test_a_host_that_hangs_finds_the_arm_where_its_motors_hold_it(feedback):
-    """For 0.3 s in motion; then it stops, since states were missed, and the arm rests."""
-    loop = loop_of(SLOW)
-    controller = blf.ArmController(loop.controller)
-    plant = MotorPlant(loop.plant, RANGES)
-    motor = MotorFeedback(controller, RANGES, SLOW)
-    for k in range(1000):
-        if 500 <= k < 575:
-            plant.coast()
-            continue
-        torque = controller.update(1.0 + k * SLOW, *plant.measure())
-        frame = motor.frame(torque) if feedback == 'motor' else torque_alone(torque)
-        plant.step(frame)
-        if k == 499:
-            hung = plant.measure()[0]
-        elif k == 575:
-            travel = np.abs(plant.measure()[0] - hung).max()
-    assert controller.phase is Phase.SAFE_STOP
-    assert 'is 0.304 s after the last one' in controller.reason
-    assert bool(travel < 0.05) is (feedback == 'motor')  # rad: 0.17, 0.025
-    assert np.abs(plant.measure()[1]).max() < 0.1  # rad/s
 
 
 def test_the_loop_sends_frames_whose_sum_is_in_the_bag_which_replays(tmp_path):
@@ -327,45 +215,3 @@ def test_the_loop_sends_frames_whose_sum_is_in_the_bag_which_replays(tmp_path):
     assert (stopping.stiffness == 0.0).all()
     assert (stopping.damping > 0.0).all()
     assert np.abs(driver.plant.measure()[1]).max() < 0.03  # rad/s: at rest, to a step
-
-
-@pytest.mark.parametrize('kind', ['zero', 'damping'])
-def test_frames_of_a_stop_damp_the_slow_velocity_unless_its_torque_is_zero(kind):
-    config = change(loop_of(SLOW).controller, {'safety.torque': kind})
-    controller = blf.ArmController(config)
-    last = controller.guard.safe_torque.last
-    q, slow = np.linspace(-0.5, 0.5, 7), np.full(7, 0.2)
-    last.take(10**9, np.concatenate((q, 2.0 * slow, np.zeros(7))), slow)
-    torque = 0.2 * TORQUE
-    frame = MotorFeedback(controller, RANGES, 0.0).frame(torque)
-    assert (frame.stiffness == 0.0).all()
-    assert (frame.damping > 0.0).all() == (kind == 'damping')
-    off = np.abs(frame.torque_at(q, slow) - torque)
-    assert (off <= 0.5 * RANGES.torque.step + 1e-12).all()
-
-
-def test_torques_alone_and_laws_of_files_cannot_have_it():
-    config = build(DriveConfig, {'feedback': 'motor'})
-    with pytest.raises(DriverError, match='PlantDriver commands torques only'):
-        check_feedback(PlantDriver, config)
-    check_feedback(PlantDriver, DriveConfig())
-    loop = blf.load_loop('recommended')
-    driver = PlantDriver('plant', loop.controller, config)
-    with pytest.raises(BlfDscError, match='write host'):
-        DriveLoop(driver, blf.ArmController(loop.controller), feedback='motor')
-    controller = blf.ArmController(change(loop.controller, {'law': COMPUTED_TORQUE}))
-    with pytest.raises(BlfDscError, match='a law of a file'):
-        MotorFeedback(controller, RANGES, 0.0)
-
-
-def test_margins_are_those_of_feedback_in_the_motors():
-    """LeRobot's gains at 250 Hz are unstable over a bus, by the linear loop as in the plant."""
-    config = loop_of(SLOW, LEROBOT).controller
-    judged = as_in_motors(config)
-    settings = settings_of_config(judged)
-    host, motor = (
-        expected_errors(each, settings).unmodelled.max() for each in (config, judged)
-    )
-    assert host > 0.5  # rad, within six time constants
-    assert motor < 0.02
-    assert as_in_motors(judged) == judged

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from blf_dsc_controller.motors import damiao
-from blf_dsc_controller.motors.damiao import Limits, Register, StateCodes, Status
+from blf_dsc_controller.motors.damiao import Register, StateCodes, Status
 from blf_dsc_controller.motors.frame import Frame
-from blf_dsc_controller.motors.mounting import Mounting
 
 theirs = pytest.importorskip('damiao_motor.core.motor')
 
@@ -89,34 +88,3 @@ def test_requests_and_readings_are_theirs():
         assert asked.registers[register] == value
         assert damiao.reading_of(data, 3, register) == value
     assert damiao.reading_of(data, 4, Register.MODE) is None
-
-
-def test_ranges_are_those_of_each_motor():
-    ranges = damiao.ranges_of([Limits(12.5, 45.0, 54.0), Limits(12.5, 30.0, 10.0)])
-    np.testing.assert_allclose(ranges.torque.step, [108.0 / 4095, 20.0 / 4095])
-    assert ranges.position.step[0] == pytest.approx(0.38e-3, rel=0.01)  # rad
-
-
-def test_values_that_joints_can_have_are_those_that_their_motors_can():
-    """At both ends of the range, and rounded in between."""
-    limits = [damiao.MODELS['4310']] * 3
-    at_motors = damiao.ranges_of(limits)
-    mounting = Mounting(np.array([1.0, -1.0, -1.0]), np.array([0.3, -0.2, 2.0]))
-    ranges = mounting.ranges_at_joints(at_motors)
-    np.testing.assert_allclose(ranges.position.least, [-12.8, -12.7, -10.5])
-    np.testing.assert_allclose(ranges.position.most, [12.2, 12.3, 14.5])
-    random = np.random.default_rng(5)
-    for _ in range(100):
-        wanted = random.uniform(-15.0, 15.0, (3, 3))
-        frame = Frame(
-            ranges.position.nearest(wanted[0]),
-            ranges.velocity.nearest(wanted[1]),
-            np.zeros(3),
-            np.zeros(3),
-            ranges.torque.nearest(wanted[2]),
-        )
-        data = damiao.command_data(mounting.frame_at_motors(frame), at_motors)
-        codes = np.array([damiao.codes_of_command(each) for each in data]).T
-        sent = Frame(*(f.values(c) for f, c in zip(at_motors, codes, strict=True)))
-        got = mounting.frame_at_joints(sent)
-        np.testing.assert_allclose(got, frame, atol=1e-9)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 
 import numpy as np
@@ -13,13 +12,11 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 import mujoco
-from paper_case import OFF, ROWS, end_of
-from plants import commands, rigid_gears, true_parameters
+from plants import commands
 from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller import (
     ConfigurationError,
-    ControllerConfig,
     MissingExtraError,
     PlantConfig,
     change,
@@ -172,23 +169,6 @@ def test_what_mujoco_has_not_is_an_error_with_a_remedy(monkeypatch):
         plant_of(config)
 
 
-def test_closed_loop_runs_the_same_with_both_plants():
-    """With every imperfection except dry friction and ripple, which differ over a sample."""
-    loop = load_loop('panda_rigid')
-    given = {
-        'disturbance.coulomb': [0.0] * 7,
-        'actuator.ripple': 0.0,
-        'load.payload': 0.3,
-    }
-    config = change(loop.plant, given)
-    theirs, ours = (
-        close_loop(loop.controller, make(config), 2000)[1]
-        for make in (MujocoPlant, plant_of)
-    )
-    np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-8)
-    assert np.ptp(ours, axis=0).min() > 1e-3  # rad
-
-
 @pytest.mark.parametrize(
     ('name', 'settled', 'peak'),
     [
@@ -227,51 +207,6 @@ def close_loop(config, arm, samples):
         errors[k] = guard.controller.sample.xi1
     assert not guard.supervisor.text
     return guard, angles, errors
-
-
-def test_drives_that_compensate_hold_the_arm():
-    """Zero holds an FR3: its drives add gravity, in MuJoCo as in our plant.
-
-    With rigid gears: released brakes leave springs to settle by 2 mrad.
-    """
-    loop = load_loop('fr3', rigid_gears(7, 0.01))
-    quiet = {
-        'drive.mass_deviation': 0.0,
-        'drive.centre_deviation': 0.0,
-        'truth.mass_deviation': 0.0,
-        'truth.centre_deviation': 0.0,
-        'sensor.incomplete_states': 0,
-    }
-    arm = MujocoPlant(change(loop.plant, quiet))
-    start = arm.measure()[:7].copy()
-    for _ in range(500):
-        arm.measure()
-        arm.step(np.zeros(7))
-    assert np.abs(arm.measure()[:7] - start).max() < 1e-3
-    assert np.abs(arm.measure()[14:]).max() > 10.0  # what the drives add
-
-
-# All of them in `make test-nightly`; test_law_consistency.py has them with our own
-# plant.
-CHANGES = ROWS if os.environ.get('NIGHTLY') else ['payload to 0.75 kg at 8 s']
-
-
-@pytest.mark.parametrize('name', CHANGES)
-def test_bound_holds_while_the_arm_changes_and_learning_does_no_harm(name):
-    """Two windows after the last change the parameters are known again."""
-    plant = build(PlantConfig, ROWS[name])
-    end = end_of(ROWS[name])
-    learning, without = (
-        close_loop(build(ControllerConfig, law), MujocoPlant(plant), round(1e3 * end))[
-            0
-        ]
-        for law in ({}, OFF)
-    )
-    assert np.all(learning.samples.ratio < 1.0)
-    assert np.all(learning.samples.ratio <= 1.3 * without.samples.ratio)
-    true = true_parameters(plant, end)
-    error = learning.controller.state.estimate[:3] - true
-    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(true)
 
 
 PICKED_UP, THERE, ENDED = 7.0, 12.0, 15.0  # s; a wall is there from 12 s on

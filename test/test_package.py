@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import ast
 import configparser
-import json
 import pickle
 import re
 import shutil
@@ -18,11 +17,8 @@ from importlib.metadata import PathDistribution
 from pathlib import Path
 
 import pytest
-import yaml
 
 import blf_dsc_controller
-from blf_dsc_controller import errors
-from blf_dsc_controller.compiled import linked
 from blf_dsc_controller.extras import import_extra
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,49 +108,6 @@ def requirements(distribution, extra=None):
         if (f'extra == "{extra}"' in line if extra else 'extra' not in line)
     ]
     return {re.match(r'[\w-]+', line).group().lower() for line in wanted}
-
-
-def test_version_is_the_same_everywhere(distribution):
-    version = blf_dsc_controller.__version__
-    citation = re.search(
-        r'^version: (.+)$', (ROOT / 'CITATION.cff').read_text(), re.MULTILINE
-    )
-    assert distribution.version == version
-    assert manifest().findtext('version') == version
-    assert citation.group(1) == version
-    assert version in (ROOT / 'CHANGELOG.rst').read_text()
-
-
-def test_metadata_matches_the_manifest_and_readme(distribution):
-    fields = distribution.metadata
-    text = distribution.read_text('METADATA')
-    # PyPI shows no relative picture or link
-    assert not re.search(r'\]\((?!https?://|#)', text)
-    for place in ('raw', 'blob'):
-        text = text.replace(f'({URL}/{place}/{blf_dsc_controller.__version__}/', '(')
-    assert text.endswith((ROOT / 'README.md').read_text())
-    assert fields['Description-Content-Type'] == 'text/markdown'
-    assert fields['Project-URL'] == f'repository, {URL}'
-    assert fields['Author'] == fields['Maintainer'] == manifest().findtext('maintainer')
-    assert fields['Maintainer-email'] == manifest().find('maintainer').get('email')
-    # depends on setuptools
-    license_name = fields.get('License-Expression') or fields['License']
-    assert license_name == manifest().findtext('license') == 'Apache-2.0'
-    assert fields['Requires-Python'] == '>=3.10'
-    assert fields['Keywords']
-
-
-def test_continuous_integration_runs_every_supported_python(distribution):
-    jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yml').read_text())['jobs']
-    classifiers = distribution.metadata.get_all('Classifier')
-    classified = {
-        value.split(' :: ')[-1] for value in classifiers if 'Python :: 3.' in value
-    }
-    assert set(jobs['suite']['strategy']['matrix']['python']) == classified
-    container = json.loads((ROOT / '.devcontainer/devcontainer.json').read_text())
-    assert (ROOT / '.devcontainer' / container['build']['dockerfile']).is_file()
-    for script in ('run', 'ros'):
-        subprocess.run(['/bin/bash', '-n', ROOT / '.ci' / script], check=True)
 
 
 def test_colcon_and_ros2_run_find_the_package():
@@ -256,65 +209,6 @@ def test_public_names_are_documented_and_imported_on_first_use(tmp_path):
     subprocess.run([sys.executable, '-c', program], cwd=tmp_path, check=True)
 
 
-def test_errors_to_catch_are_public():
-    kinds = vars(errors).values()
-    names = {each.__name__ for each in kinds if isinstance(each, type)}
-    for method in vars(blf_dsc_controller.ArmController).values():
-        names.update(re.findall(r'^ +(\w+Error): ', method.__doc__ or '', re.MULTILINE))
-    assert {'BlfDscError', 'StartError', 'StateError', 'TrajectoryError'} <= names
-    assert names <= set(blf_dsc_controller.__all__)
-
-
-@pytest.mark.parametrize(
-    ('target', 'extra'),
-    [
-        ('changes', 'monte-carlo'),
-        ('bench', 'bench'),
-        ('docs', 'docs'),
-        ('test', 'test'),
-        ('lint', 'lint'),
-        ('release', 'release'),
-    ],
-)
-def test_make_installs_the_extra_that_a_target_needs(target, extra, tmp_path):
-    make = ['make', '-n', target, f'VENV={tmp_path}', f'PYTHON={sys.executable}']
-    recipe = subprocess.run(make, cwd=ROOT, check=True, capture_output=True, text=True)
-    assert f"-e '.[{extra}]'" in recipe.stdout
-
-
-@pytest.mark.parametrize('numpy', ['1.26.4', '2.4.6'])
-@pytest.mark.parametrize('file', ['Makefile', 'Dockerfile'])
-def test_sourced_ros_keeps_its_numpy_and_a_pyarrow_that_loads_with_it(
-    file, numpy, tmp_path
-):
-    text = (ROOT / file).read_text().replace('\\\n', '')
-    (program,) = re.findall(r"-c '(import numpy;[^']*)'", text)
-    (tmp_path / 'numpy.py').write_text(f'__version__ = "{numpy}"')
-    python = [sys.executable, '-c', program]
-    output = subprocess.run(
-        python, cwd=tmp_path, check=True, capture_output=True, text=True
-    ).stdout.split()
-    assert f'numpy=={numpy}' in output
-    if numpy < '2':
-        assert 'pyarrow<26' in output
-
-
-@pytest.mark.parametrize(
-    ('target', 'limit'), [('test', 900), ('test-nightly', 7200), ('fuzz', 7200)]
-)
-def test_every_test_has_an_end(target, limit, tmp_path):
-    """One that waits for a process that never answers would otherwise last for ever."""
-    make = ['make', '-n', target, f'VENV={tmp_path}', f'PYTHON={sys.executable}']
-    recipe = subprocess.run(make, cwd=ROOT, check=True, capture_output=True, text=True)
-    assert f'-p pytest_timeout --timeout {limit} ' in recipe.stdout, recipe.stdout
-    hanging = tmp_path / 'test_hanging.py'
-    hanging.write_text('import time\n\ndef test_hangs():\n    time.sleep(1000.0)\n')
-    options = ['-p', 'pytest_timeout', '--timeout', '1', '-p', 'no:cacheprovider']
-    run = [sys.executable, '-m', 'pytest', *options, str(hanging)]
-    ended = subprocess.run(run, cwd=tmp_path, check=False, capture_output=True)
-    assert b'Timeout' in ended.stdout
-
-
 def test_setup_runs_in_the_links_of_a_colcon_symlink_install(tmp_path):
     for name in ('setup.py', 'setup.cfg', 'package.xml', *PACKAGES):
         (tmp_path / name).symlink_to(ROOT / name)
@@ -323,26 +217,6 @@ def test_setup_runs_in_the_links_of_a_colcon_symlink_install(tmp_path):
         run, cwd=tmp_path, check=True, capture_output=True, text=True
     )
     assert ended.stdout.split()[-1] == blf_dsc_controller.__version__
-
-
-def test_dependencies_have_bounds(distribution):
-    """Of numba up to the releases whose private parts are known."""
-    bare = [line for line in distribution.requires if 'extra' not in line]
-    bare += [line for line in distribution.requires if 'trimesh' in line]
-    assert [line for line in bare if '>=' not in line] == []
-    (numba,) = (line for line in bare if line.startswith('numba'))
-    first, after = ('.'.join(map(str, each)) for each in (linked.FIRST, linked.AFTER))
-    assert set(numba.removeprefix('numba').split(',')) == {f'>={first}', f'<{after}'}
-
-
-def test_hooks_of_pre_commit_have_the_versions_of_make_lint(distribution):
-    """They install them by themselves, so a commit needs no .venv."""
-    lint = {each.partition(';')[0].strip() for each in distribution.requires}
-    found = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text())
-    hooks = [hook for repo in found['repos'] for hook in repo['hooks']]
-    assert len(hooks) > 3
-    for hook in hooks:
-        assert hook['additional_dependencies'][0] in lint, hook['id']
 
 
 def test_errors_can_be_passed_between_processes():

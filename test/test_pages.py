@@ -27,9 +27,9 @@ from markdown_it import MarkdownIt
 
 from benchmark.__main__ import parser_of as table_parser
 from benchmark.tables import TABLES
+from blf_dsc_controller import load_study
 from blf_dsc_controller.cli.parser import make_parser
 from blf_dsc_controller.configuration.nodes import NODES, known_names, load, read
-from blf_dsc_controller.studies.monte_carlo import load_study
 
 ROOT = Path(__file__).resolve().parents[1]
 DOC = ROOT / 'doc'
@@ -351,11 +351,3 @@ def test_links_outside_the_site_are_valid(name, site):
             target = page.parent / url.path
             assert target.exists(), link
             assert not url.fragment or url.fragment in anchors[target.stem], link
-
-
-@pytest.mark.nightly
-def test_every_picture_has_a_command():
-    text = (ROOT / 'CONTRIBUTING.md').read_text()
-    shown = {path.name for kind in ('png', 'webp') for path in DOC.glob(f'*.{kind}')}
-    row = r'^\| \[([\w-]+\.\w+)\]\S* \| `.+?` \| '
-    assert set(re.findall(row, text, re.MULTILINE)) == shown

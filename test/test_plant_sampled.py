@@ -10,7 +10,6 @@ from plain_law import R, dynamics
 from plants import (
     ARM,
     FULL,
-    PERIOD,
     ROUGH,
     START,
     commands,
@@ -22,11 +21,10 @@ from plants import (
 from scipy.integrate import RK45
 from scipy.interpolate import CubicSpline
 
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from sim_plant.plant import plant_of
 from sim_plant.settings import plant_settings
-from sim_plant.torque_input import TorqueInput
 
 TORQUE = np.array([-6.0, -2.0])
 
@@ -79,75 +77,6 @@ def test_disturbances_of_every_kind_add_up_against_the_motion(changes):
     undisturbed.step(np.zeros(2))
     disturbed.step(np.zeros(2))
     assert disturbed.truth()[-1] < undisturbed.truth()[-1]
-
-
-def test_friction_grows_with_the_torque_of_the_drive():
-    """Per N m, with the sign of the velocity, as Coulomb friction does."""
-    arm = plant(velocity=(0.3, -0.2), load_share=0.1, coulomb=(0.2, 0.1))
-    for _ in range(3):
-        arm.step(TORQUE)
-    _, disturbance, _, dq = np.split(arm.truth(), [3, 5, 7])
-    level = np.array([0.2, 0.1]) + 0.1 * np.abs(TORQUE)
-    np.testing.assert_allclose(disturbance, level * np.tanh(dq / 0.01), rtol=1e-13)
-
-
-def test_gear_may_lose_more_where_the_motor_drives_the_load():
-    """By 0.6 of the share of 5 %, and as much less where the load drives the motor."""
-    arm = plant(velocity=(0.3, -0.2), load_share=0.05, load_asymmetry=0.6)
-    arm.step(TORQUE)
-    _, disturbance, _, dq = np.split(arm.truth(), [3, 5, 7])
-    assert dq[0] > 0.0 > dq[1]  # TORQUE brakes the first joint, and drives the second
-    level = np.array([0.02, 0.08]) * np.abs(TORQUE)
-    np.testing.assert_allclose(disturbance, level * np.tanh(dq / 0.01), rtol=1e-13)
-
-
-def test_friction_changes_as_the_arm_gets_warm():
-    """To half of it, with a time constant of 0.2 s; drives compensate what there is."""
-    arm = plant(
-        velocity=(0.3, -0.2), viscous=(0.5, 0.5), warm_factor=0.5, warm_time=0.2
-    )
-    for k in range(300):
-        _, disturbance, _, dq = np.split(arm.truth(), [3, 5, 7])
-        factor = 0.5 + 0.5 * np.exp(-k * PERIOD / 0.2)
-        np.testing.assert_allclose(disturbance, 0.5 * factor * dq, rtol=1e-12)
-        arm.step(np.zeros(2))
-
-
-def test_eccentric_encoders_err_once_per_turn():
-    """Velocities from their own sensor are true, those of differences have the error."""
-    amplitude = np.array([2e-3, 1e-3])
-    for source in ('measured', 'differenced'):
-        arm = plant(
-            velocity=(0.3, -0.2),
-            eccentricity=tuple(amplitude),
-            **{'sensor.velocity': source},
-        )
-        read = run(arm, commands(50))
-        arm.reset()
-        true = []
-        for torque in commands(50):
-            true.append(arm.truth()[5:].copy())
-            arm.step(torque)
-        q, dq = np.array(true).reshape(-1, 2, 2).swapaxes(0, 1)
-        seen = q + amplitude * np.sin(q)
-        np.testing.assert_allclose(read[:, :2], seen, rtol=1e-14)
-        if source == 'measured':
-            np.testing.assert_array_equal(read[:, 2:4], dq)
-        else:
-            rates = np.diff(seen, axis=0) / PERIOD
-            np.testing.assert_allclose(read[1:, 2:4], rates, atol=1e-11)
-
-
-def test_torque_is_stale_after_its_limit_and_each_such_step_counts():
-    received = TorqueInput(2)
-    assert received.take(2, TORQUE, 5)
-    assert [received.count_stale(k, 3) for k in range(7, 11)] == [False] * 2 + [
-        True
-    ] * 2
-    assert received.stale_steps == 2
-    received.renew(10)
-    assert not received.count_stale(13, 3)
-    assert received.stale_steps == 2
 
 
 @pytest.mark.parametrize('source', ['measured', 'differenced'])
@@ -222,27 +151,6 @@ def test_event_is_equivalent_to_changing_the_plant_at_its_time(events, lasting):
     assert np.any(after[2] != after[0])
 
 
-def test_payload_is_ramped_in_and_out_and_the_truth_follows():
-    events = {'begin': [0.01], 'duration': [0.02], 'ramp': [0.004], 'payload': [0.5]}
-    m2_l2_squared = truths({f'events.{name}': value for name, value in events.items()})[
-        :, 1
-    ]
-    k = np.arange(SAMPLES)
-    present = np.clip((k - 10) / 4, 0.0, 1.0) - np.clip((k - 30) / 4, 0.0, 1.0)
-    np.testing.assert_allclose(
-        m2_l2_squared, (0.5 + 0.5 * present) * 0.8**2, rtol=1e-14
-    )
-
-
-def test_events_do_not_make_friction_negative():
-    for name in ('viscous', 'coulomb'):
-        decrease = {'events.begin': [0.0], f'events.{name}': [-1.0, -0.1]}
-        found = truths({f'disturbance.{name}': [0.3, 0.3], **decrease})
-        np.testing.assert_array_equal(
-            found, truths({f'disturbance.{name}': [0.0, 0.3 - 0.1]})
-        )
-
-
 OMEGA, MASS = 12.0, 0.4  # rad/s, kg
 
 
@@ -284,13 +192,3 @@ def test_energy_of_arm_and_sloshing_load_changes_by_what_its_damper_takes(zeta):
     assert np.abs(stretch).max() > 0.05
     assert taken[-1] > 0.1 or zeta == 0.0
     np.testing.assert_allclose(energy + taken, energy[0], atol=1e-7)
-
-
-def test_sloshing_load_begins_at_rest_relative_to_the_tip_and_leaves_no_trace():
-    x = sloshing(60, begin=[0.02], duration=[0.02])
-    for k in (20, 21):
-        stretch, rate = spring_of(x[k : k + 1])
-        assert np.abs(stretch).max() <= (1e-15 if k == 20 else 1e-4)
-        assert np.abs(rate).max() <= (1e-15 if k == 20 else 2e-2)
-    np.testing.assert_array_equal(x[:20, :4], sloshing(20, sloshing=[0.0])[:, :4])
-    np.testing.assert_array_equal(x[41, 4:], x[59, 4:])  # frozen, and of no effect

@@ -3,21 +3,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
 
-import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.nodes import DRIVE, load, locate
+from blf_dsc_controller.configuration.nodes import load, locate
 
 NAMES = sorted(path.stem for path in (blf.share_folder() / 'config').glob('*.yaml'))
 IN_MOTORS = [
-    name for name in NAMES if load(locate(name), DRIVE, DriveConfig).feedback == 'motor'
+    name
+    for name in NAMES
+    if load(locate(name), 'drive', DriveConfig).feedback == 'motor'
 ]
 PRESETS = sorted({*NAMES} - {*IN_MOTORS})
 LAW = {
@@ -78,21 +77,3 @@ def test_preset_with_feedback_in_its_motors_is_driven_by_name(preset, tmp_path, 
     assert offline(preset, tmp_path / 'out', 0.5) == STOPPED
     told = capsys.readouterr()
     assert f'blf_dsc drive --robot simulated --config {preset}' in told.err
-
-
-@pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
-@pytest.mark.usefixtures('blank_pictures')
-def test_papers_preset_over_ros_matches_its_offline_run_bit_for_bit(tmp_path):
-    """Lambda prediction, gradient, no columns and a known truth: paths the defaults do not take."""
-    assert offline('paper', tmp_path / 'offline', 1.0) == 0
-    over_ros = ['--config', 'paper', '--mode', 'lockstep', '--duration', '1.0']
-    before = dict(os.environ)
-    assert main(['run', *over_ros, '--out', str(tmp_path / 'ros')]) == 0
-    assert dict(os.environ) == before  # the ROS domain of the run is not left behind
-
-    runs = [blf.read_run(tmp_path / name / 'bag') for name in ('offline', 'ros')]
-    np.testing.assert_array_equal(runs[0].error, runs[1].error)
-    np.testing.assert_array_equal(runs[0].torque, runs[1].torque)
-    assert runs[0].monitor.names == runs[1].monitor.names
-    names = [name for name in runs[0].monitor.names if name != 'compute_time']
-    np.testing.assert_array_equal(*(run.monitor.select(names) for run in runs))

@@ -10,12 +10,9 @@ import pytest
 
 from benchmark import (
     joint_pd,
-    many_arms,
     random_arms,
-    soft_pairs,
 )
-from blf_dsc_controller.configuration.schema import change
-from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller import change, controller_of
 from blf_dsc_controller.supervision.model_torque import gravity_torque
 
 ARMS = 300
@@ -31,34 +28,6 @@ def test_arms_do_not_depend_on_what_the_controller_has(drawn):
             random_arms.arm_of(own, k) == random_arms.arm_of(other, k)
             for k in (0, 1, ARMS)
         )
-
-
-def test_wide_arms_are_of_every_kind_independently():
-    """With 300 arms two independent values correlate by 0.06; 0.2 is three times that."""
-    own = random_arms.study_of('panda', 'wide')
-    guess = random_arms.guessed_rotors(own.controller)
-    arms = [random_arms.arm_of(own, k) for k in range(ARMS)]
-    values = np.array(
-        [
-            (
-                *np.log(np.array(arm.truth.rotor_inertia) / guess)[:2],
-                *np.log(arm.joint.stiffness)[:2],
-                arm.sensor.side == 'motor',
-                arm.actuator.loop_gain > 0.0,
-                arm.base.mass,
-                arm.actuator.delay,
-            )
-            for arm in arms
-        ]
-    )
-    apart = np.corrcoef(values.T) - np.eye(values.shape[1])
-    assert np.abs(apart).max() < 0.2
-    rotors = np.exp(values[:, :2])
-    assert 0.2 <= rotors.min() < 0.25  # uniform in the logarithm, 600 of them
-    assert 6.0 < rotors.max() <= 7.0
-    assert all(
-        bool(arm.actuator.loop_gain) == bool(arm.actuator.loop_damping) for arm in arms
-    )
 
 
 def test_laws_have_the_same_arm_limits_and_sampling_and_are_run_once(
@@ -123,34 +92,3 @@ def test_joint_pd_is_a_pd_over_gravity_with_the_published_gains():
     expected -= 2.0 * np.array(robot.stiffness) * signals.xi1
     expected -= 2.0 * np.array(robot.damping) * (signals.dq - signals.dqr)
     np.testing.assert_allclose(signals.demand, expected, rtol=1e-3)
-
-
-def test_an_arm_that_the_published_gains_hold_is_a_failure_of_this_law():
-    """Arm 0 holds, 1 stops though those gains hold, and 2 stops with both."""
-    kept = random_arms.Kept(None)
-    for number, law in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1)):
-        is_stopped = number > law
-        stopped = 2.0 if is_stopped else np.nan
-        result = random_arms.Result(
-            stopped, '', 0, 0.01, 1e-3, 2e-3, 3e-3, 0.5, *[1] * 3
-        )
-        name = (random_arms.THIS, random_arms.STOCK)[law]
-        kept.results[random_arms.Key('panda', 'study', number, name)] = result
-    (row,) = many_arms.rows(kept)
-    assert row[2:8] == ['3', '1', '0', '2', '0', '1']
-    assert row[-1] == '3 / 3 / 3'
-
-
-def test_rows_of_pairs_count_what_learning_and_noise_break():
-    yes, no = (True,) * 3, (False,) * 3
-    found = [
-        soft_pairs.Pair('panda', 0, yes, yes, (1.0, 2.0, 2.0)),
-        soft_pairs.Pair('panda', 1, (False, True, True), yes, (2.4, 2.0, 2.1)),
-        soft_pairs.Pair('panda', 2, (True, False, False), yes, (2.1, 2.0, 2.0)),
-        soft_pairs.Pair('panda', 3, (True, True, False), yes, (1.0, 2.0, 3.0)),
-        soft_pairs.Pair('panda', 4, no, (False, True, True), (np.nan, 2.0, 2.0)),
-    ]
-    row = soft_pairs.row('panda', found)
-    assert row[1:6] == ['5', '3 / 3', '1 / 1', '1 / 0', '4']
-    assert row[6:] == ['0.78, 1.20 (1)', '2, 1', '1.50']
-    assert len(row) == len(soft_pairs.HEADS) == len(soft_pairs.row('panda', found[4:]))

@@ -167,32 +167,6 @@ def test_brakes_that_close_still_stop_an_arm_whose_efforts_say_so():
     assert arm.reason in ('commands without effect', 'error past the bound')
 
 
-PUSHED = {
-    'events.begin': [0.0, 2.0, 3.0],  # s
-    'events.duration': [1.5, 0.2, 0.0],
-    'events.force': [0.0, 0.0, 0.0, 30.0, 15.0, -20.0, 0.0, 0.0, 0.0],  # N
-}
-ERRONEOUS = {  # but sensors, which the loop of the drives sees as well
-    'sensor.torque_offset': [0.8, -0.8, 0.6, -0.8, 0.15, -0.15, 0.15],  # N m
-    'sensor.torque_factor': [1.03, 0.97, 1.02, 0.98, 0.97, 1.03, 0.98],
-    'sensor.torque_noise': [0.1, 0.1, 0.1, 0.1, 0.03, 0.03, 0.03],  # N m
-}
-
-
-@pytest.mark.parametrize('errors', [{}, ERRONEOUS], ids=['exact', 'erroneous'])
-@pytest.mark.parametrize('preset', ['panda', 'fr3', 'fr3_direct'])
-def test_sensors_of_an_arm_that_starts_with_a_load_and_is_pushed_are_left_alone(
-    preset, errors
-):
-    """It holds 2 kg that nobody declared, puts them down, is pushed, and picks up its payload."""
-    payload = blf.load_loop(preset).controller.robot.payload
-    loads = {'events.payload': [2.0, 0.0, payload]}
-    arm = Scenario(preset, plant=PUSHED | loads | errors)
-    arm.run(4.0)
-    assert said(arm) == ([], [])
-    assert any(arm.guard.controller.state.observer.torque)
-
-
 def warned(given, preset='panda'):
     """Return what is warned of the use of torque sensors."""
     config = Scenario(preset, given).config

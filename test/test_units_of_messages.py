@@ -4,19 +4,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.bags.table import table
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.messages.named_values import external_names
-from blf_dsc_controller.run import Series
+from blf_dsc_controller import ConfigurationError, ControllerConfig, change
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.supervision.bound_warnings import width_warnings
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
@@ -88,48 +83,12 @@ def test_warnings_of_a_narrow_bound_and_of_efforts_that_are_not_given():
     )
 
 
-def test_bound_that_is_too_fine():
-    both_slide = URDF.replace('revolute', 'prismatic')
-    given = {'robot.urdf': both_slide, 'robot.tip': 'tip', 'barrier.tool_bound': 1e-9}
-    with pytest.raises(ConfigurationError, match=r'\w+ would be \S+ m, finer'):
-        build(ControllerConfig, {'joints': list(JOINTS), **given})
-
-
 def test_errors_to_expect():
     assert re.fullmatch(
         r'\d+ mrad and \d+ mm by friction, .*; \d+ mrad of turning and \d+ mm of sliding '
         'when 3 kg are picked up in motion',
         expectation(arm()),
     )
-
-
-def test_efforts_that_no_drive_has_are_those_of_the_joints_that_are_named():
-    """The greatest effort of all is infinite: none is given for the joint that turns."""
-    large = URDF.replace('effort="40"', 'effort="0"', 1).replace('"40"', '"1e6"')
-    (told,) = (each for each in config_warnings(arm(large)) if 'placeholder' in each)
-    assert told.startswith('torque.limit: an effort of up to 1e+06 N for sliding looks')
-
-
-def test_columns_of_a_recorded_run(tmp_path):
-    config = change(arm(), {'reference.type': 'hold'})
-    with blf.ArmController(config, record=tmp_path / 'bag') as controller:
-        for k in range(3):
-            controller.update(1.0 + 1e-3 * k, NOW, NOW, NOW)
-    run = blf.read_run(tmp_path / 'bag')
-    names = external_names(JOINTS)
-    external = Series(names, run.stamp, np.zeros((run.stamp.size, len(names))))
-    assert {
-        'position sliding [m]',
-        'torque sliding [N]',
-        'torque turning [N m]',
-        'monitor disturbance sliding [N]',
-        'monitor viscous sliding [N s/m]',
-        'monitor viscous turning [N m s/rad]',
-        'monitor distance_to_bound sliding [m]',
-        'external sliding [N]',
-        'external sliding +- [N]',
-        'external turning +- [N m]',
-    } <= {*table(replace(run, external=external))}
 
 
 def test_stop_at_the_bound():

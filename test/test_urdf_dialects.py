@@ -10,19 +10,11 @@ import numpy as np
 import pytest
 from random_arm import ARMS, PANDA, PANDA_CHAIN, PANDA_TEXT
 
-from blf_dsc_controller.analysis.metrics import measure
-from blf_dsc_controller.analysis.metrics_table import format_table
-from blf_dsc_controller.analysis.panels import panels
+from blf_dsc_controller import BlfDscError, ControllerConfig, PlantConfig
 from blf_dsc_controller.arms.urdf import frames, read_chain
-from blf_dsc_controller.bags.table import table
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, load
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller.configuration.nodes import load
 from blf_dsc_controller.configuration.robot import Robot, implausible_friction
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.run import Run
-from blf_dsc_controller.supervision.config_warnings import config_warnings
 from sim_plant.mujoco_plant import model_of
 
 Q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 7))
@@ -146,36 +138,7 @@ def test_damping_that_no_drive_overcomes_is_a_placeholder_without_velocities(lim
         assert robot.friction(chain)['viscous'] == (expected, expected)
 
 
-def test_efforts_that_nothing_states_are_half_the_weight_at_full_reach():
-    """Joint a holds two links, at 0.15 and 0.45 m, joint b one at 0.15 m."""
-    robot = Robot(urdf=arm_in_mjcf(0.0), payload=0.0)
-    of_a, of_b = robot.efforts(robot.chain(('a', 'b')))
-    assert of_a == pytest.approx(0.5 * 3.0 * 9.81 * (0.15 + 0.45), rel=1e-9)
-    assert of_b == pytest.approx(0.5 * 3.0 * 9.81 * 0.15, rel=1e-9)
-
-
 # Grippers, and arms beside their configuration.
-
-GRIPPER = (
-    '<link name="finger"><inertial><mass value="0.1" /><origin xyz="0 0 0.1" />'
-    '<inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4" /></inertial></link>'
-    '<joint name="grip" type="prismatic"><parent link="{0}" /><child link="finger" />'
-    '<limit lower="0" upper="0.1" effort="20" velocity="0.1" /></joint></robot>'
-)
-ARM = re.sub('type="prismatic"', 'type="revolute"', ARMS['two'][0])
-
-
-def test_gripper_that_becomes_a_joint_is_named():
-    text = ARM.replace('</robot>', GRIPPER.format('flange2'))
-    config = build(ControllerConfig, {'robot.urdf': text})
-    assert config.joints[-1] == 'grip'
-    warnings = [each for each in config_warnings(config) if 'robot.tip' in each]
-    assert len(warnings) == 1
-    assert 'grip is one of the joints' in warnings[0]
-    assert warnings[0].endswith('l2')
-    given = {'robot.urdf': text, 'robot.tip': 'l2'}
-    config = build(ControllerConfig, given)
-    assert not any('robot.tip' in each for each in config_warnings(config))
 
 
 def test_urdf_is_found_beside_the_file_that_names_it(tmp_path, monkeypatch):
@@ -188,11 +151,11 @@ def test_urdf_is_found_beside_the_file_that_names_it(tmp_path, monkeypatch):
         '    robot: {urdf: mine.urdf, tip: panda_hand_tcp}\n'
     )
     monkeypatch.chdir(tmp_path)
-    assert load(path, CONTROLLER, ControllerConfig).joints == PANDA
+    assert load(path, 'blf_dsc_controller', ControllerConfig).joints == PANDA
     # that of the current folder takes precedence
     (tmp_path / 'mine.urdf').write_text('<robot name="other" />')
     with pytest.raises(BlfDscError, match='the links are none'):
-        load(path, CONTROLLER, ControllerConfig)
+        load(path, 'blf_dsc_controller', ControllerConfig)
 
 
 # MuJoCo, with parts beside the arm.
@@ -249,41 +212,3 @@ def test_parts_beside_the_arm_do_not_matter_in_mujoco(beside):
 
 
 # Joints that slide.
-
-
-def test_joints_that_slide_have_metres_and_newtons():
-    stamp = np.arange(400, dtype=np.int64) * 1_000_000
-    values = np.full((400, 2), 0.002)
-    run = Run(
-        joints=('turning', 'sliding'),
-        stamp=stamp,
-        received=stamp,
-        position=values,
-        velocity=values,
-        torque=values,
-        reference=values,
-        error=values,
-        bound=values,
-        torque_limit=values,
-        sliding=('sliding',),
-    )
-    rows = format_table(measure(run)).splitlines()
-    turning, sliding = (line for line in rows if line.startswith(run.joints))
-    assert '2.000 mrad' in turning
-    assert '0.00 N m' in turning
-    assert 'rad' not in sliding
-    assert '2.000 mm' in sliding
-    assert 'N m' not in sliding
-    names = list(table(run))
-    for name in (
-        'position sliding [m]',
-        'velocity sliding [m/s]',
-        'torque sliding [N]',
-    ):
-        assert name in names
-    assert 'position turning [rad]' in names
-    units = {panel.title: panel.unit for panel in panels([run])}
-    assert units['position of sliding'] == 'm'
-    assert units['error of sliding'] == 'mm'
-    assert units['torque of sliding'] == 'N'
-    assert units['error of turning'] == 'mrad'

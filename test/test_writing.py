@@ -66,17 +66,3 @@ def test_device_is_written_itself_and_not_replaced(tmp_path):
     write_text(link, 'x')
     assert link.is_symlink()
     assert not link.is_file()
-
-
-def test_what_cannot_be_made_is_named_by_its_own_name(tmp_path):
-    with pytest.raises(FileNotFoundError) as raised:
-        write_text(tmp_path / 'none' / 'page.html', 'x')
-    assert raised.value.filename == str(tmp_path / 'none' / 'page.html')
-
-
-def test_what_cannot_be_opened_stays(tmp_path):
-    """Such as a folder of the same name."""
-    (tmp_path / 'page.html').mkdir()
-    with pytest.raises(IsADirectoryError, match=r'page\.html'):
-        write_text(tmp_path / 'page.html', 'x')
-    assert (tmp_path / 'page.html').is_dir()
