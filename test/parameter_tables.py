@@ -10,12 +10,12 @@ import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from blf_dsc_controller.configuration import known_arm, law_file, two_link
 from blf_dsc_controller.configuration.law_traits import GAINS
 from blf_dsc_controller.configuration.nodes import NODES
 from blf_dsc_controller.configuration.schema import (
-    Parameter,
     format_value,
     parameters,
 )
@@ -68,12 +68,12 @@ def _of_group(heading: str, text: str, group: str, cls: type) -> str:
     return f'\n### {heading}\n\n{text}\n\n{_table(params)}'
 
 
-def _section(node: str, params: Iterable[Parameter], earlier: dict[str, str]) -> str:
+def _section(node: str, params: Iterable[Any], earlier: dict[str, str]) -> str:
     """Return a node's section: a table of its parameters for each group.
 
     One that is among the `earlier` tables, each with its heading, is linked to instead.
     """
-    groups: dict[str, list[Parameter]] = {}
+    groups: dict[str, list[Any]] = {}
     for param in params:
         group, _, _ = param.name.rpartition('.')
         groups.setdefault(group, []).append(param)
@@ -114,11 +114,11 @@ def _anchor(heading: str) -> str:
     return heading.lower().replace(': ', '-').replace('_', '-')
 
 
-def _table(params: Iterable[Parameter]) -> str:
+def _table(params: Iterable[Any]) -> str:
     return HEADER + ''.join(map(_row, params))
 
 
-def _row(param: Parameter) -> str:
+def _row(param: Any) -> str:
     symbol = f' ({param.symbol})' if param.symbol else ''
     kind = '; '.join(part for part in (param.kind, param.constraints) if part)
     cells = (

@@ -150,6 +150,22 @@ def test_folder_goes_in_which_nothing_could_be_written(tmp_path, capsys):
     assert 'config.yaml cannot be written: File too large' in run.stderr
 
 
+def test_report_that_the_disk_does_not_hold_leaves_what_was_there(
+    bag, tmp_path, capsys
+):
+    """Nor does it leave a stump of its own."""
+    page = tmp_path / 'disk' / 'page.html'
+    words = 'report', str(bag), '--out', str(page)
+    with limited_files(tmp_path / 'disk', 1000):
+        page.write_text('old')
+        assert main([*words, '--force']) == 1
+        assert 'page.html cannot be written: File too large' in capsys.readouterr().err
+        assert [each.read_text() for each in page.parent.iterdir()] == ['old']
+    assert main([*words, '--force']) == 0
+    assert [*page.parent.iterdir()] == [page]
+    assert '</html>' in page.read_text()
+
+
 @pytest.mark.parametrize(
     'command',
     [('main', 'run'), ('sim_plant',), ('blf_dsc_controller',), ('bag_recorder',)],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motor_arm import ELASTIC, LEROBOT, RANGES, TORQUE, MotorDriver, loop_of
+from motor_arm import ELASTIC, LEROBOT, RANGES, MotorDriver, loop_of
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import Phase, load_loop
@@ -19,32 +19,11 @@ from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.motor_feedback import MotorFeedback
 from blf_dsc_controller.motors import damiao
 from blf_dsc_controller.motors.frame import (
-    Gains,
-    Motion,
-    split,
     torque_alone,
 )
 from sim_plant.motors import MotorPlant
 
 SLOW = 0.004  # s
-
-
-def test_sum_of_a_frame_is_the_torque_up_to_the_rounding_of_the_last_field():
-    random = np.random.default_rng(0)
-    for _ in range(200):
-        q, dq = random.uniform(-2.0, 2.0, (2, 7))
-        reference = Motion(q + random.normal(0.0, 0.01, 7), dq + 0.1)
-        gains = Gains(random.uniform(0.0, 700.0, 7), random.uniform(0.0, 7.0, 7))
-        torque = random.uniform(-0.5, 0.5, 7) * TORQUE
-        frame = split(torque, Motion(q, dq), reference, reference, gains, RANGES)
-        for field, values in zip(RANGES, frame, strict=True):  # as it is sent
-            np.testing.assert_allclose(values, field.nearest(values), atol=1e-12)
-        off = np.abs(frame.torque_at(q, dq) - torque)
-        assert (off <= 0.5 * RANGES.torque.step + 1e-12).all()
-        whole = frame.stiffness > 0.0
-        assert whole.sum() >= 3  # of most joints, the rest fits into its range
-        wanted = np.minimum(gains.stiffness, 500.0)
-        assert (np.abs(frame.stiffness - wanted)[whole] < 0.07).all()  # half a step
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ from pathlib import Path
 import pytest
 
 import blf_dsc_controller
-from blf_dsc_controller.extras import import_extra
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'blf_dsc_controller'
@@ -223,25 +222,3 @@ def test_errors_can_be_passed_between_processes():
     error = blf_dsc_controller.ConfigurationError(['a: got 1', 'b: got 2'], 'my.yaml')
     copied = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
     assert (str(copied), vars(copied)) == (str(error), vars(error))
-
-
-@pytest.mark.parametrize(
-    ('package', 'program', 'says'),
-    [
-        ('absent', None, 'the page needs absent, which is not installed'),
-        ('absent', 'import nowhere', f"pip install '{ROOT}[view]'"),
-        ('absent', 'raise ImportError("old numpy")', 'cannot be loaded (old numpy'),
-        ('pyarrow', 'raise ImportError("numpy 1")', "pip install 'pyarrow<26'"),
-    ],
-)
-def test_package_that_cannot_be_loaded_is_not_called_missing(
-    package, program, says, tmp_path, monkeypatch
-):
-    if program:
-        (tmp_path / f'{package}.py').write_text(program)
-    monkeypatch.syspath_prepend(tmp_path)
-    for name in [name for name in sys.modules if name.split('.')[0] == package]:
-        monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(blf_dsc_controller.BlfDscError) as raised:
-        import_extra(package, 'view', 'the page')
-    assert says in str(raised.value)

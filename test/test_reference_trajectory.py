@@ -290,16 +290,24 @@ def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow()
 
 
 def test_chunk_whose_first_points_cannot_be_reached_in_time_keeps_the_later_ones():
-    chunk = trajectory(
-        (GOALS[:1] + 0.02 * np.arange(10)[:, None],), times=0.05 * np.arange(1, 11)
-    )
-    at_rest = pack(2, [minimum_jerk(np.zeros(1), GOALS[:1] - 0.02)])
+    """Bare positions of a curve: it is followed with the velocities that these mean."""
+    times = 0.05 * np.arange(1, 11)
+    curve = 0.4 * times + 0.5 * times**2
+    chunk = trajectory((GOALS[:1] + curve[:, None],), times=times)
+    at_rest = pack(2, [minimum_jerk(np.zeros(1), GOALS[:1])])
     motion = plan(chunk, at_rest, NOW)
     assert motion.note.startswith('its path is joined after ')
     assert motion.end == pytest.approx(NOW + 0.5)
+    joined = NOW + times[NOW + times > motion.settled]
+    assert joined.size > 2
     np.testing.assert_allclose(
-        at(motion.vector, NOW + 0.5)[0], GOALS[0] + 0.18, atol=1e-9
+        sampled(motion.vector, joined)[:, 0],
+        GOALS[0] + curve[-joined.size :, None],
+        atol=1e-9,
     )
+    rates = sampled(motion.vector, joined[:-1])[:, 1]
+    wanted = 0.4 + times[-joined.size : -1]
+    np.testing.assert_allclose(rates, np.tile(wanted, (2, 1)).T, rtol=0.05)
     assert max(limits_used(motion, NOW, motion.end)) <= 1.0 + 1e-9
 
 

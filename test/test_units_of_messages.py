@@ -12,7 +12,6 @@ import pytest
 import blf_dsc_controller as blf
 from blf_dsc_controller import ConfigurationError, ControllerConfig, change
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.supervision.bound_warnings import width_warnings
 from blf_dsc_controller.supervision.config_warnings import config_warnings
 from blf_dsc_controller.supervision.expected_errors import expectation
 
@@ -73,8 +72,6 @@ def test_warnings_of_a_narrow_bound_and_of_efforts_that_are_not_given():
     assert re.search(
         r'to move sliding [\d.]+ m from its reference: give .* m, or', alone
     )
-    (wide,) = width_warnings(change(arm(), {'barrier.bound': [0.3, 0.7]}), None)
-    assert wide == 'barrier.bound: 0.7 m bounds nothing: is it in mm? Give 0.0007'
     unlimited = config_warnings(arm(URDF.replace('effort="40"', 'effort="0"')))
     (told,) = (each for each in unlimited if 'no effort' in each)
     assert told == (
