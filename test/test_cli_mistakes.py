@@ -156,7 +156,7 @@ def test_report_that_the_disk_does_not_hold_leaves_what_was_there(
     """Nor does it leave a stump of its own."""
     page = tmp_path / 'disk' / 'page.html'
     words = 'report', str(bag), '--out', str(page)
-    with limited_files(tmp_path / 'disk', 1000):
+    with limited_files(tmp_path / 'disk', 20_000):
         page.write_text('old')
         assert main([*words, '--force']) == 1
         assert 'page.html cannot be written: File too large' in capsys.readouterr().err
