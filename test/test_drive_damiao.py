@@ -322,19 +322,6 @@ def test_motors_that_turn_the_other_way_from_another_zero_get_and_send_theirs(ma
         assert state.effort[i] == pytest.approx(d[i] * found['torq'], abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ('given', 'text'),
-    [
-        ({'motor_directions': [1, -1]}, r'motor_directions: got 2, .* 7 joints'),
-        ({'motor_directions': [1, 0] * 3 + [1]}, 'turns with its joint, 1, or against'),
-        ({'motor_models': ['4310', '4311']}, 'got 4311, but known are 4310, 4340'),
-    ],
-)
-def test_motors_that_are_described_wrongly_are_told(made, given, text):
-    with pytest.raises(blf.BlfDscError, match=text):
-        made(**given)
-
-
 def test_two_motors_with_one_identifier_are_named(made):
     others = []
 

@@ -31,7 +31,6 @@ from blf_dsc_controller.drive.driver import (
     ReflexError,
     disagreements,
 )
-from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 
@@ -136,28 +135,6 @@ def test_it_tracks_and_holds_two_kilograms_that_appear_in_the_hand(wire):
 
 def message_counts(wire):
     return read_content(wire.folder / 'bag').message_counts
-
-
-def test_positions_of_motors_are_recorded_and_identification_reads_them(wire):
-    """The wire carries them as float32."""
-    wire.simulate('gears=10000@1')
-    code, output = ended(wire.drive(0.6))
-    assert code == 0, output
-    counts = message_counts(wire)
-    # the first state may come before the first torque, with which the cycles begin
-    assert counts[topics.MOTOR_STATES.resolved] >= counts['/joint_states'] - 20
-    recorded = blf.read_run(wire.folder / 'bag')
-    robot = blf.load_loop('fr3_direct').controller.robot
-    read = read_recording(wire.folder / 'bag', robot.text, recorded.joints)
-    assert 'positions of motors of /motor_states' in read.source
-    twist = read.torque[:] / 10_000.0
-    known = ~np.isnan(read.twist[:]).any(axis=1)
-    assert known.sum() > 500
-    # up to a constant: its median is that of the states, before they are interpolated
-    off = (read.twist[:] - twist)[known]
-    np.testing.assert_allclose(off - off.mean(axis=0), 0.0, atol=1e-6)
-    assert np.abs(np.median(read.twist[:][known], axis=0)).max() < 1e-5
-    assert_replays(wire.folder / 'bag')
 
 
 def told_config():

@@ -15,7 +15,6 @@ from random_arm import CONFIG, PANDA, UR5E
 
 from blf_dsc_controller import (
     BlfDscError,
-    ConfigurationError,
     ControllerConfig,
     PlantConfig,
 )
@@ -287,63 +286,6 @@ def test_actuators_add_to_armature_and_damping_through_their_gear():
     assert robot.rotor_inertia == pytest.approx((0.1, 0.14))
     assert [joint.damping for joint in chain.joints] == pytest.approx([0.5, 0.62])
     agrees(robot, chain, mujoco.MjModel.from_xml_string(text))
-
-
-POST = '</body></body><body name="post"><site name="wall"/><body name="beside"><site/>'
-
-
-def cable(acts, more=''):
-    """Return a tendon at the elbow that acts by an attribute or an actuator."""
-    fixed = f'<fixed name="cable" {acts}><joint joint="elbow" coef="1"/></fixed>'
-    return arm(more=f'<tendon>{fixed}</tendon>{more}')
-
-
-@pytest.mark.parametrize(
-    'text',
-    [
-        cable('stiffness="3"'),
-        cable('limited="true" range="0 1"'),
-        cable('', '<actuator><motor tendon="cable"/></actuator>'),
-    ],
-)
-def test_tendon_that_acts_by_whatever_it_has_is_refused(text):
-    with pytest.raises(ConfigurationError, match="<tendon> 'cable' acts on it"):
-        robot_of({'robot.urdf': text, 'robot.tip': 'tool'})
-
-
-@pytest.mark.parametrize(
-    ('parts', 'expected'),
-    [
-        (
-            {
-                'more': '<equality><joint name="pair" joint1="elbow" joint2="shoulder"/></equality>'
-            },
-            ["'elbow'", "'shoulder'", "<equality> 'pair'"],
-        ),
-        (
-            {'more': '<equality><weld body1="lower" body2="world"/></equality>'},
-            ["'elbow'", "'shoulder'", '<equality> number 1', 'closed chains'],
-        ),
-        (
-            {
-                'more': '<tendon><spatial name="rope" springlength="0" stiffness="3">'
-                '<site site="tool"/><site site="wall"/></spatial></tendon>',
-                'beyond': POST,
-            },
-            ["'shoulder'", "'elbow'", "<tendon> 'rope'"],
-        ),
-        ({'lower': 'stiffness="7"'}, ["'elbow'", 'stiffness="7"']),
-        (
-            {'lower': '/><joint name="second" axis="1 0 0"'},
-            ['lower: joint 1 of 2 in one body (moved by elbow)'],
-        ),
-    ],
-)
-def test_what_no_serial_chain_has_is_refused_by_name(parts, expected):
-    with pytest.raises(ConfigurationError) as caught:
-        build(ControllerConfig, {'robot.urdf': arm(**parts), 'robot.tip': 'tool'})
-    for each in expected:
-        assert each in str(caught.value)
 
 
 def test_file_with_includes_becomes_one_text_that_needs_neither_files_nor_mujoco(

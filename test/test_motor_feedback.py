@@ -26,22 +26,6 @@ from sim_plant.motors import MotorPlant
 SLOW = 0.004  # s
 
 
-@pytest.mark.parametrize(
-    'words',
-    ['--write motion.yaml', '--prove --robot simulated'],
-)
-def test_gains_for_motors_alone_are_not_commissioned_over_the_bus(
-    tmp_path, monkeypatch, capsys, words
-):
-    """Simulated over the bus, those of the preset oscillate at some 45 Hz and stop."""
-    monkeypatch.chdir(tmp_path)
-    assert main(['commission', '--config', 'yam', *words.split()]) == 1
-    printed = capsys.readouterr()
-    assert 'keep the gains that the maker runs in them' in printed.err
-    assert not printed.out
-    assert not [*tmp_path.iterdir()]
-
-
 def test_motion_by_hand_sends_motors_the_torque_that_a_bag_records(
     tmp_path, monkeypatch, capsys
 ):

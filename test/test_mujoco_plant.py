@@ -16,7 +16,6 @@ from plants import commands
 from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller import (
-    ConfigurationError,
     MissingExtraError,
     PlantConfig,
     change,
@@ -160,9 +159,6 @@ def test_run_with_this_physics_is_one_command_and_replays(tmp_path):
 
 
 def test_what_mujoco_has_not_is_an_error_with_a_remedy(monkeypatch):
-    sloshing = {'events.begin': [1.0], 'events.sloshing': [0.5], 'physics': 'mujoco'}
-    with pytest.raises(ConfigurationError, match='no sloshing loads: use own'):
-        build(PlantConfig, sloshing)
     config = build(PlantConfig, {'physics': 'mujoco', 'duration': 1.0})
     monkeypatch.setitem(sys.modules, 'mujoco', None)
     with pytest.raises(MissingExtraError, match=r'physics: mujoco needs .*\[mujoco\]'):

@@ -10,7 +10,7 @@ import pytest
 from command import PATIENCE
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.cli import computer, domains
+from blf_dsc_controller.cli import domains
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.control.realtime import request_realtime
@@ -72,14 +72,6 @@ def test_real_time_is_left_out_elsewhere_with_a_word():
     request_realtime(Realtime(priority=10), said.append)
     request_realtime(Realtime(), said.append)
     assert said == ['realtime: left out, since only Linux has it']
-
-
-@pytest.mark.usefixtures('other')
-def test_the_self_check_leaves_out_what_only_linux_has(monkeypatch):
-    monkeypatch.delattr('os.sched_getaffinity')
-    monkeypatch.setattr(computer, '_SAMPLES', 10)
-    subjects = {finding.subject for finding in computer.examine()}
-    assert subjects == {'computer', 'kernel', 'governor', 'clock', 'disk'}
 
 
 def test_a_drive_without_processes_that_inherit_sockets_names_another_way(monkeypatch):

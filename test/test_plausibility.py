@@ -15,8 +15,6 @@ from blf_dsc_controller import (
     ConfigurationError,
     ControllerConfig,
     PlantConfig,
-    change,
-    load_loop,
 )
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.supervision.config_warnings import config_warnings
@@ -127,14 +125,6 @@ def test_what_follows_from_any_urdf_is_accepted(
     build(PlantConfig, arm)
 
 
-def test_change_at_run_time_is_refused_alike():
-    config = build(ControllerConfig, UR5E)
-    with pytest.raises(
-        ConfigurationError, match=r'torque.limit: got 300 N m .* insist'
-    ):
-        change(config, {'torque.limit': tuple(2.0 * EFFORTS)})
-
-
 def test_joints_without_an_effort_have_that_of_an_arm_of_their_weight():
     """Four times the weight of the stretched UR5e with 3 kg, 98 N m."""
     text = build(ControllerConfig, UR5E).robot.text
@@ -143,17 +133,6 @@ def test_joints_without_an_effort_have_that_of_an_arm_of_their_weight():
     build(ControllerConfig, unknown | {'torque.limit': each(390.0)})
     with pytest.raises(ConfigurationError, match='no drive of an arm of this weight'):
         build(ControllerConfig, unknown | {'torque.limit': each(400.0)})
-
-
-def test_both_nodes_insist_by_one_list(tmp_path):
-    path = tmp_path / 'my.yaml'
-    path.write_text(
-        '/**:\n  ros__parameters:\n    insist: [barrier.bound, sensor.resolution]\n'
-        '    barrier.bound: [5.0, 5.0]\n    sensor.resolution: 0.1\n'
-    )
-    loop = load_loop(path)
-    assert loop.controller.barrier.bound == (5.0, 5.0)
-    assert loop.plant.sensor.resolution == 0.1
 
 
 @pytest.mark.parametrize(

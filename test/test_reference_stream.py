@@ -75,19 +75,6 @@ def test_target_that_nothing_follows_is_held_or_left_behind_while_braking(held):
         assert np.all((last[0] - q) * [1.0, -1.0] > 0.02)
 
 
-@pytest.mark.parametrize(
-    ('interval', 'coast'),
-    [
-        (0.004, 0.03),  # s, at least
-        (0.1, 0.2),  # two intervals
-        (0.7, TIMEOUT),  # by then the stream is over
-    ],
-)
-def test_reference_stays_on_the_line_until_the_stream_is_over(interval, coast):
-    target = receive(TargetStream(), interval * np.arange(5))[-1]
-    assert target.until - target.due == pytest.approx(coast)
-
-
 @pytest.mark.parametrize('side', [1.0, -1.0])
 @pytest.mark.parametrize('coast', [0.03, 0.3])
 def test_stream_towards_a_position_limit_is_slowed_so_that_the_arm_can_stop(

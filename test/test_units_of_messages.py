@@ -13,7 +13,6 @@ import blf_dsc_controller as blf
 from blf_dsc_controller import ConfigurationError, ControllerConfig, change
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.expected_errors import expectation
 
 JOINTS = ('turning', 'sliding')
 NOW = np.zeros(2)
@@ -77,14 +76,6 @@ def test_warnings_of_a_narrow_bound_and_of_efforts_that_are_not_given():
     assert told == (
         'torque.limit: no effort in the URDF for turning, sliding: 100 N m or 100 N is assumed; '
         'give the rated torque of each drive'
-    )
-
-
-def test_errors_to_expect():
-    assert re.fullmatch(
-        r'\d+ mrad and \d+ mm by friction, .*; \d+ mrad of turning and \d+ mm of sliding '
-        'when 3 kg are picked up in motion',
-        expectation(arm()),
     )
 
 
