@@ -71,11 +71,12 @@ _COMPARISON = (
     Gain('gains.robust_gain', 1e-3, 5.0),
     Gain('gains.leakage', 1e-5, 1.0),
 )
+_NONE = {'disturbance.gain': (0.0, 0.0)}
 TASKS = {
     'proposed': Task('paper', {}, _PROPOSED),
-    'comparison': Task('recommended', {'law': 'backstepping'}, _COMPARISON),
+    'comparison': Task('recommended', {'law': 'backstepping', **_NONE}, _COMPARISON),
     'slotine_li': Task(
-        'recommended', {'law': 'slotine_li'}, (*_SHARED, _SURFACE_OF_35)
+        'recommended', {'law': 'slotine_li', **_NONE}, (*_SHARED, _SURFACE_OF_35)
     ),
 }
 

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,6 +162,8 @@ class Run:
     notes: tuple[str, ...] = ()  #: samples of a bag that are left out, and why
     #: joints that slide, where arrays have m and N instead of rad and N m
     sliding: tuple[str, ...] = ()
+    #: of the controller, by dotted name; empty if they are unknown
+    parameters: Mapping[str, Any] = field(default_factory=dict)
 
     def units(self, joint: str) -> JointUnits:
         """Return the units of a joint."""

@@ -3,20 +3,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import plants
-from plain_law import R
+from plain_law import R, dynamics
 from symbols import replaced
 
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_file import load_law
+from blf_dsc_controller.configuration.law_traits import gains_of
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import (
@@ -36,6 +38,7 @@ REFERENCE = reference.pack(
     2, [reference.sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))]
 )
 JOINTS = ('shoulder', 'elbow')
+P = np.array([1.0, 0.32, 0.4])
 
 
 def recommended(
@@ -65,8 +68,40 @@ def quick(**changes: Any) -> Settings:
 
 def controller(settings: Settings) -> Controller:
     """Return a controller that tracks the paper's reference."""
-    law = BlfDsc() if settings.has_barrier else Backstepping()
-    return Controller(law, settings, REFERENCE)
+    return Controller(BlfDsc(), settings, REFERENCE)
+
+
+def as_printed(settings: Settings, **gains: float) -> Controller:
+    """Return the same with the law file `paper`, with the filter (8) in its memory."""
+    law = load_law('paper')
+    given = dataclasses.asdict(gains_of('paper')()) | gains
+    return Controller(law(**given), settings._replace(memory=4), REFERENCE)
+
+
+def energies(law: Controller, t: float) -> np.ndarray:
+    """Return the terms (4,) of (29) [J] of the last sample, with 0.1 + 0.1 sin t N m."""
+    settings, sample, s = law.settings, law.sample, law.signals
+    barriers = (
+        barrier.joint_potential(
+            settings.barrier, s.barrier, sample.xi1[i], sample.bound[i], i
+        )
+        for i in range(2)
+    )
+    M, _, _ = dynamics(P, R, s.q, s.dq)
+    tau_dist = 0.1 + 0.1 * np.sin(t)
+    return np.array(
+        [
+            sum(barriers),
+            0.5 * sample.xi2 @ M @ sample.xi2,
+            weighted(P - sample.estimate[:3], settings.adaptation.adaptation_gain[:3]),
+            weighted(tau_dist - sample.disturbance, settings.disturbance.gain),
+        ]
+    )
+
+
+def weighted(error: np.ndarray, gain: np.ndarray) -> float:
+    """Half the sum of squares over the gains, of what is adapted."""
+    return float(0.5 * np.sum(error[gain > 0.0] ** 2 / gain[gain > 0.0]))
 
 
 def plant(**changes: Any) -> Plant:

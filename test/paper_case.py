@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.analysis.lyapunov import energies
 from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.law.controller import Controller
@@ -19,30 +20,6 @@ NO_DISTURBANCE = {
     'disturbance.constant': [0.0, 0.0],
     'disturbance.amplitude': [0.0, 0.0],
 }
-EXACT = {
-    'truth.parameters': [1.0, 0.32, 0.4],
-    'truth.constant': [0.1, 0.1],
-    'truth.amplitude': [0.1, 0.1],
-}
-
-CHOICES = {
-    'gains.prediction': 'filtered',
-    'gains.update': 'newton',
-    'gains.compensation': 'reference',
-    'gains.bumpless': True,
-    'gains.change_detection': True,
-}
-"""What `blf_dsc` does, as gains of the law `paper`."""
-
-
-def instead(*, known_rate: bool = False, **choices: object) -> dict[str, object]:
-    """Return what `blf_dsc` does for two links, but for these choices, as the law `paper`.
-
-    For an arm from a URDF give `known_rate=True`.
-    """
-    usual = {**CHOICES, 'gains.known_rate': known_rate}
-    given = {f'gains.{name}': choice for name, choice in choices.items()}
-    return {'law': 'paper', **usual, **given}
 
 
 def configured(
@@ -68,7 +45,7 @@ class Loop(NamedTuple):
     torque: np.ndarray  # (., 2) N m
     disturbance: np.ndarray  # (., 2) N m, d^3 and learned friction
     estimate: np.ndarray  # (., m)
-    lyapunov: np.ndarray  # (., 4)
+    lyapunov: np.ndarray | None  # (., 4), terms of (29)
     latched: np.ndarray  # (.,)
     changes: np.ndarray  # (.,) of the arm, detected so far
     P: np.ndarray  # (., 3) of the plant at that time
@@ -93,8 +70,10 @@ def run(config: LoopConfig) -> Loop:
     """Run a configuration offline."""
     record = simulate(config.controller, config.plant, supervised=False)
     samples = sample_columns(record.samples, record.controller.settings)
-    names = ('xi1', 'xi2', 'torque', 'disturbance', 'estimate', 'lyapunov')
+    names = ('xi1', 'xi2', 'torque', 'disturbance', 'estimate')
     parts = [getattr(samples, name) for name in names]
+    energy = energies(record.run())
+    parts += [None if energy is None else energy.values]
     parts += [samples.latched[:, 0], samples.changes[:, 0], record.truths[:, :3]]
     return Loop(record.stamps * 1e-9, *parts, record.controller)
 

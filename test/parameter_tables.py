@@ -12,8 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from blf_dsc_controller.configuration import known_arm, law_file, two_link
-from blf_dsc_controller.configuration.law_traits import GAINS
+from blf_dsc_controller.configuration import law_file, two_link
 from blf_dsc_controller.configuration.nodes import NODES
 from blf_dsc_controller.configuration.schema import (
     format_value,
@@ -39,27 +38,24 @@ def with_tables(page: str) -> str:
 
 
 def _optional() -> str:
-    """Return tables of what the controller has with some laws, or if it is given."""
-    tables = [
-        _of_group(
-            f'Gains of {law}', f'Only the law `{law}` has them.', law_file.GROUP, group
-        )
-        for law, group in GAINS.items()
-    ]
-    known = _of_group(
-        'Known data of the arm',
-        'The controller has them if one is given, or by the law `model_based`.',
-        known_arm.GROUP,
-        known_arm.KnownArm,
-    )
-    planar = _of_group(
+    """Return tables of what the controller has with two links, and with some laws."""
+    of_two_links = _of_group(
         'The arm of two links',
         'The controller has them without `robot.urdf`: the gains of an arm from a URDF follow '
         'from its stiffness and damping.',
         two_link.GROUP,
         two_link.TwoLink,
     )
-    return ''.join((planar, *tables, known))
+    of_laws = [
+        _of_group(
+            f'Gains of {law}',
+            f'Only the law `{law}` has them.',
+            law_file.GROUP,
+            law_file.gains_of(law_file.load_law(law)),
+        )
+        for law in law_file.PACKAGED
+    ]
+    return ''.join((of_two_links, *of_laws))
 
 
 def _of_group(heading: str, text: str, group: str, cls: type) -> str:

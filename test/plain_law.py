@@ -50,9 +50,6 @@ class PlainLaw:
 
     def __init__(self, settings):
         self.gains = g = by_symbol(settings)
-        self.newton = g.update == 0
-        self.at_state = settings.compensation == 1
-        self.linear = settings.has_barrier == 0
         self.theta = settings.initial_estimate.copy()
         self.d3 = np.zeros(2)
         self.tau = np.zeros(2)
@@ -73,13 +70,8 @@ class PlainLaw:
         return g.bound + wider, -g.funnel_rate * wider
 
     def barrier_torque(self, xi1, t):
-        """Return tau_c of (16) with its weight, a straight line beyond the knee.
-
-        Of (35) -w z1.
-        """
+        """Return tau_c of (16) with its weight, a straight line beyond the knee."""
         g = self.gains
-        if self.linear:
-            return -g.weight * xi1
         k, _ = self.bound(t)
         edge = np.minimum(np.abs(xi1), g.knee / g.bound * k)
         inside = g.weight * edge / np.cos(np.pi * edge**2 / (2.0 * k**2)) ** 2
@@ -168,12 +160,10 @@ class PlainLaw:
         if self.latched is not None:
             Phi, b = self.latched
             eps = b - Phi @ self.theta
-            if self.newton:
-                eps = np.linalg.solve(Phi + g.rho * g.information, eps)
-            v += g.kappa * eps
+            v += g.kappa * np.linalg.solve(Phi + g.rho * g.information, eps)
         tracking = np.zeros(g.m)
         if not saturated:
-            tracking[:3] = -(g.variance * (H.T @ xi2) + g.Wc * self.theta)[:3]
+            tracking[:3] = -(g.variance * (H.T @ xi2))[:3]
             rate = g.gamma * (xi2 + g.eta * self.d3)
             if g.follows_inertia:
                 Yp, _ = self.momentum_regressors(0.0, q, rate / g.joint_inertia)
@@ -191,14 +181,13 @@ class PlainLaw:
             # Nearest point of the ball, from the multiplier that puts it on the sphere.
             out = lambda nu: np.linalg.norm(w / (1.0 + nu * gain)) - g.radius  # noqa: E731
             self.theta[:3] = w / (1.0 + brentq(out, 0.0, 1e9, xtol=1e-18) * gain)
-        if g.bumpless and self.latched is not None:
+        if self.latched is not None:
             self.d3 = self.d3 - H @ (self.theta - by_tracking)
 
     def update(self, t, dt, qr, dqr, ddqr, measurement):
-        """Return the torque (28) or (35); the caller sets `tau`, the last one sent.
+        """Return the torque (28); the caller sets `tau`, the last one sent.
 
-        What is learned acts along the reference, or at the measured state as in the
-        paper.
+        What is learned acts along the reference.
         """
         g = self.gains
         q, dq, _ = np.reshape(measurement, (3, 2)).copy()
@@ -212,9 +201,6 @@ class PlainLaw:
         lagging = (self.alpha2 - beta2) * np.exp(-dt / g.time_constant)
         following = beta2 + lagging + dt * known
         dalpha2 = (following - self.alpha2) / dt
-        if self.linear:
-            self.alpha2 = dqr - g.K * xi1
-            dalpha2 = ddqr - g.K * (dq - dqr)
         self.xi2 = xi2 = dq - self.alpha2
         self.learn(t, dt, q, dq, dqr, self.tau)
         r, P0 = g.model.r, g.initial_estimate[:3]
@@ -225,15 +211,14 @@ class PlainLaw:
             damped = damped + barrier / g.joint_inertia
             barrier = np.zeros(2)
         H = regressor(r, q, dq, v, damped)
-        along = (q, dq, v, a) if self.at_state else (qr, dqr, dqr, ddqr)
         H_r = np.zeros((2, g.m))
-        H_r[:, :3] = regressor(r, *along)
+        H_r[:, :3] = regressor(r, qr, dqr, dqr, ddqr)
         if g.viscous:
             ahead = dqr + (1.5 * dt + 0.5 * g.lag) * ddqr
             H_r[:, 3 + 2 * g.bias :][:, :2] = np.diag(ahead)
         demand = (
             barrier
-            - (g.d2 * np.abs(xi1) + g.mu_bar) * np.clip(xi2 / 0.01, -1.0, 1.0)
+            - g.d2 * np.abs(xi1) * np.clip(xi2 / 0.01, -1.0, 1.0)
             - g.Kp * xi2
             + H @ P0
             - H_r[:, :3] @ P0

@@ -9,24 +9,21 @@ from typing import Any
 from blf_dsc_controller.law.state import Settings
 
 _PARTS = {
-    '': 'robust_gain=mu_bar',
-    'truth': 'known=truth_known parameters=true_parameters disturbance=true_disturbance',
     'barrier': 'bound initial_bound funnel_rate weight slope_limit knee',
     'surface': 'gain=K mu time_constant known_rate',
     'feedback': 'gain=Kp robust_gain=d2 damping_rate follows_inertia decoupled',
-    'disturbance': 'gain=gamma leakage=eta bumpless',
+    'disturbance': 'gain=gamma leakage=eta',
     'torque': 'limit=torque_limit rate_limit drive',
     'columns': (
         'bias viscous coulomb coulomb_velocity load_friction frequencies ripple_cycles'
     ),
-    'row': 'prediction filter_pole=pole motion_scale lag omega row_weight',
+    'row': 'filter_pole=pole motion_scale lag row_weight',
     'window': 'length=window row_interval interval prior_weight regularization=rho',
     'excitation': (
-        'excitation_threshold=sigma learning_start change_detection residual_floor'
+        'excitation_threshold=sigma learning_start change_detection starts_full '
+        'residual_floor'
     ),
-    'adaptation': (
-        'update weight=kappa leakage=Wc radius adaptation_gain=Gamma variance least most'
-    ),
+    'adaptation': 'weight=kappa radius adaptation_gain=Gamma variance least most',
 }
 _FIELDS = {
     symbol or field: (part, field)

@@ -11,12 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from paper_case import instead
 
 from blf_dsc_controller import (
     ConfigurationError,
@@ -25,9 +23,8 @@ from blf_dsc_controller import (
     load_loop,
     share_folder,
 )
-from blf_dsc_controller.compiled.layout import pack
 from blf_dsc_controller.configuration.files import parse
-from blf_dsc_controller.configuration.law_traits import GAINS
+from blf_dsc_controller.configuration.law_traits import LAWS, gains_of
 from blf_dsc_controller.configuration.nodes import (
     LoopConfig,
     dump,
@@ -39,7 +36,6 @@ from blf_dsc_controller.configuration.nodes import (
 )
 from blf_dsc_controller.configuration.schema import build, flatten, parameters
 from blf_dsc_controller.configuration.side_nodes import RecorderConfig
-from blf_dsc_controller.factory.settings import settings_of_config
 
 CHANGED = LoopConfig(
     build(
@@ -250,7 +246,8 @@ def test_parameter_page_is_what_its_command_writes(tmp_path):
         'run: python test/parameter_tables.py doc/parameters.md'
     )
     rows = [row for row in committed.splitlines() if row.startswith('| `')]
-    gains = {f'gains.{each.name}' for of in GAINS.values() for each in parameters(of)}
+    groups = [gains_of(law) for law in LAWS[1:]]
+    gains = {f'gains.{each.name}' for of in groups for each in parameters(of)}
     assert {row.split('`')[1] for row in rows} == known_names() | gains
     assert {row.replace('\\|', '').count('|') for row in rows} == {7}
 
@@ -308,34 +305,11 @@ def test_unknown_names_are_rejected_and_those_of_other_nodes_only_in_their_own_s
         assert load_plant(file(section(pattern, of_ros))).seed == 2
 
 
-def test_known_data_of_the_arm_is_there_if_it_is_given_or_needed(file):
-    path = file(section('/**', 'truth: {parameters: [1.0, 0.32, 0.4]}, seed: 4'))
-    assert load_plant(path).seed == 4
-    config = load(path, 'blf_dsc_controller', ControllerConfig)
-    assert flatten(config)['truth.parameters'] == (1.0, 0.32, 0.4)
-    assert copy.deepcopy(config) == config
-    assert not hasattr(load_loop('recommended').controller, 'truth')
-    assert hasattr(load_loop('model_based').controller, 'truth')
-    text = section('blf_dsc_controller', 'truth: {seed: 4}')
-    with pytest.raises(ConfigurationError, match=r'truth\.seed: unknown'):
-        load(file(text), 'blf_dsc_controller', ControllerConfig)
-
-
-@pytest.mark.parametrize('preset', ['recommended', 'panda'])
-def test_the_law_paper_with_all_choices_of_blf_dsc_is_that_law(preset):
-    ours = load_loop(preset).controller
-    choices = instead(known_rate=preset == 'panda')
-    theirs = build(ControllerConfig, flatten(ours) | choices)
-    np.testing.assert_array_equal(
-        *(pack(settings_of_config(each)) for each in (ours, theirs))
-    )
-
-
 def test_a_law_of_the_package_has_its_gains_and_others_have_not(file):
-    gains = 'gains: {surface_gain: [9.0, 8.0]}'
+    gains = 'gains: {surface_gain: 9.0}'
     path = file(section('/**', f'law: backstepping, {gains}'))
     config = load(path, 'blf_dsc_controller', ControllerConfig)
-    assert flatten(config)['gains.surface_gain'] == (9.0, 8.0)
+    assert flatten(config)['gains.surface_gain'] == 9.0
     assert flatten(config)['gains.leakage'] == 0.001
     assert not hasattr(ControllerConfig(), 'gains')
     assert copy.deepcopy(config) == config  # through `__reduce__`, as pickle does

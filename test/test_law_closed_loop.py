@@ -7,25 +7,29 @@ import numpy as np
 import pytest
 from closed_loop_case import (
     REFERENCE,
+    as_printed,
     closed_loop,
     controller,
+    energies,
     plant,
     quick,
     recommended,
 )
-from paper_case import BOUND, EXACT, NO_DISTURBANCE, P, configured, instead, run_preset
+from paper_case import BOUND, NO_DISTURBANCE, P, configured, run_preset
 from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
 from scipy.integrate import solve_ivp
 
+from blf_dsc_controller.analysis.lyapunov import energies as offline_energies
+from blf_dsc_controller.bags.reader import read_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.schema import build, change
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import columns_of
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law import state
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.simulation.loop import simulate, write_bag
 
 
 def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():
@@ -55,35 +59,26 @@ def power_of_the_initial_model(law, q, dq):
     return s.xi2 @ (H - s.H[:, :3]) @ (law.settings.initial_estimate[:3] - P)
 
 
-@pytest.mark.parametrize('compensation', ['reference', 'state'])
-@pytest.mark.parametrize('kappa', [0.0, 100.0], ids=['tracking alone', 'learning too'])
-def test_lyapunov_function_decreases_from_sample_to_sample(kappa, compensation):
-    """(31), (32) without a disturbance; before the latch at 6.8 s both cases are the same.
+@pytest.mark.parametrize('of_law', [controller, as_printed])
+def test_lyapunov_function_decreases_from_sample_to_sample(of_law):
+    """(31), (32) without a disturbance, as long as nothing is learned from a window.
 
-    With compensation along the reference V may rise by no more than the power of the initial model.
+    With compensation along the reference V may rise by no more than the power of the
+    initial model.
     """
-    form = state.REFERENCE if compensation == 'reference' else state.STATE
-    gains = {'kappa': kappa, 'gamma': np.full(2, 1.0), 'compensation': form}
-    known = {
-        'truth_known': 1,
-        'true_parameters': P,
-        'true_disturbance': np.zeros((4, 2)),
-    }
-    law = controller(recommended(bias=False, bumpless=0, **gains, **known))
+    along = of_law is controller
+    law = of_law(recommended(bias=False, gamma=np.full(2, 1.0)))
     V, power = [], []
-    for sample in closed_loop(law, plant(constant=QUIET, amplitude=QUIET), 10.0):
-        V.append(law.sample.lyapunov.sum())
-        power.append(
-            power_of_the_initial_model(law, *sample.measurement.reshape(3, 2)[:2])
-        )
+    for sample in closed_loop(law, plant(constant=QUIET, amplitude=QUIET), 6.5):
+        off = law.sample.disturbance
+        V.append(energies(law, sample.t)[:3].sum() + 0.5 * off @ off)
+        lacking = power_of_the_initial_model(law, *sample.measurement.reshape(3, 2)[:2])
+        power.append(lacking if along else 0.0)
     V, power = np.array(V), np.array(power)
-
-    assert (np.abs(power).max() > 1e-3) == (compensation == 'reference')
+    assert (np.abs(power).max() > 1e-3) == along
     # A sampled loop may ripple where V' is close to zero: by a millionth of the initial V.
     assert np.max(np.diff(V) - 1e-3 * power[1:]) < 1e-6 * V[0]
     assert V[6000] < 0.5 * V[0]
-    if kappa > 0.0:
-        assert V[-1] < 0.1 * V[6000]
 
 
 END = 0.5
@@ -173,78 +168,11 @@ def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate(
     """The estimate steps by half of P; without the handover the error reaches 0.42 mrad."""
     end = LATCH + 1.0
     true = 0.1 + 0.1 * np.sin(end)  # N m
-    bumpless, paper = (
-        run_preset(end, law=instead(bumpless=choice)) for choice in (True, False)
-    )
-    off, late = (
-        np.abs(loop.controller.state.disturbance - true).max()
-        for loop in (bumpless, paper)
-    )
-    assert bumpless.parameter_error[np.searchsorted(bumpless.t, LATCH - 0.1)] > 0.1
-    assert bumpless.parameter_error[-1] < 1e-3
-    assert bumpless.largest(LATCH).max() < 0.02e-3
-    assert paper.largest(LATCH).max() > 0.4e-3
-    assert off < 0.02
-    assert late > 0.1
-
-
-GAINS = {
-    'two_link.adaptation_gain': [0.5, 2.0, 1.5],
-    'disturbance.gain': [40.0, 10.0],
-    'two_link.barrier_weight': [800.0, 300.0],
-    'truth.phase': [0.0, 0.4],
-}
-
-
-def samples(law, **changes):
-    """Yield time, controller and measurement of 300 samples."""
-    config = configured('recommended', 1.0, EXACT | {'law': law} | changes)
-    controller = controller_of(config.controller)
-    for sample in closed_loop(controller, plant(), 0.3):
-        yield sample.t, controller, sample.measurement
-
-
-@pytest.mark.parametrize(
-    ('law', 'own'),
-    [('blf_dsc', {}), ('backstepping', {'gains.position_gain': [25.0, 9.0]})],
-)
-def test_terms_are_those_of_equation_29(law, own):
-    Gamma = np.array([0.5, 2.0, 1.5])
-    gamma = np.array([40.0, 10.0])
-    w = np.array([800.0, 300.0] if law == 'blf_dsc' else [25.0, 9.0])
-    for t, running, measurement in samples(law, **GAINS, **own):
-        sample = running.sample
-        xi1, xi2 = sample.xi1, sample.xi2
-        M, _, _ = dynamics(P, 9.8, measurement[:2], measurement[2:4])
-        tau_dist = 0.1 + 0.1 * np.sin(t + np.array([0.0, 0.4]))
-        # (35) has no barrier and no d^3
-        error = 0.5 * np.sum(w * xi1**2)
-        disturbance = 0.0
-        if law == 'blf_dsc':
-            error = np.sum(
-                w * 0.002**2 / np.pi * np.tan(np.pi * xi1**2 / (2.0 * 0.002**2))
-            )
-            disturbance = 0.5 * np.sum((tau_dist - sample.disturbance) ** 2 / gamma)
-        parameters = 0.5 * np.sum((P - sample.estimate[:3]) ** 2 / Gamma)
-        expected = error, 0.5 * xi2 @ M @ xi2, parameters, disturbance
-        np.testing.assert_allclose(sample.lyapunov, expected, rtol=1e-11, atol=1e-18)
-
-
-def test_energies_of_estimates_that_are_not_adapted_or_unknown_do_not_count():
-    frozen = {
-        'two_link.adaptation_gain': [0.0, 1.0, 0.0],
-        'disturbance.gain': [0.0, 50.0],
-    }
-    for t, running, _ in samples('blf_dsc', **frozen):
-        off = (
-            P[1] - running.sample.estimate[1],
-            0.1 + 0.1 * np.sin(t) - running.sample.disturbance[1],
-        )
-        expected = 0.5 * np.square(off) / (1.0, 50.0)
-        np.testing.assert_allclose(running.sample.lyapunov[2:], expected, rtol=1e-11)
-    for _, running, _ in samples('blf_dsc', **{'truth.parameters': []}):
-        assert running.sample.lyapunov[0] >= 0.0
-        assert np.all(np.isnan(running.sample.lyapunov[1:]))
+    loop = run_preset(end)
+    assert loop.parameter_error[np.searchsorted(loop.t, LATCH - 0.1)] > 0.1
+    assert loop.parameter_error[-1] < 1e-3
+    assert loop.largest(LATCH).max() < 0.02e-3
+    assert np.abs(loop.controller.state.disturbance - true).max() < 0.02
 
 
 NOISY = {'position_noise': 1e-5, 'sensor.velocity': 'differenced', 'delay': 2}
@@ -278,35 +206,6 @@ def test_law_continues_bit_for_bit_from_a_saved_state_and_begins_anew_after_a_re
     np.testing.assert_array_equal(torques(law, 0, 1337), start)
 
 
-OWN = {'position_gain': [30.0, 11.0], 'robust_gain': [0.4, 0.2], 'leakage': 0.05}
-
-
-@pytest.mark.parametrize(('law', 'share'), [('backstepping', 1.0), ('slotine_li', 0.0)])
-def test_comparison_laws_are_the_linear_surface_with_their_gains(law, share):
-    """`slotine_li` without w, mu_bar and W_c; neither learns from a window unless told to."""
-    gains = {'surface_gain': [60.0, 35.0]} | (OWN if share else {})
-    given = {f'gains.{name}': value for name, value in gains.items()}
-    config = configured('recommended', 1.0, given | {'law': law}).controller
-    settings = settings_of_config(config)
-    assert settings.has_barrier == 0
-    assert settings.compensation == state.STATE
-    found = (settings.barrier.weight, settings.robust_gain, settings.adaptation.leakage)
-    for ours, wanted in zip(found, OWN.values(), strict=True):
-        np.testing.assert_array_equal(ours, share * np.array(wanted))
-    np.testing.assert_array_equal(settings.surface.gain, gains['surface_gain'])
-    for zero in (
-        settings.feedback.robust_gain,
-        settings.disturbance.gain,
-        settings.adaptation.weight,
-        settings.excitation.change_detection,
-    ):
-        assert not np.any(zero)
-    told = change(config, {'gains.learning_weight': 7.0})
-    assert (
-        settings_of_config(told).adaptation.weight == 7.0
-    )  # not the 100 of two_link.learning_weight
-
-
 FROZEN = {
     'two_link.initial_estimate': list(P),
     'two_link.adaptation_gain': [0.0] * 3,
@@ -315,12 +214,48 @@ FROZEN = {
 
 
 def test_proposed_law_with_everything_known_and_frozen_equals_model_based():
-    known = {'law': 'model_based', 'truth.parameters': list(P)}
+    known = FROZEN | {'law': 'model_based'}
     frozen, model_based = (
         run_preset(10.0, NO_DISTURBANCE, law=law) for law in (FROZEN, known)
     )
     np.testing.assert_allclose(frozen.torque, model_based.torque, atol=1e-12)
     np.testing.assert_allclose(frozen.xi1, model_based.xi1, atol=1e-15)
+
+
+def of_linear_surface(law, gains):
+    """Return the first torque of a law (2,), and H P^(0) - K_p z2 with its surface."""
+    config = configured('recommended', 1.0, {'law': law} | gains).controller
+    controller = controller_of(config)
+    qr, dqr, ddqr = controller.reference_at(0.0)
+    z1, rate = np.array([1e-3, -2e-3]), np.array([0.03, 0.01])
+    q, dq = qr + z1, dqr + rate
+    controller.update(0.0, 1e-3, np.concatenate((q, dq, np.zeros(2))))
+    surface = gains['gains.surface_gain']
+    alpha2, dalpha2 = dqr - surface * z1, ddqr - surface * rate
+    z2 = dq - alpha2
+    H = regressor(R, q, dq, alpha2, dalpha2)
+    usual = H @ config.two_link.initial_estimate - config.two_link.feedback_gain * z2
+    return controller.signals.demand, usual, z1, z2
+
+
+def test_torque_of_the_comparison_laws_is_that_of_their_equations():
+    found, usual, z1, z2 = of_linear_surface('slotine_li', {'gains.surface_gain': 60.0})
+    np.testing.assert_allclose(found, usual, rtol=1e-12)
+    gains = {'position_gain': 30.0, 'robust_gain': 0.4, 'surface_gain': 60.0}
+    named = {f'gains.{name}': value for name, value in gains.items()}
+    found, usual, z1, z2 = of_linear_surface('backstepping', named)
+    expected = usual - 30.0 * z1 - 0.4 * np.clip(z2 / 0.01, -1.0, 1.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_leakage_of_backstepping_shrinks_what_nothing_excites():
+    """At rest on the reference: P^' = -Gamma W_c P^."""
+    law = {'law': 'backstepping', 'gains.leakage': 2.0, 'reference.type': 'hold'}
+    quiet = NO_DISTURBANCE | {'initial.position': [1.2, 0.6]}
+    start = {'reference.offset': [1.2, 0.6], 'two_link.initial_estimate': list(P)}
+    loop = run_preset(0.1, quiet, law=law | start)
+    shrunk = np.exp(-2.0 * 0.5 * 0.1) * P
+    np.testing.assert_allclose(loop.estimate[-1, :3], shrunk, rtol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +267,6 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(gain, mu, weight):
 
     xi1 compensates it by (K/2 + mu) xi1 in beta2, and by w xi1 = -K_p xi2 in the torque.  The
     reference's acceleration is 0.3 rad/s^2; the held torque adds half a sample to the lag.
-    With the known rate of beta2 neither is left, here of the law whose estimate is true and frozen.
     """
     gains = {
         'two_link.surface_gain': gain,
@@ -344,9 +278,6 @@ def test_error_of_the_oracle_is_the_lag_of_the_surface_filter(gain, mu, weight):
     rate = gain / 2.0 + mu + weight / np.array([60.0, 20.0])
     expected = (0.002 + 0.5e-3) * 0.3 / rate
     np.testing.assert_allclose(loop.largest(1.0), expected, rtol=0.05)
-    changes |= FROZEN | instead(known_rate=True)
-    loop = run_preset(8.0, NO_DISTURBANCE, law=changes)
-    assert (loop.largest(1.0) < 0.2 * 0.5e-3 * 0.3 / rate).all()  # alpha2 does not lag
 
 
 def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
@@ -377,3 +308,37 @@ def test_settings_follow_the_configuration():
         3.0,
         *[1.0] * columns,
     ]
+
+
+def test_terms_of_equation_29_follow_from_what_a_bag_holds(tmp_path):
+    """Those of a simulated run, and of its bag where this has the truth."""
+    loop = configured('paper', 0.5)
+    record = simulate(loop.controller, loop.plant)
+    run = record.run()
+    found = offline_energies(run)
+    gains = loop.controller.two_link.adaptation_gain, loop.controller.disturbance.gain
+    k = 250
+    xi1, xi2 = run.error[k], run.xi2[k]
+    M, _, _ = dynamics(P, R, run.position[k], run.velocity[k])
+    s = np.pi * xi1**2 / (2.0 * BOUND**2)
+    off = P - run.monitor.values[k, :3]
+    tau_dist = 0.1 + 0.1 * np.sin(run.time[k])
+    missed = tau_dist - record.sample(k).disturbance
+    expected = (
+        np.sum(BOUND**2 / np.pi * np.tan(s)),
+        0.5 * xi2 @ M @ xi2,
+        0.5 * np.sum(off**2 / gains[0]),
+        0.5 * np.sum(missed**2 / gains[1]),
+    )
+    np.testing.assert_allclose(found.values[k], expected, rtol=1e-9)
+    write_bag(tmp_path / 'bag', record, loop.plant)
+    recorded = offline_energies(read_run(tmp_path / 'bag'))
+    rows = np.searchsorted(found.stamp, recorded.stamp - recorded.stamp[0])
+    assert len(rows) > 5
+    np.testing.assert_allclose(recorded.values, found.values[rows], rtol=1e-9)
+
+
+@pytest.mark.parametrize('law', ['backstepping', 'slotine_li'])
+def test_equation_29_is_of_laws_with_the_barrier_alone(law):
+    loop = configured('recommended', 0.01, {'law': law})
+    assert offline_energies(simulate(loop.controller, loop.plant).run()) is None

@@ -11,11 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from paper_case import OFF, configured, instead, several
+from paper_case import OFF, configured, several
+from symbols import replaced
 
 import blf_dsc_controller as blf
 from benchmark.studies import load_study
+from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.messages.journal import Journal
+from blf_dsc_controller.simulation.loop import new_record, run_alone
 from blf_dsc_controller.studies.summary import compare_pairs
+from sim_plant.plant import plant_of
 
 # rad/s, first of the presets panda and ur5e, third of the last
 TONE = 1.2566370614359172
@@ -37,13 +42,23 @@ ROWS = {
     'panda, sine on joint7': ('panda_rigid', 12.0, SINE),
     'noisy, cosines': ('noisy', 20.0, COSINES),
 }
-UNCHECKED = instead(known_rate=True, change_detection=False)
 
 
 def run(name, law):
     """Return the run of a row, with parameters of the law."""
     preset, duration, plant = ROWS[name]
     return run_of(preset, duration, law, plant)
+
+
+def unchecked(name):
+    """Return the run of a row by the law alone, which detects no change."""
+    preset, duration, plant = ROWS[name]
+    config = configured(preset, duration, {}, plant)
+    law = controller_of(config.controller)
+    law.retune(law.law, replaced(law.settings, change_detection=0, starts_full=1))
+    record = new_record(law, config.controller, config.plant, Journal())
+    run_alone(record, plant_of(config.plant))
+    return record.run()
 
 
 def run_of(preset, duration, law=None, plant=None):
@@ -83,7 +98,7 @@ def test_learned_friction_stays_friction():
     The first window of the UR5e sees a payload come and go, and takes parts of it for friction,
     unless the change is detected.
     """
-    found = run('ur5e, 1.26 kg put down again', UNCHECKED)
+    found = unchecked('ur5e, 1.26 kg put down again')
     kinds = (learned(found, kind) for kind in ('viscous ', 'coulomb '))
     share = np.hstack([values / values[0] for values in kinds])
     assert share.min() == pytest.approx(1.0 / 3.0)

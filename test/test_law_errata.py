@@ -9,12 +9,14 @@ import pytest
 from closed_loop_case import (
     JOINTS,
     REFERENCE,
+    as_printed,
     closed_loop,
     controller,
+    energies,
     plant,
     recommended,
 )
-from paper_case import EXACT, P, configured, run
+from paper_case import P, configured, run
 from plain_law import R, dynamics, regressor
 from plants import QUIET, START
 from symbols import replaced
@@ -23,7 +25,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law import adaptation, learning
 from blf_dsc_controller.law.lag import filter_gain
-from blf_dsc_controller.law.prediction import FILTERED, LAMBDA
 from blf_dsc_controller.law.surface import virtual_control
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.approach import check_takeover
@@ -132,12 +133,12 @@ def test_erratum_15_robust_term_dominates_disturbances_bounded_joint_by_joint():
     np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
 
-def rows_of_a_loop(prediction, duration=1.0):
+def rows_of_a_loop(of_law, duration=1.0):
     """Yield X P - u of each sample without disturbances, with the controller that formed it.
 
     The filter (8) and those of the regressor settle within the first fifth of a second.
     """
-    law = controller(recommended(bias=False, prediction=prediction))
+    law = of_law(recommended(bias=False))
     arm = plant(constant=QUIET, amplitude=QUIET)
     for sample in closed_loop(law, arm, duration):
         if sample.t > 0.2:
@@ -148,10 +149,10 @@ def rows_of_a_loop(prediction, duration=1.0):
 def test_erratum_6_known_part_of_the_dynamics_is_subtracted():
     """(23): M xi2' + C xi2 is the torque LESS M alpha2' + C alpha2 + G; printed is a plus."""
     corrected, printed = [], []
-    for _, law, sample in rows_of_a_loop(LAMBDA):
+    for _, law, sample in rows_of_a_loop(as_printed):
         q, dq, torque = sample.measurement.reshape(3, 2)
         xi2 = law.signals.xi2
-        observed = law.state.row.observed_rate
+        observed = law.state.memory[2:]
         M, C, _ = dynamics(P, R, q, dq)
         known = regressor(R, q, dq, dq - xi2, law.signals.dalpha2) @ P
         rest = M @ observed + C @ xi2 - torque
@@ -165,11 +166,10 @@ def test_erratum_7_only_filtered_rows_are_exact_with_an_error():
     """Lambda of (24) is a heuristic: its error is of first order in xi2 and xi2'."""
     largest = {
         kind: max(np.abs(residual).max() for residual, _, _ in rows_of_a_loop(kind))
-        for kind in (FILTERED, LAMBDA)
+        for kind in (controller, as_printed)
     }
-    assert recommended().row.prediction == FILTERED
-    assert largest[FILTERED] < 1e-4  # N m, of second order in the sample time
-    assert largest[LAMBDA] > 100.0 * largest[FILTERED]
+    assert largest[controller] < 1e-4  # N m, of second order in the sample time
+    assert largest[as_printed] > 100.0 * largest[controller]
 
 
 def test_erratum_11_filter_gap_enters_the_error_rate_with_a_minus():
@@ -204,7 +204,7 @@ def test_erratum_24_varying_disturbance_adds_a_term_to_the_rate_of_the_lyapunov_
         'two_link.initial_estimate': list(P),
         'two_link.adaptation_gain': [0.0] * 3,
     }
-    law = EXACT | known | {'disturbance.gain': [gain, gain]}
+    law = known | {'disturbance.gain': [gain, gain]}
     loop = run(configured('recommended', 8.0, law))
     V = loop.lyapunov[:, 3]
     tau_dist = 0.1 + 0.1 * np.sin(loop.t)[:, np.newaxis]
@@ -227,14 +227,14 @@ def test_erratum_16_disturbance_reduces_the_effective_velocity_feedback():
     T = 1e-5
     d1 = 15.0
     xi2 = np.array([0.02, -0.05])
-    known = {'initial_estimate': P, 'truth_known': 1, 'true_parameters': P}
-    law = controller(recommended(bias=False, gamma=np.zeros(2), **known))
+    settings = recommended(bias=False, gamma=np.zeros(2), initial_estimate=P)
+    law = controller(settings)
     start = law.reference_at(0.0)[0]  # at rest there, so that alpha2 = 0 and xi2 = q'
     arm = plants.plant(sample_time=1e-5, start=start, velocity=xi2)
     energy = []
     for k in range(2):
         law.update(k * T, T, arm.measure())
-        energy.append(law.sample.lyapunov[1])
+        energy.append(energies(law, 0.0)[1])
         arm.step(law.signals.torque + d1 * xi2)
     power = np.diff(energy)[0] / T
     assert power == pytest.approx(

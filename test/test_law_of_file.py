@@ -26,7 +26,7 @@ from blf_dsc_controller.compiled.jit import SLOW, kernel
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
-from blf_dsc_controller.configuration.law_traits import LAWS, OWN, traits_of
+from blf_dsc_controller.configuration.law_traits import LAWS, traits_of
 from blf_dsc_controller.configuration.nodes import load_loop, locate
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import build, change, flatten
@@ -51,7 +51,6 @@ from blf_dsc_controller.studies.runs import run_chunk
 from blf_dsc_controller.supervision.retuning import apply_bumpless
 
 LAW = COMPUTED_TORQUE
-TRUTH = {'truth.parameters': [1.0, 0.32, 0.4]}
 GAINS = ('gains.position', 'gains.velocity', 'gains.integral')
 
 
@@ -436,11 +435,10 @@ def test_bound_at_the_tool_needs_a_barrier_and_contacts_a_law_that_learns(
 
 
 def test_traits_of_the_packaged_laws_are_those_of_the_laws():
-    """`learns` is of the configuration: model_based is blf_dsc with gains of zero."""
     for law in LAWS:
-        config = build(ControllerConfig, TRUTH | {'law': law})
+        config = build(ControllerConfig, {'law': law})
         assert traits_of(config).has_barrier == law_of(config).has_barrier
-        assert traits_of(config).learns == (law in OWN)
+        assert traits_of(config).learns == (law in ('blf_dsc', 'paper'))
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from paper_case import instead
 from plain_urdf_law import PlainArm, PlainUrdfLaw
 from random_arm import UR5E, UR5E_TEXT, pinocchio_model
+from symbols import replaced
 
-from blf_dsc_controller import load_loop, simulate
+from blf_dsc_controller import load_loop
+from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.samples import sample_columns
+from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.terms import sampled
+from blf_dsc_controller.simulation.loop import new_record, run_alone
+from sim_plant.plant import plant_of
 
 PERIOD = 0.004  # s
 BOTH = {'sample_time': PERIOD}
@@ -27,7 +31,6 @@ FRICTION_FALLS = {
     'events.torque': [0.0] * 6 + [10.0] * 3 + [3.0] * 3,
 }
 LAW = {
-    **instead(known_rate=True, change_detection=False),
     'robot.rotor_inertia': [0.4, 0.4, 0.4, 0.07, 0.07, 0.07],
 }
 WHOLE = {'feedback.inertia': 'whole'}
@@ -44,6 +47,16 @@ CASES = {
 }
 
 
+def unchecked(loop):
+    """Run the law alone, which detects no change and begins to learn with a full window."""
+    law = controller_of(loop.controller)
+    changes = {'change_detection': 0, 'starts_full': 1}
+    law.retune(law.law, replaced(law.settings, **changes))
+    record = new_record(law, loop.controller, loop.plant, Journal())
+    run_alone(record, plant_of(loop.plant))
+    return record
+
+
 @pytest.mark.parametrize('name', CASES)
 def test_law_of_a_ur5e_is_the_one_of_the_page(name):
     changes = CASES[name]
@@ -56,7 +69,7 @@ def test_law_of_a_ur5e_is_the_one_of_the_page(name):
             'blf_dsc_controller': BOTH | LAW | changes,
         },
     )
-    record = simulate(loop.controller, loop.plant, supervised=False)
+    record = unchecked(loop)
     settings = record.controller.settings
     ours = sample_columns(record.samples, settings)
     arm = PlainArm(pinocchio_model(UR5E_TEXT, UR5E), settings.model.parameter_names)

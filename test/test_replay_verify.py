@@ -100,7 +100,6 @@ def test_every_number_is_reproduced(bag, tmp_path):
         {'law': 'backstepping'},
         {'law': 'slotine_li'},
         {'feedback.joint_damping_lag': [0.003, 0.003]},
-        {'law': 'slotine_li', 'feedback.joint_damping_lag': [0.003, 0.003]},
     ],
 )
 def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path, given):

@@ -348,19 +348,6 @@ def test_table_and_picture_of_soft_arms_show_each_law(tmp_path):
     assert (tmp_path / 'stiffness.png').stat().st_size > 10_000
 
 
-def test_integral_gain_of_slotine_li_is_the_gain_of_its_disturbance_estimate():
-    config = load_loop('ur5e_rigid').controller
-    chosen = {
-        'law': 'slotine_li',
-        'gains.integral_gain': [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
-    }
-    settings = settings_of_config(change(config, chosen))
-    assert settings.disturbance.gain.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    assert not settings_of_config(
-        change(config, {'law': 'slotine_li'})
-    ).disturbance.gain.any()
-
-
 def test_events_of_a_file_become_the_pick_up_of_its_heaviest_load():
     events = {
         'events.begin': [1.0, 2.0],

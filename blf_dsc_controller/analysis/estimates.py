@@ -18,7 +18,6 @@ from blf_dsc_controller.messages.topics import (
     LAMBDA_MIN,
     LATCHED,
     LOAD,
-    LYAPUNOV,
     MODEL_CHANGES,
     POSITION,
     RATIO,
@@ -32,7 +31,7 @@ _POSTURES = 400  # of the reference, at which torques are compared
 _MAX_SAMPLES = 100_000  # samples of the estimates, evenly spaced
 _BLOCK = 8192
 _NO_PARAMETERS = (
-    *(*COLUMNS, DISTURBANCE, POSITION, VELOCITY, RATIO, DISTANCE, *LOAD, LYAPUNOV),
+    *(*COLUMNS, DISTURBANCE, POSITION, VELOCITY, RATIO, DISTANCE, *LOAD),
     *(LAMBDA_MIN, LATCHED, MODEL_CHANGES, *CONTACT, *TOOL, COMPUTE_TIME),
 )
 

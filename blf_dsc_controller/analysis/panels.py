@@ -25,13 +25,12 @@ from blf_dsc_controller.analysis.event_times import (
     outside,
     true_change_times,
 )
+from blf_dsc_controller.analysis.lyapunov import energies
 from blf_dsc_controller.analysis.metrics import rms, tool_errors
 from blf_dsc_controller.messages.topics import (
     DISTURBANCE,
     INTERVAL,
     LAMBDA_MIN,
-    LYAPUNOV,
-    LYAPUNOV_TERMS,
 )
 from blf_dsc_controller.run import Floats, LearnedArm, Run, Series
 
@@ -400,19 +399,19 @@ def _monitors(run: Run) -> Iterator[Panel]:
         for line in _column(run, run.monitor, LAMBDA_MIN, title)
     ]
     yield Panel('Excitation', title, '', excitation, note, log=True)
-    if run.monitor is not None and LYAPUNOV_TERMS[0] in run.monitor.names:
-        yield _lyapunov(run, run.monitor)
+    found = energies(run)
+    if found is not None:
+        yield _lyapunov(run, found)
 
 
-def _lyapunov(run: Run, monitor: Series) -> Panel:
+def _lyapunov(run: Run, energy: Series) -> Panel:
     """Return the panel of V (29) and its terms."""
-    V = Line(
-        'V', run.time_of(monitor.stamp), monitor.select(LYAPUNOV_TERMS).sum(axis=1), INK
-    )
+    time = run.time_of(energy.stamp)
+    V = Line('V', time, energy.values.sum(axis=1), INK)
     terms = [
         line
-        for term in LYAPUNOV_TERMS
-        for line in _column(run, monitor, term, term.removeprefix(LYAPUNOV))
+        for term in energy.names
+        for line in _column(run, energy, term, term)
         if np.any(line.values > 0.0)
     ]
     lines = [

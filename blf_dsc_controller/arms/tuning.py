@@ -210,25 +210,6 @@ def radius(arm: Design) -> float:
     return 10.0 * max(float(np.sqrt((P * P).sum())), arm.payload)
 
 
-def linear_surface_gains(arm: Design) -> Mapping[str, Value]:
-    """Return the gains of the laws with a linear surface by the name of their parameter."""
-    n = len(arm.chain.joints)
-    if arm.joints is None:
-        fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
-        rate = arm.stiffness * fastest
-        surface = (rate / 3.0,) * n
-        position = arm.over_postures().free_inertia * (rate / 4.0) ** 2
-    else:
-        gains = arm.joints.scaled(arm.stiffness)
-        surface = _listed(gains.rate)
-        position = 0.5 * gains.stiffness
-    return {
-        'surface_gain': surface,
-        'position_gain': _listed(position),
-        'robust_gain': (0.0,) * n,
-    }
-
-
 def adaptation_gain(integral: np.ndarray, deviation: np.ndarray) -> float:
     """Return a Gamma with which the tracking error adapts no faster than an integral.
 
@@ -244,15 +225,7 @@ def adaptation_gain(integral: np.ndarray, deviation: np.ndarray) -> float:
 
 def _of_arm(arm: Design) -> dict[str, Value]:
     """Return what does not depend on the feedback: limits, learning, safety."""
-    zeros = (0.0,) * len(arm.chain.joints)
-    return {
-        'truth.constant': zeros,
-        'truth.amplitude': zeros,
-        'truth.frequency': (1.0,) * len(zeros),
-        'truth.phase': zeros,
-        **_limits_of(arm),
-        **_learning_of(arm),
-    }
+    return {**_limits_of(arm), **_learning_of(arm)}
 
 
 def _limits_of(arm: Design) -> dict[str, Value]:

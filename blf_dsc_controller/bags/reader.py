@@ -14,7 +14,7 @@ from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_con
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages, Values
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.law_traits import OWN
+from blf_dsc_controller.configuration.law_traits import OWN, PAPER
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
@@ -114,6 +114,7 @@ def recorded_run(
         learns=_learns([event.content.get('parameters', {}) for event in events]),
         notes=(*run.notes, *_unknown_parameters(content), *unusable),
         sliding=config.robot.sliding(config.joints) if config else (),
+        parameters=content.configurations.get(CONTROLLER, {}),
     )
 
 
@@ -352,7 +353,7 @@ def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:
     switches = [
         each['learning.enabled'] for each in settings if 'learning.enabled' in each
     ]
-    return laws <= set(OWN) and any(switches or [True])
+    return laws <= {OWN, PAPER} and any(switches or [True])
 
 
 class TorqueError(BlfDscError):

@@ -35,7 +35,6 @@ _VALUES = {  # prefix of names in the vectors: unit
     topics.POSITION: 'rad',
     topics.VELOCITY: 'rad/s',
     topics.DISTANCE: 'rad',
-    topics.LYAPUNOV: 'J',
     **dict.fromkeys(
         (topics.RATIO, topics.LATCHED, topics.MODEL_CHANGES, topics.LATE_STEPS), '1'
     ),

@@ -20,12 +20,7 @@ from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration import tool_bound
 from blf_dsc_controller.configuration.controller_groups import Feedback
-from blf_dsc_controller.configuration.law_file import GROUP
-from blf_dsc_controller.configuration.law_traits import (
-    GAINS,
-    LAWS,
-    OWN,
-)
+from blf_dsc_controller.configuration.law_traits import OWN, PAPER
 from blf_dsc_controller.configuration.robot import (
     ArmConfig,
     Robot,
@@ -33,7 +28,7 @@ from blf_dsc_controller.configuration.robot import (
     given_robot,
     parameters_of,
 )
-from blf_dsc_controller.configuration.schema import Value, parameters
+from blf_dsc_controller.configuration.schema import Value
 
 
 def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
@@ -51,18 +46,7 @@ def followed_by(given: Mapping[str, Any]) -> Mapping[str, Value]:
         **described(robot, chain),
         'feedback.stiffness': arm.stiffness,
         **usual,
-        **_gains_of_law(given, arm),
     }
-
-
-def _gains_of_law(given: Mapping[str, Any], arm: tuning.Design) -> dict[str, Value]:
-    """Return the gains that only the given law of the package has."""
-    group = GAINS.get(given.get('law', LAWS[0]))
-    if group is None:
-        return {}
-    names = {param.name for param in parameters(group)}
-    usual = tuning.linear_surface_gains(arm)
-    return {f'{GROUP}.{name}': usual[name] for name in names & usual.keys()}
 
 
 def used_design(
@@ -81,11 +65,11 @@ def stated_design(
 ) -> tuple[tuning.Design, Gears | None]:
     """Return the design by what is given alone, and the gears, if known.
 
-    Other laws than the package's own have feedback through the inertia matrix.
+    Laws of other files have feedback through the inertia matrix.
     """
     motors = robot.rotors(chain)
     gears = _gears(robot, chain, motors)
-    is_own = given.get('law', LAWS[0]) in OWN
+    is_own = given.get('law', OWN) in (OWN, PAPER)
     usual = 'whole' if not is_own or (gears and gears.has_torque_loop) else 'none'
     is_whole = given.get('feedback.inertia', usual) != 'none'
     gains = _given_gains(given, len(motors)) or unknown_arm(motors)

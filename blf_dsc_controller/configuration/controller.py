@@ -13,7 +13,6 @@ from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.known_gears import Gears
 from blf_dsc_controller.arms.model import arm_model
 from blf_dsc_controller.configuration import (
-    known_arm,
     law_file,
     plausibility,
     tool_bound,
@@ -40,6 +39,7 @@ from blf_dsc_controller.configuration.controller_groups import (
 from blf_dsc_controller.configuration.law_traits import (
     LAWS,
     OWN,
+    PAPER,
     gains_of,
     has_exact_rows,
     traits_of,
@@ -59,8 +59,6 @@ from blf_dsc_controller.configuration.schema import (
 )
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import JointUnits, joint_units
-
-_FILTERED = '; of the law paper, gains.prediction filtered'
 
 
 @dataclass(frozen=True)
@@ -87,14 +85,13 @@ class ControllerConfig(ArmConfig):
 
     @classmethod
     def variant(cls, given: Mapping[str, Any]) -> type[ControllerConfig]:
-        """Return the configuration with the gains that only the given law has, and known data.
+        """Return the configuration with the gains that only the given law has.
 
         Raises BlfDscError if there is no such law.
         """
-        law = given.get('law', LAWS[0])
+        law = given.get('law', OWN)
         gains = gains_of(law) if isinstance(law, str) else None
-        knows = known_arm.is_asked_for(given)
-        return _with_groups(gains, knows=knows, planar=not given.get('robot.urdf'))
+        return _with_groups(gains, planar=not given.get('robot.urdf'))
 
     @property
     def model(self) -> Literal['two_link', 'urdf']:
@@ -120,60 +117,49 @@ class ControllerConfig(ArmConfig):
 
     def problems(self) -> Iterator[str]:
         """Check the parameters against each other and against the model."""
-        needed, count = self._sizes()
         yield from self._drive_load_problems()
         yield from self._contact_problems()
         yield from self._stiffness_problems()
-        yield from self.arm_problems(f'model {self.model}', needed)
+        yield from self.arm_problems(f'model {self.model}', self._needed_joints())
         yield from self.reference.problems()
         yield from self.limits.problems(self.joints, self.units)
         yield from tool_bound.problems(self)
-        known = known_arm.known_arm(self)
-        if known:
-            yield from known.problems(self.law, self.model, count)
         yield from self.learning.problems(self.sample_time)
         yield from plausibility.problems_of_controller(self)
 
-    def _sizes(self) -> tuple[int | None, int]:
-        """Return how many joints the model needs, None for any, and its parameters."""
+    def _needed_joints(self) -> int | None:
+        """Return how many joints the model needs; None for any."""
         if self.model == 'urdf':
-            base = parameters_of(self.robot, self.robot.chain(self.joints))
-            return None, base.model.p
+            return None
         given = two_link.two_link(self)
-        model = arm_model(given.l1, given.gravity)
-        return model.n, model.p
+        return arm_model(given.l1, given.gravity).n
 
     @property
     def weighs(self) -> bool:
         """Whether what `robot.tip` holds is weighed: by exact rows of an arm from a URDF."""
-        return self.model == 'urdf' and self._has_exact_rows()
+        return self.model == 'urdf' and self.has_exact_rows
 
     @property
     def learns_load_friction(self) -> bool:
         """Whether friction that grows with the load is learned: a torque loop hides it."""
-        is_soft = self.law in OWN and self.feedback.inertia == 'none'
+        is_soft = self.law == OWN and self.feedback.inertia == 'none'
         return self.weighs and is_soft and not self.robot.torque_loop
 
     @property
     def has_torque_sensors(self) -> bool:
         """Whether efforts are said to be of joint torque sensors, for a law that uses them."""
         says = self.robot.torque_loop and self.robot.effort == 'whole'
-        is_own = self.law in OWN and self.model == 'urdf'
-        return says and is_own and self._has_exact_rows()
+        return says and self.law == OWN and self.model == 'urdf'
 
     @property
     def observes_load(self) -> bool:
         """Whether the load is observed by joint torque sensors."""
         return self.disturbance.observer_bandwidth > 0.0 and self.has_torque_sensors
 
-    def _has_exact_rows(self) -> bool:
+    @property
+    def has_exact_rows(self) -> bool:
         """Whether loads and contacts show in the rows that the law learns from."""
         return has_exact_rows(flatten(self))
-
-    def _rows(self) -> str:
-        """Return the law, and its rows if these are not exact."""
-        rows = '' if self._has_exact_rows() else ', whose gains.prediction is lambda'
-        return f'law {self.law}{rows}'
 
     def _drive_load_problems(self) -> Iterator[str]:
         """Check that the load can be declared to the drives, and how."""
@@ -181,10 +167,9 @@ class ControllerConfig(ArmConfig):
         compensates = self.robot.drive_compensates != 'none'
         if load.tell_drive and not (self.weighs and compensates):
             yield (
-                f'load.tell_drive: got true with model {self.model}, {self._rows()} and '
+                f'load.tell_drive: got true with model {self.model}, law {self.law} and '
                 f'robot.drive_compensates {self.robot.drive_compensates}, but needs a load that is '
-                f'weighed, by robot.urdf and {LAWS[0]}{_FILTERED}, and drives that compensate '
-                'gravity'
+                f'weighed, by robot.urdf and {OWN}, and drives that compensate gravity'
             )
         if load.service and not load.tell_drive:
             yield (
@@ -201,11 +186,11 @@ class ControllerConfig(ArmConfig):
     def _contact_problems(self) -> Iterator[str]:
         """Check that contacts are found, and by a law that can find them."""
         contact = self.contact
-        can_find = traits_of(self).learns and self._has_exact_rows()
+        can_find = traits_of(self).learns and self.has_exact_rows
         if contact.enabled and not can_find:
             yield (
-                f'contact.enabled: got true with {self._rows()}, but the external torque needs a '
-                f'law that learns, such as {LAWS[0]}{_FILTERED}'
+                f'contact.enabled: got true with law {self.law}, but the external torque needs a '
+                f'law that learns, such as {OWN}'
             )
         if contact.reaction != 'none' and not contact.enabled:
             yield (
@@ -239,7 +224,7 @@ class ControllerConfig(ArmConfig):
         feedback = self.feedback
         given = bool(feedback.joint_stiffness), bool(feedback.joint_damping)
         acts = feedback.inertia == 'none' and self.model == 'urdf'
-        if any(given) and self.law in OWN and not acts:
+        if any(given) and self.law in (OWN, PAPER) and not acts:
             yield (
                 'feedback.joint_stiffness, feedback.joint_damping: gains follow from them only '
                 f'for a URDF with feedback.inertia none, but got {feedback.inertia} and model '
@@ -272,15 +257,11 @@ def design_of(config: ControllerConfig) -> tuple[tuning.Design, Gears | None]:
 
 
 @functools.cache
-def _with_groups(
-    gains: type | None, *, knows: bool, planar: bool
-) -> type[ControllerConfig]:
-    """Return the configuration with the gains of a law, known data, and those of two links."""
+def _with_groups(gains: type | None, *, planar: bool) -> type[ControllerConfig]:
+    """Return the configuration with the gains of a law, and those of two links."""
     groups: dict[str, type] = {}
     if planar:
         groups[two_link.GROUP] = two_link.TwoLink
-    if knows:
-        groups[known_arm.GROUP] = known_arm.KnownArm
     if gains:
         groups[law_file.GROUP] = gains
     if not groups:

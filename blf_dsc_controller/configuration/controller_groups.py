@@ -216,12 +216,6 @@ class Torque:
     )
 
 
-def misfits(name: str, P: tuple[float, ...], model: str, count: int) -> Iterator[str]:
-    """Check that parameters P are those of a model."""
-    if len(P) != count:
-        yield f'{name}: got {len(P)}, but model {model} has {count} parameters'
-
-
 @dataclass(frozen=True)
 class Learning:
     """Composite learning of the parameters P and of the disturbance columns."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A control law of a user's own: a Python file, named by the parameter `law`.
+"""A control law in a Python file, named by the parameter `law`: a user's, or one of the package.
 
 The file defines `LAW`, a `NamedTuple` of gains with the methods of `law.interface.Law`,
 and, if the law keeps anything between samples, `MEMORY`, a `NamedTuple` of arrays.
@@ -37,6 +37,10 @@ from blf_dsc_controller.errors import BlfDscError
 GROUP = 'gains'
 """Group of the parameters that only one law has."""
 
+PACKAGED = ('paper', 'model_based', 'backstepping', 'slotine_li')
+"""Law files of the package, which are found by their name."""
+
+_FOLDER = Path(__file__).resolve().parents[1] / 'laws'
 _METHODS = {
     'compute_demand': ('self', 'settings', 'state', 'signals', 't', 'dt'),
     'finish': ('self', 'settings', 'state', 'signals', 'dt', 'saturated'),
@@ -54,6 +58,8 @@ class _File(NamedTuple):
     @classmethod
     def of(cls, law: str) -> _File:
         """Return the file that the parameter `law` names."""
+        if law in PACKAGED:
+            return cls(_FOLDER / f'{law}.py', '')
         written = _WRITTEN.fullmatch(law)
         if written is None:
             raise BlfDscError(f'{law} is not a Python file')
@@ -77,8 +83,13 @@ class _File(NamedTuple):
 
 
 def is_file(law: str) -> bool:
-    """Whether the parameter `law` names a file, not a law of the package."""
+    """Whether the parameter `law` names a user's file, not a law of the package."""
     return _WRITTEN.fullmatch(law) is not None
+
+
+def has_file(law: str) -> bool:
+    """Whether the parameter `law` names a law in a file, of a user or of the package."""
+    return law in PACKAGED or is_file(law)
 
 
 def is_pinned(law: str) -> bool:
@@ -129,7 +140,7 @@ def errors_told_with_line(law: str) -> Iterator[None]:
         yield
     except Exception as error:
         raised = traceback.extract_tb(error.__traceback__)[-1]
-        path = _File.of(law).path if is_file(law) else None
+        path = _File.of(law).path if has_file(law) else None
         if path and str(error) == _PAST_THE_END:  # which numba tells without a line
             raise BlfDscError(
                 f'{path}: an index is past the end of an array. Run it with NUMBA_DISABLE_JIT=1 '

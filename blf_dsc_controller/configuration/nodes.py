@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from blf_dsc_controller.compiled.announcement import logged_compilation
-from blf_dsc_controller.configuration import known_arm, law_file, received, two_link
+from blf_dsc_controller.configuration import law_file, received, two_link
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.files import (
@@ -94,16 +94,16 @@ class LoopConfig(NamedTuple):
 def known_names() -> frozenset[str]:
     """Return the parameter names of all nodes of the package."""
     names = (param.name for cls in NODES.values() for param in parameters(cls))
-    return known_arm.NAMES.union(two_link.NAMES, names)
+    return two_link.NAMES.union(names)
 
 
 def is_of_node(name: str, cls: type) -> bool:
     """Return whether a parameter in a section for several nodes is one of this node.
 
-    The gains that only one law has are the controller's, whatever they are called, and so is
-    what is known of the arm, and the arm of two links.
+    The gains that only one law has are the controller's, whatever they are called, and so
+    is the arm of two links.
     """
-    if is_gain_of_law(name) or name in known_arm.NAMES | two_link.NAMES:
+    if is_gain_of_law(name) or name in two_link.NAMES:
         return cls is ControllerConfig
     return name in {param.name for param in parameters(cls)}
 

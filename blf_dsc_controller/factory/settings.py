@@ -18,7 +18,6 @@ from blf_dsc_controller.arms.joint_gains import SURFACE
 from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.compiled.layout import filled
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.known_arm import known_arm
 from blf_dsc_controller.configuration.robot import (
     UNKNOWN_FRICTION,
     drive_model,
@@ -35,7 +34,7 @@ from blf_dsc_controller.factory.estimate import (
 )
 from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.inertia import joint_inertia
-from blf_dsc_controller.factory.laws import law_of, of_law
+from blf_dsc_controller.factory.laws import law_of, with_memory
 from blf_dsc_controller.law import (
     adaptation,
     apparent_inertia,
@@ -53,15 +52,13 @@ from blf_dsc_controller.law import (
     reversals,
     surface,
     torque,
-    truth,
     weighing,
     window,
 )
-from blf_dsc_controller.law.state import REFERENCE, Settings
+from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.numerics.algebra import inverse, product
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns
-_OMEGA = 100.0  # rad/s, of the filter (8)
 _CHECKS = 0.01  # s, between two checks of the excitation
 # Of an arm from a URDF, whose many parameters no motion excites all:
 # s, between rows of the window and between its checks
@@ -100,7 +97,6 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     settings = filled(
         Settings,
         config.learning,
-        compensation=REFERENCE,
         model=model,
         n=model.n,
         p=model.p,
@@ -108,14 +104,12 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         memory=0,
         has_barrier=int(law_of(config).has_barrier),
         joint_inertia=inertia,
-        robust_gain=np.zeros(model.n),
-        truth=_truth(config, model.p),
         friction=None,  # follows from the others
         rotors=_rotors(config, row.lag, inertia),
         **_parts_of_feedback(config, model.p, row.lag),
         **_parts_of_learning(config, model.p, learned, row),
     )
-    settings = of_law(config, settings)
+    settings = with_memory(config, settings)
     return settings._replace(friction=friction_settings(settings))
 
 
@@ -129,7 +123,6 @@ def _parts_of_feedback(config: ControllerConfig, p: int, lag: float) -> dict[str
             disturbance.Settings,
             config.disturbance,
             leakage=law_gains(config).leakage,
-            bumpless=1,
         ),
         'observer': _observer(config, p, lag),
         'torque': _torque(config),
@@ -167,21 +160,6 @@ def _parts_of_learning(
         'contact': _contact(config),
         'weighing': _weighing(config, learned, row, sliding),
     }
-
-
-def _truth(config: ControllerConfig, p: int) -> truth.Settings:
-    """Return the known data of an arm with p parameters: zeros without any."""
-    known = known_arm(config)
-    disturbance = np.zeros((4, len(config.joints)))
-    if known:
-        disturbance[:] = known.constant, known.amplitude, known.frequency, known.phase
-    parameters = known.parameters if known else ()
-    return truth.Settings(
-        known=int(bool(parameters)),
-        feed_forward=0,
-        parameters=np.array(parameters or (0.0,) * p),
-        disturbance=disturbance,
-    )
 
 
 def _barrier(config: ControllerConfig) -> barrier.Settings:
@@ -294,11 +272,9 @@ def _row(config: ControllerConfig) -> prediction.Settings:
     return filled(
         prediction.Settings,
         config.learning,
-        prediction=prediction.FILTERED,
         filter_pole=_ROW_POLE if is_urdf else _SLOW_ROW_POLE,
         motion_scale=_SLOW if is_urdf else 0.0,
         lag=config.robot.lag if is_urdf else 0.0,
-        omega=_OMEGA,
         row_weight=_least_floor(config) / np.array(config.learning.residual_floor),
     )
 
@@ -330,18 +306,21 @@ def _excitation(config: ControllerConfig) -> excitation.Settings:
     """Return which windows are learned from.
 
     The first must be full (27), unless its rows are compared with a prior from the start.
+    Rows that are not exact contradict each other on any arm, which is not taken for a change.
     With feedback through the inertia matrix it must be, too: there drives lighter than
     guessed are measured first.
     """
     least = _least_floor(config)
     is_urdf = config.model == 'urdf'
     settling_time = _SETTLING if is_urdf else _SLOW_SETTLING
+    is_soft = is_urdf and config.feedback.inertia == 'none'
+    has_prior = is_soft and config.has_exact_rows
     return excitation.Settings(
         excitation_threshold=law_gains(config).excitation_threshold,
         learning_start=config.learning.window + settling_time,
-        change_detection=1,
+        change_detection=int(config.has_exact_rows),
         anchor_weight=_ANCHOR * least**2 if is_urdf else _PLANAR_ANCHOR,
-        starts_full=int(not is_urdf or config.feedback.inertia != 'none'),
+        starts_full=int(not has_prior),
         residual_floor=len(config.joints) * least * least,
     )
 
@@ -356,9 +335,7 @@ def _adaptation(
     gains = law_gains(config)
     of_columns = _COLUMNS if config.learning.enabled else 0.0
     return adaptation.Settings(
-        update=adaptation.NEWTON,
         weight=gains.learning_weight,
-        leakage=0.0,
         radius=gains.radius,
         adaptation_gain=np.array(gains.adaptation + (of_columns,) * len(learned)),
         variance=np.diag(covariance).copy(),
@@ -406,14 +383,12 @@ def friction_settings(settings: Settings) -> friction.Settings:
     def of_coulomb(values: np.ndarray) -> np.ndarray:
         return values[own] if of.coulomb else np.zeros(n)
 
-    is_filtered = settings.row.prediction == prediction.FILTERED
     return friction.Settings(
         viscous=of.viscous,
         coulomb=of.coulomb,
         first_viscous=viscous,
         first_coulomb=coulomb,
-        learns=int(of.coulomb and is_filtered),
-        bumpless=settings.disturbance.bumpless,
+        learns=of.coulomb,
         coulomb_velocity=of.coulomb_velocity,
         lag=settings.row.lag,
         pole=settings.row.filter_pole,

@@ -2,12 +2,12 @@
 """Composite learning: the update law (20) with the latched prediction error (26).
 
     eps = b_e - Phi_e theta^                                theta^ = [P^; d^], the current estimate
-    theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )        W = I, or (Phi_e + rho R)^-1 (newton)
+    theta^' = Proj( -Gamma (H^T xi2 - kappa W eps) )                    W = (Phi_e + rho R)^-1
 
 As printed, (20) has + kappa eps, which drives P^ to the projection ball as soon as
-learning starts.  H^T xi2 and the leakage W_c P^ of the comparison law (35) act on P^
-alone.  With the Newton W every excited direction converges at the rate Gamma kappa;
-with the gradient update the rates vary with the eigenvalues of Phi_e.
+learning starts.  H^T xi2 acts on P^ alone.  With the Newton W every excited direction
+converges at the rate Gamma kappa; with the paper's W = I the rates vary with the
+eigenvalues of Phi_e.
 
 The update stays in a ball, in the metric of the adaptation gain.  As printed, (4) acts
 where |P^| equals the radius, which a sampled update never hits: it steps over and never
@@ -26,9 +26,6 @@ from blf_dsc_controller.law import excitation
 from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.numerics.algebra import cholesky_solve
 
-NEWTON, GRADIENT = range(2)
-"""Choices of `gains.update`, in the order of the configuration."""
-
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _ROUNDED = 1.0 + 1e-14
 # of Newton's method; 12 for Gamma spanning eight decades, ten radii outside
@@ -38,9 +35,7 @@ _MOST_STEPS = 20
 class Settings(NamedTuple):
     """The parameters `learning.*` of the update, and the prior and range of theta."""
 
-    update: int  # NEWTON or GRADIENT
     weight: float  # kappa, of the prediction error
-    leakage: float  # W_c of P^ in (35)
     radius: float  # omega_a of (4)
     adaptation_gain: Annotated[Array, 'm']  # diagonal of Gamma
     variance: Annotated[Array, 'm']  # diagonal of R^-1, of the prior
@@ -51,7 +46,7 @@ class Settings(NamedTuple):
 class Work(NamedTuple):
     """Values of one sample."""
 
-    rate: Annotated[Array, 'm']  # W eps, then theta^' [1/s]
+    rate: Annotated[Array, 'm']  # eps or W eps, then theta^' [1/s]
     tracked: Annotated[Array, 'm']  # theta^ after the tracking error alone
 
 
@@ -107,10 +102,8 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
 
 
 @inner
-def fill_prediction_error(
-    settings: Settings, work: Work, latch: excitation.State, estimate: Array
-) -> None:
-    """Write W eps (m,) to `work.rate`; zero while no window is latched."""
+def fill_prediction_error(work: Work, latch: excitation.State, estimate: Array) -> None:
+    """Write eps (m,) to `work.rate`; zero while no window is latched."""
     m = estimate.size
     for i in range(m):
         work.rate[i] = 0.0
@@ -120,7 +113,13 @@ def fill_prediction_error(
         work.rate[i] = latch.b[i]
         for j in range(m):
             work.rate[i] -= latch.Phi[i, j] * estimate[j]
-    if settings.update == NEWTON:
+
+
+@inner
+def fill_newton_step(work: Work, latch: excitation.State, estimate: Array) -> None:
+    """Write W eps (m,) to `work.rate`; zero while no window is latched."""
+    fill_prediction_error(work, latch, estimate)
+    if latch.latched[0] == 1.0:
         cholesky_solve(latch.factor, work.rate)
 
 
@@ -135,7 +134,7 @@ def adapt(
     tracks: bool,
     dt: float,
 ) -> None:
-    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20), with W eps in `work.rate`.
+    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20), with eps or W eps in `work.rate`.
 
     H is (n, m); the tracking error acts on the p parameters, where it `tracks`.
     """
@@ -146,7 +145,7 @@ def adapt(
         if j < p and tracks:
             for i in range(xi2.size):
                 tracking += H[i, j] * xi2[i]
-            tracking = settings.variance[j] * tracking + settings.leakage * estimate[j]
+            tracking = settings.variance[j] * tracking
         work.tracked[j] = estimate[j] - dt * gain[j] * tracking
         work.rate[j] = gain[j] * (settings.weight * work.rate[j] - tracking)
     parameters = part(estimate, 0, (p,))

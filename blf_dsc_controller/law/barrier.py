@@ -40,7 +40,7 @@ class Settings(NamedTuple):
     bound: Annotated[Array, 'n']  # k_c, rad
     initial_bound: Annotated[Array, 'n']  # k_0, rad; k_c: constant bound
     funnel_rate: float  # a, rate at which the bound narrows, 1/s
-    weight: Annotated[Array, 'n']  # w, N m/rad; of z1 in (35)
+    weight: Annotated[Array, 'n']  # w, N m/rad
     slope_limit: Annotated[Array, 'n']  # S_lim, N m/rad
     # error at which the slope reaches S_lim if the bound is k_c, rad
     knee: Annotated[Array, 'n']

@@ -8,9 +8,6 @@
     tau = -dV/dxi1 - d2 |xi1| sat(xi2 / b) - K_p xi2 + tau_m + d^3                     (28)
     theta^' = Proj(-Gamma (H^T xi2 - kappa W eps)),    d^3' = -gamma (xi2 + eta d^3)   (20), (30)
 
-The model-based controller (16) is the same law with P^ = P and the disturbance known:
-its gains of adaptation are zero, and the known disturbance is fed forward.
-
 Where it departs from the paper, and why:
 
 - tau_m, the torque of the model, is in `compensation`: what is learned acts along the reference.
@@ -39,7 +36,7 @@ from blf_dsc_controller.law.surface import known_rate, virtual_control
 
 
 class BlfDsc(NamedTuple):
-    """The law (28), and with everything known (16)."""
+    """The law (28)."""
 
     layer: float = 0.01  # b, rad/s: xi2 at which the robust term saturates
 
@@ -69,13 +66,9 @@ class BlfDsc(NamedTuple):
         dt: float,
         saturated: bool,
     ) -> None:
-        """Adapt theta^ and d^3; advance alpha2 of the filter (13), exactly for the held beta2."""
+        """Adapt theta^ and d^3; advance alpha2."""
         learning.adapt(settings, state, signals, dt, saturated)
-        work = signals.surface
-        gain = filter_gain(settings.surface.time_constant, dt)
-        for i in range(settings.n):
-            state.alpha2[i] += gain * (work.beta2[i] - state.alpha2[i])
-            state.alpha2[i] += dt * work.rate[i]
+        advance_surface(settings, state, signals, dt)
 
 
 @inner
@@ -105,6 +98,18 @@ def compute_surface(
         signals.feedback.restoring[i] = -barrier.joint_gradient(
             settings.barrier, signals.barrier, xi1, bound, i
         )
+
+
+@inner
+def advance_surface(
+    settings: Settings, state: State, signals: Signals, dt: float
+) -> None:
+    """Advance alpha2 of the filter (13) by `dt` [s], exactly for the held beta2."""
+    work = signals.surface
+    gain = filter_gain(settings.surface.time_constant, dt)
+    for i in range(settings.n):
+        state.alpha2[i] += gain * (work.beta2[i] - state.alpha2[i])
+        state.alpha2[i] += dt * work.rate[i]
 
 
 def shift_surface(state: State, change: Array) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Torque of the model in a law: P^(0) at the state, what is learned along the reference.
 
-The paper's compensation is H(q, dq, alpha2, alpha2') P^ (`compensation: state`).
+The paper's compensation is H(q, dq, alpha2, alpha2') P^.
 alpha2' contains the feedback, which is thus multiplied by the learned inertia: an
 estimate of 2.3 times the inertia makes a loop at 1 kHz unstable.  So what is learned
 acts along the reference only, and the feedback keeps the model from before the start,
@@ -28,36 +28,45 @@ from __future__ import annotations
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import apparent_inertia, feedback, friction
-from blf_dsc_controller.law.prediction import FILTERED
-from blf_dsc_controller.law.state import REFERENCE, Settings, Signals, State
+from blf_dsc_controller.law.state import Settings, Signals, State
 
 
 @inner
-def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute H P^(0) of the feedback, H of what is learned; if the row needs them, Yp and Yr."""
-    model, of = settings.model, settings.feedback
+def fill_model(settings: Settings, state: State, signals: Signals) -> None:
+    """Compute H, Yp and Yr at the state, and H P^(0) with the feedback as `model_torque` [N m]."""
+    of, row = settings.feedback, signals.row
     H, a_f = signals.H, signals.feedback.acceleration
-    q, dq, dqr, ddqr = signals.q, signals.dq, signals.dqr, signals.ddqr
     v, a = state.alpha2, signals.dalpha2
     if of.decoupled == 1:
-        v, a = dqr, ddqr
+        v, a = signals.dqr, signals.ddqr
     feedback.fill_acceleration(
         of, signals.feedback, a, signals.xi2, settings.joint_inertia
     )
-    if settings.row.prediction == FILTERED:
-        model.regressors(q, dq, v, a_f, H, signals.row.Yp, signals.row.Yr)
-    else:
-        model.regressor(q, dq, v, a_f, H)
+    settings.model.regressors(signals.q, signals.dq, v, a_f, H, row.Yp, row.Yr)
     for i in range(settings.n):
         signals.model_torque[i] = 0.0
         for j in range(settings.p):
             signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
-    if settings.compensation == REFERENCE:
-        model.regressor(signals.qr, dqr, dqr, ddqr, H)
-    elif of.decoupled == 1:
-        model.regressor(q, dq, dqr, ddqr, H)
-    elif of.damping_rate > 0.0 or of.follows_inertia == 1:
-        model.regressor(q, dq, state.alpha2, signals.dalpha2, H)
+
+
+@inner
+def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
+    """Compute H P^(0) of the feedback, H of what is learned, and Yp and Yr of the row."""
+    fill_model(settings, state, signals)
+    dqr, ddqr = signals.dqr, signals.ddqr
+    settings.model.regressor(signals.qr, dqr, dqr, ddqr, signals.H)
+
+
+@inner
+def compute_regressors_at_state(
+    settings: Settings, state: State, signals: Signals
+) -> None:
+    """Compute the same with H of what is learned at the state, as in the paper."""
+    fill_model(settings, state, signals)
+    of = settings.feedback
+    if of.damping_rate > 0.0 or of.follows_inertia == 1:
+        q, dq = signals.q, signals.dq
+        settings.model.regressor(q, dq, state.alpha2, signals.dalpha2, signals.H)
 
 
 @inner
@@ -135,8 +144,6 @@ def compensated(
     """Return the demand of joint i [N m]: feedback, model, d^3, r, and what is learned."""
     torque = feedback + signals.model_torque[i]
     torque += state.disturbance[i] + signals.friction.torque[i]
-    if settings.truth.feed_forward == 1:
-        torque += signals.truth.disturbance[i]
     if settings.observer.enabled == 1:
         torque += state.observer.torque[i]
     for j in range(settings.m):

@@ -89,7 +89,6 @@ class Controller:
             self.reference_vector,
             0.0,
             0.0,
-            True,
         )
         self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
         self._compare = direct(compare, *self._compared, 0.0)
@@ -135,7 +134,7 @@ class Controller:
         """
         self._take(measurement)
         self.flags = self._update(
-            self.given_law, *self._vectors, self.reference_vector, t, dt, True
+            self.given_law, *self._vectors, self.reference_vector, t, dt
         )
         return self.sample.torque
 

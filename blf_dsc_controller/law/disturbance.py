@@ -5,7 +5,7 @@
 
 (30) lacks the last term.  While the estimate is wrong, d^3 compensates for it; the
 prediction error then corrects the estimate within milliseconds, but d^3 follows only
-within seconds, and their sum is wrong in between.  With the term (`bumpless`) learning
+within seconds, and their sum is wrong in between.  With the term learning
 does not change the torque H P^ + d^3, and d^3 is left to estimate the disturbance
 alone.
 """
@@ -17,11 +17,10 @@ from blf_dsc_controller.compiled.layout import Array
 
 
 class Settings(NamedTuple):
-    """The parameters `disturbance.*`, and whether it gives up what is learned."""
+    """The parameters `disturbance.*`."""
 
     gain: Annotated[Array, 'n']  # gamma, N m/rad
     leakage: float  # eta, rad/(N m s)
-    bumpless: int  # 1: it gives up what a changed estimate adds to the torque
 
 
 class Work(NamedTuple):

@@ -43,7 +43,7 @@ class State(NamedTuple):
 class Work(NamedTuple):
     """Values of one sample."""
 
-    restoring: Annotated[Array, 'n']  # tau_c, by the error: -dV/dxi1 or -w z1, N m
+    restoring: Annotated[Array, 'n']  # tau_c, by the error: -dV/dxi1, N m
     acceleration: Annotated[Array, 'n']  # a_f, rad/s^2
 
 

@@ -53,7 +53,6 @@ class Settings(NamedTuple):
     first_coulomb: int
     # 1: there are columns of Coulomb friction, and rows that show its steps
     learns: int
-    bumpless: int  # 1: d^3 gives up what a changed estimate adds to the torque
     coulomb_velocity: float  # v_c, rad/s
     lag: float  # of measured velocities and applied torques together, s
     pole: float  # p of the row filters, rad/s
@@ -111,7 +110,7 @@ def coulomb_torque(
     """Return the compensation C(v) s(v) of joint i [N m], with c^ `learned` [N m]."""
     low = learned
     high = learned
-    if settings.learns == 1 and settings.bumpless == 1:
+    if settings.learns == 1:
         band = settings.reversals.unmodelled[i]
         shown = state.reversals.shown.coulomb
         for evidence in (
@@ -171,8 +170,7 @@ def transfer_learned(
     for i in range(disturbance.size):
         learned = estimate[settings.first_coulomb + i]
         torque = coulomb_torque(settings, state, work, learned, i)
-        if settings.bumpless == 1:
-            disturbance[i] -= torque - work.torque[i]
+        disturbance[i] -= torque - work.torque[i]
         work.torque[i] = torque
 
 

@@ -15,15 +15,11 @@ from typing import Any
 from numba.core import config
 
 from blf_dsc_controller.compiled.jit import SLOW, kernel
-from blf_dsc_controller.law.backstepping import Backstepping
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.called_law import CalledLaw, called, is_callable
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.mistakes import tell_mistakes
 from blf_dsc_controller.law.state import Settings, Signals, State
-
-PACKAGED = (BlfDsc, Backstepping)
-"""Types of the package's laws."""
 
 
 def for_kernels(

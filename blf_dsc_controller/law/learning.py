@@ -41,7 +41,6 @@ from blf_dsc_controller.law import (
 )
 from blf_dsc_controller.law.compensation import compute_regressors, fill_friction
 from blf_dsc_controller.law.innovation import Prior
-from blf_dsc_controller.law.prediction import FILTERED
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.law.window import Window
 
@@ -123,11 +122,8 @@ def fill_columns(
 
 @inner
 def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Form the configured row of the last interval."""
+    """Form the row of the last interval."""
     of, now, work = settings.row, state.row, signals.row
-    if of.prediction != FILTERED:
-        form_lambda_row(settings, state, signals, dt)
-        return
     if state.samples[0] > 0.0:
         begins = state.samples[0] <= 1.0
         prediction.delay_torque(of, now, signals.applied, begins, dt)
@@ -138,22 +134,6 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
             filter_external_torque(settings, state, signals, dt)
         prediction.pass_poles(of, now, work, signals.dqr, dt)
     prediction.keep_regressors(now, work)
-
-
-@inner
-def form_lambda_row(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Form the row `lambda` of (24)."""
-    work, q, dq = signals.row, signals.q, signals.dq
-    alpha2, dalpha2 = state.alpha2, signals.dalpha2
-    begins = state.samples[0] == 0.0
-    prediction.differentiate(
-        settings.row, state.row, work, signals.xi2, dalpha2, begins, dt
-    )
-    scale = prediction.lambda_of(work.acceleration, dq, dalpha2, alpha2)
-    settings.model.regressor(q, dq, alpha2, dalpha2, work.Yp)
-    prediction.fill_lambda_row(work, scale, signals.applied)
 
 
 @inner
@@ -263,7 +243,7 @@ def detect_change(
 
 @inner
 def take_back(settings: Settings, state: State, signals: Signals) -> None:
-    """Return to the estimate before the window; the torque stays the same, if configured.
+    """Return to the estimate before the window; the torque stays the same.
 
     What is not learned from the window stays: Coulomb friction is of reversals, and the other
     friction of the sensors, if there are any.
@@ -275,8 +255,7 @@ def take_back(settings: Settings, state: State, signals: Signals) -> None:
         is_sensed = senses and settings.p <= j < settings.motors.size
         if not (is_sensed or friction.is_coulomb(settings.friction, j)):
             state.estimate[j] = state.latch.anchor[j]
-    if settings.disturbance.bumpless == 1:
-        transfer_learned(settings, state, signals, before)
+    transfer_learned(settings, state, signals, before)
 
 
 @inner
@@ -308,7 +287,7 @@ def adapt(
         return
     of, work = settings.adaptation, signals.scratch.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
-    adaptation.fill_prediction_error(of, work, latch, estimate)
+    adaptation.fill_newton_step(work, latch, estimate)
     if latch.latched[0] == 1.0:
         friction.follow_reversals(
             settings.friction,
@@ -336,8 +315,7 @@ def adapt(
     if not saturated:
         follow_disturbance(settings, state, signals, dt)
     if latch.latched[0] == 1.0:
-        if settings.disturbance.bumpless == 1:
-            transfer_learned(settings, state, signals, work.tracked)
+        transfer_learned(settings, state, signals, work.tracked)
         if settings.observer.enabled == 1:
             joint_sensors.follow_absorbed(settings, state, signals, dt)
         friction.adapt_breakaway(

@@ -21,8 +21,8 @@ from blf_dsc_controller.compiled.jit import direct, inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import barrier
+from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.laws import PACKAGED
 from blf_dsc_controller.law.state import Settings, Signals, settings_of, signals_of
 from blf_dsc_controller.law.surface import virtual_slope
 
@@ -31,8 +31,6 @@ from blf_dsc_controller.law.surface import virtual_slope
 def stiffness_of(settings: Settings, signals: Signals, i: int, damping: float) -> float:
     """Return the stiffness [N m/rad] of joint i, whose damping is known."""
     wall, surface = settings.barrier, settings.surface
-    if settings.has_barrier == 0:
-        return float(wall.weight[i] + damping * surface.gain[i])
     xi, bound = signals.xi1[i], signals.bound[i]
     stiffness = wall.slope_limit[i]
     if abs(xi) < signals.barrier.knee[i]:
@@ -65,7 +63,7 @@ class LocalGains:
             BlfDscError: it is a law of a file, whose feedback is not known, or its damping
                 lags, which no stiffness and damping can do.
         """
-        if not isinstance(controller.law, PACKAGED):
+        if not isinstance(controller.law, BlfDsc):
             raise BlfDscError(
                 f'the feedback of {type(controller.law).__name__}, a law of a file, is not '
                 'known: let the host close it'

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows [X | u] of the prediction error: X theta = u holds for the true theta = [P; d].
 
-`filtered`.  d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held
+d/dt(Yp P) + Yr P + D d = tau, integrated over a sample of held
 torque, gives
 
     X_k = (Yp_k - Yp_{k-1}) / T + (Yr_k + Yr_{k-1}) / 2,      X_k P + D_k d = tau on [k-1, k]
 
 up to O(T^2).  Both sides pass through the same two cascaded poles, which preserves the
 identity and filters the noise of the difference quotient.  No acceleration is needed.
-
-`lambda`, of the law `paper`.  (24): X = H(q, dq, alpha2, alpha2'), u = Lambda tau with the scalar
-Lambda = x^T y / x^T x,  x = [xi2'^ + alpha2'; xi2 + alpha2; 1],  y = [alpha2'; alpha2; 1], and
-xi2'^ from the filter (8).  Since tau = [M C G] x and H P = [M C G] y, this is exact only where y is
-parallel to x: its error is of first order in xi2 and xi2', and depends on the units.
 
 Besides P, the learning estimates the coefficients d of the disturbance `columns` D.
 `learning.form_row` calls these functions in order.
@@ -25,10 +20,6 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.sums import clear
-from blf_dsc_controller.numerics.elementary import exp
-
-FILTERED, LAMBDA = range(2)
-"""Choices of `gains.prediction` of the law `paper`, in the order of the configuration."""
 
 SETTLED = 6.0
 """Time constants of the poles after which a row shows nothing of what was before."""
@@ -37,11 +28,9 @@ SETTLED = 6.0
 class Settings(NamedTuple):
     """The parameters `learning.*` of a row, and what follows from others."""
 
-    prediction: int  # FILTERED or LAMBDA
     filter_pole: float  # of both poles, rad/s
     motion_scale: float  # reference velocity below which rows count less, rad/s; 0: off
     lag: float  # of measured velocities and applied torques together, s
-    omega: float  # of the differentiating filter (8), rad/s
     # of a joint's rows: smaller where more torque is unmodelled
     row_weight: Annotated[Array, 'n']
 
@@ -54,16 +43,13 @@ class State(NamedTuple):
     late: Annotated[Array, 2, 'n']  # applied torque behind half of `lag`, and all, N m
     filter1: Annotated[Array, 'n', 'm + 1']  # first pole
     filter2: Annotated[Array, 'n', 'm + 1']  # second pole
-    observed: Annotated[Array, 'n']  # xi2 filtered by (8), rad/s
-    observed_rate: Annotated[Array, 'n']  # its derivative, rad/s^2
 
 
 class Work(NamedTuple):
     """Values of one sample."""
 
-    Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq; of `lambda` H(q, dq, alpha2, alpha2')
+    Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq
     Yr: Annotated[Array, 'n', 'm']  # [Yr | D], Yr P = G - C^T dq
-    acceleration: Annotated[Array, 'n']  # ddq^ of `lambda`, rad/s^2
     Xu: Annotated[Array, 'n', 'm + 1']  # [X | u], the row
 
 
@@ -162,54 +148,3 @@ def keep_regressors(state: State, work: Work) -> None:
             state.Yr[i, j] = Yr[i, j]
             if j < Yp.shape[1]:
                 state.Yp[i, j] = Yp[i, j]
-
-
-@inner
-def differentiate(
-    settings: Settings,
-    state: State,
-    work: Work,
-    xi2: Array,
-    dalpha2: Array,
-    begins: bool,
-    dt: float,
-) -> None:
-    """Step the filter (8) with damping 1, exactly for held xi2 (n,).
-
-    ddq^ is the sum of alpha2' and the derivative of xi2.
-    """
-    decay = exp(-settings.omega * dt)
-    for i in range(xi2.size):
-        if begins:
-            state.observed[i] = xi2[i]
-            state.observed_rate[i] = 0.0
-        else:
-            offset = state.observed[i] - xi2[i]
-            slope = state.observed_rate[i] + settings.omega * offset
-            state.observed[i] = xi2[i] + (offset + slope * dt) * decay
-            state.observed_rate[i] = (
-                state.observed_rate[i] - settings.omega * slope * dt
-            ) * decay
-        work.acceleration[i] = dalpha2[i] + state.observed_rate[i]
-
-
-@inner
-def lambda_of(ddq: Array, dq: Array, dalpha2: Array, alpha2: Array) -> float:
-    """Return Lambda of (24), which is dimensionless only if units are ignored."""
-    products = 1.0
-    squares = 1.0
-    for i in range(dq.size):
-        products += ddq[i] * dalpha2[i] + dq[i] * alpha2[i]
-        squares += ddq[i] ** 2 + dq[i] ** 2
-    return products / squares
-
-
-@inner
-def fill_lambda_row(work: Work, scale: float, applied: Array) -> None:
-    """Compute the row `lambda`, with its `scale` Lambda, of the torque `applied` (n,) [N m]."""
-    H, Yr, row = work.Yp, work.Yr, work.Xu
-    n, m = Yr.shape
-    for i in range(n):
-        for j in range(m):
-            row[i, j] = H[i, j] if j < H.shape[1] else scale * Yr[i, j]
-        row[i, m] = scale * applied[i]

@@ -34,13 +34,9 @@ from blf_dsc_controller.law import (
     surface,
     torque,
     torque_sensors,
-    truth,
     weighing,
     window,
 )
-
-REFERENCE, STATE = range(2)
-"""Choices of `gains.compensation` of the law `paper`, in the order of the configuration."""
 
 
 class Settings(NamedTuple):
@@ -55,7 +51,6 @@ class Settings(NamedTuple):
     m: int
     memory: int  # numbers in the memory of a law of a file
     has_barrier: int  # 1: the law keeps the error inside its bound
-    compensation: int  # of what is learned: REFERENCE or STATE
     initial_estimate: Annotated[Array, 'm']  # P^(0), then that of the columns
     # R, inverse covariance of the prior of theta
     information: Annotated[Array, 'm', 'm']
@@ -63,8 +58,6 @@ class Settings(NamedTuple):
     row_information: Annotated[Array, 'm', 'm']
     # m, least inertia of a joint with the others free, kg m^2
     joint_inertia: Annotated[Array, 'n']
-    robust_gain: Annotated[Array, 'n']  # mu_bar of (35), N m
-    truth: truth.Settings
     barrier: barrier.Settings
     surface: surface.Settings
     feedback: feedback.Settings
@@ -153,7 +146,6 @@ class Signals(NamedTuple):
     demand: Annotated[Array, 'n']  # whole torque (28) before saturation, N m
     torque: Annotated[Array, 'n']  # commanded torque, N m
     H: Annotated[Array, 'n', 'm']  # of what is learned: [H | compensated columns]
-    truth: truth.Work
     barrier: barrier.Work
     surface: surface.Work
     feedback: feedback.Work
@@ -179,8 +171,6 @@ class Sample(NamedTuple):
     cuts: Annotated[Array, 'n']
     # theta^; NaN for a disturbance column that has been rejected
     estimate: Annotated[Array, 'm']
-    # terms of (29): error, kinetic, parameters, disturbance; or NaN
-    lyapunov: Annotated[Array, 4]
     lambda_min: Cell  # of the current window's Phi
     latched: Cell  # 0 or 1
     changes: Cell  # number of times that the arm was found to have changed

@@ -17,7 +17,6 @@ from blf_dsc_controller.law import (
     repeats,
     torque,
     torque_sensors,
-    truth,
 )
 from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.called_law import CalledLaw
@@ -36,7 +35,6 @@ from blf_dsc_controller.law.checks import (
     watch_oscillation,
 )
 from blf_dsc_controller.law.interface import Law
-from blf_dsc_controller.law.lyapunov import fill_energies
 from blf_dsc_controller.law.sensor import compare_velocities
 from blf_dsc_controller.law.state import (
     Sample,
@@ -59,7 +57,7 @@ compile_methods(Law, ('compute_demand', 'finish'), BlfDsc, CalledLaw)
 def fill_sample(
     settings: Settings, state: State, signals: Signals, sample: Sample
 ) -> None:
-    """Fill the telemetry sample, except for the terms of (29)."""
+    """Fill the telemetry sample."""
     for i in range(settings.n):
         sample.qr[i] = signals.qr[i]
         sample.dqr[i] = signals.dqr[i]
@@ -131,7 +129,6 @@ def prepare(
         state.saturation, signals.saturation, state.torque, signals.applied
     )
     reference.evaluate(reference_vector, t, signals.qr, signals.dqr, signals.ddqr)
-    truth.update_disturbance(settings.truth, signals.truth, t)
     barrier.update_bound(settings.barrier, signals.barrier, t, signals.bound)
     for i in range(settings.n):
         signals.xi1[i] = signals.q[i] - signals.qr[i]
@@ -203,7 +200,7 @@ def step(
 
     The measurement is [q (n,) rad, dq (n,) rad/s, effort of the last interval (n,) N
     m], t [s] the time since the start, dt [s] since the last sample (at the first:
-    until the next).  The terms of (29) are separate: `lyapunov.fill_energies`.
+    until the next).
     """
     flags = check_measurement(checks, measurement, dt)
     if flags != 0:
@@ -234,15 +231,14 @@ def update(
     reference_vector: Array,
     t: float,
     dt: float,
-    observed: bool,
 ) -> int:
-    """Run `step` on packed vectors; return its flags.  With `observed`, find the terms of (29)."""
+    """Run `step` on packed vectors; return its flags."""
     settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     sample = sample_of(sample_vector, settings)
     checks = checks_of(checks_vector, settings)
-    flags = step(
+    return step(
         law,
         settings,
         checks,
@@ -254,9 +250,6 @@ def update(
         measurement,
         sample,
     )
-    if observed and flags & INVALID == 0:
-        fill_energies(settings, state, signals, sample)
-    return flags
 
 
 @kernel

@@ -21,7 +21,7 @@ from blf_dsc_controller.numerics.elementary import cos, sin
 class Settings(NamedTuple):
     """The parameters `surface.*`, and what follows from others."""
 
-    gain: Annotated[Array, 'n']  # K, 1/s; lambda_s of (35)
+    gain: Annotated[Array, 'n']  # K, 1/s
     mu: Annotated[Array, 'n']  # 1/s
     time_constant: float  # lambda of (13), s
     known_rate: int  # 1: the surface filter follows the known rate of beta2

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.known_arm import known_arm
 from blf_dsc_controller.messages import topics
 
 
@@ -32,9 +31,6 @@ def monitored(
         names['load'] = topics.LOAD
     if config.contact.enabled:
         names['contact'] = topics.CONTACT
-    known = known_arm(config)
-    if known and known.parameters:
-        names['lyapunov'] = topics.LYAPUNOV_TERMS
     return names
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_traits import traits_of
+from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.factory.estimate import estimate_names, learned_arm
 from blf_dsc_controller.law.controller import Controller
@@ -58,4 +59,6 @@ def run_of(
         learns=traits_of(config).learns and config.learning.enabled,
         effort=effort,
         sliding=config.robot.sliding(config.joints),
+        xi2=samples.xi2,
+        parameters=flatten(config),
     )

@@ -85,9 +85,8 @@ _FEEDBACK = (
     Gain('disturbance.gain', 100.0, 3e4, inertial=True),
 )
 _SLOTINE_LI = (
-    Gain('gains.feedback_gain', 10.0, 200.0, inertial=True),
+    *_FEEDBACK[1:],
     Gain('gains.surface_gain', 5.0, 300.0),
-    Gain('gains.integral_gain', 100.0, 3e4, inertial=True),
     Gain('gains.adaptation_gain', 0.01, 30.0),
 )
 _PID = (
@@ -134,14 +133,13 @@ def law_changes(
     changes: dict[str, object] = {'law': studied.law}
     if studied.law != 'blf_dsc':  # which alone has a load observer
         changes['disturbance.observer_bandwidth'] = 0.0
-    if studied.gains is _FEEDBACK:  # those of joints
+    if studied.gains in (_FEEDBACK, _SLOTINE_LI):  # those of joints
         changes['feedback.inertia'] = 'none'
     config = change(config, changes)  # a law of a file has gains of its own
     if studied.law == 'slotine_li':  # the slope of the proposed law's surface at zero
         gains = law_gains(config)
         slope = np.array(gains.surface) / 2.0 + gains.mu
-        changes['gains.surface_gain'] = slope.tolist()
-        changes['gains.integral_gain'] = list(config.disturbance.gain)
+        changes['gains.surface_gain'] = float(slope.mean())
     elif studied.law == COMPUTED_TORQUE:  # of equal bandwidth
         position, velocity, integral = linear_gains(config).mean(axis=1).tolist()
         changes['gains.position'] = position
@@ -152,6 +150,8 @@ def law_changes(
     tuned = studied.gains
     each = (values[gain.name] for gain in tuned)
     inertia = inertia_of_joints(config) if tuned else 1.0
+    if tuned is _SLOTINE_LI:  # which has none, but the two are given together
+        changes['feedback.joint_stiffness'] = np.asarray(inertia).tolist()
     return changes | parameters_at(config, tuned, each, inertia)
 
 

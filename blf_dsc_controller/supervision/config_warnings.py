@@ -14,13 +14,12 @@ import numpy as np
 
 from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.law_traits import LAWS, OWN
+from blf_dsc_controller.configuration.law_traits import OWN, PAPER
 from blf_dsc_controller.configuration.plausibility import LONGEST_LAG
 from blf_dsc_controller.configuration.robot import (
     implausible_friction,
 )
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.supervision.body_warnings import body_warnings
 from blf_dsc_controller.supervision.bound_warnings import (
@@ -89,7 +88,7 @@ def config_warnings(
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
     errors = None
-    if config.model == 'urdf' and config.law in OWN:
+    if config.model == 'urdf' and config.law in (OWN, PAPER):
         errors = expected_errors(config, settings)
     found = [*_of_units(config), *width_warnings(config, errors), *_of_stop(config)]
     if config.model == 'urdf':
@@ -98,7 +97,7 @@ def config_warnings(
     if errors is not None:
         found += gear_warnings(config, settings)
         found += error_warnings(config, settings.barrier.bound, errors)
-    if config.model != 'urdf' and config.law in OWN:
+    if config.model != 'urdf' and config.law in (OWN, PAPER):
         found += _of_first_error(config, settings, load)
     if (
         settings.has_barrier == 1
@@ -145,7 +144,7 @@ def _of_torque_sensors(config: ControllerConfig) -> Iterator[str]:
         yield (
             f'disturbance.observer_bandwidth: {pole:g} rad/s is not used: the load observer needs '
             'joint torque sensors (robot.torque_loop true and robot.effort whole) and '
-            f'{LAWS[0]} as law'
+            f'{OWN} as law'
         )
 
 
@@ -223,7 +222,7 @@ def _of_learning(
     learning = config.learning
     rate = float(settings.adaptation.adaptation_gain.max())
     what = 'kappa Gamma T'
-    if settings.adaptation.update != NEWTON:
+    if config.law == PAPER:
         scale = np.sqrt(settings.adaptation.adaptation_gain[: settings.p])
         rate = float(np.linalg.eigvalsh(load.excitation * np.outer(scale, scale))[-1])
         what = 'kappa lambda_max(Gamma Phi) T'

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.law_traits import OWN
+from blf_dsc_controller.configuration.law_traits import OWN, PAPER
 
 
 def not_commissioned(config: ControllerConfig, *, in_motors: bool = False) -> str:
@@ -15,7 +15,7 @@ def not_commissioned(config: ControllerConfig, *, in_motors: bool = False) -> st
     (`gear_warnings`).  A commissioning measures no feedback that is `in_motors`.
     """
     feedback = config.feedback
-    if config.model != 'urdf' or config.law not in OWN:
+    if config.model != 'urdf' or config.law not in (OWN, PAPER):
         return ''
     if config.commissioning.friction:
         if feedback.stiffness <= 1.0:

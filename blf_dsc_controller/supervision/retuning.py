@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.law_traits import PAPER
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import barrier
-from blf_dsc_controller.law.adaptation import NEWTON
 from blf_dsc_controller.law.blf_dsc import shift_surface
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import Settings
@@ -112,7 +112,7 @@ def _diverging_update(
     """Yield how much each step of the learned estimates overshoots, if they diverge."""
     latch, adaptation = controller.state.latch, settings.adaptation
     step, stretch = 'Newton step', 1.0
-    if adaptation.update != NEWTON:
+    if config.law == PAPER:
         step, stretch = 'gradient step', float(np.linalg.norm(latch.Phi, 2))
     share = (
         adaptation.weight
