@@ -157,18 +157,6 @@ def test_unknown_values_are_null_and_never_nan(run, tmp_path):
     }
 
 
-def test_estimates_are_compared_only_with_a_truth_of_the_same_parameters(run):
-    others = ('mass 1', 'mass 2', *PARAMETERS[2:])
-    names = (*others, *run.monitor.names[len(PARAMETERS) :])
-    renamed = {'monitor': replace(run.monitor, names=names)}
-    for changes, expected in (({'truth': None}, PARAMETERS), (renamed, others)):
-        metrics = measure(replace(run, **changes))
-        assert np.isnan(metrics.parameter_error.end)
-        assert metrics.true is None
-        assert list(metrics.estimate) == list(expected)
-        assert 'parameters' not in format_table(metrics)
-
-
 def test_table_shows_the_metrics_and_what_is_unusual(run):
     bound = run.bound.copy()
     late = run.timing.values.copy()

@@ -30,7 +30,6 @@ from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
 from blf_dsc_controller.messages.topics import (
     CHANGES,
-    DIAGNOSTICS,
     JOINT_STATES,
     JOURNAL,
     MONITOR,
@@ -88,29 +87,6 @@ def test_draw_writes_both_figures_and_leaves_no_trace(drawn):
     assert amount(tracking, '#D55E00') > 1000
     for colour in COLOURS[:2]:
         assert amount(parameters, lightened(colour, 0.6)) > 500
-
-
-def test_missing_series_and_a_single_sample_are_drawn(run, drawn, tmp_path):
-    height = pixels(drawn[0] / 'tracking.png').shape[0]
-    unknown_torque = np.full_like(run.torque, np.nan)
-    partial = replace(run, error=None, truth=None, torque=unknown_torque)
-    assert len(draw(partial, tmp_path)) == 2
-    assert pixels(tmp_path / 'tracking.png').shape[0] < height / 2
-    minimal = replace(partial, reference=None, bound=None, monitor=None)
-    assert draw(minimal, tmp_path / 'alone') == [tmp_path / 'alone' / 'tracking.png']
-    assert not (tmp_path / 'alone' / 'parameters.png').exists()
-    arrays = (
-        'stamp',
-        'received',
-        'position',
-        'velocity',
-        'torque',
-        'reference',
-        'error',
-        'bound',
-    )
-    one = {name: getattr(run, name)[:1] for name in (*arrays, 'torque_limit')}
-    assert draw(replace(run, **one), tmp_path)
 
 
 @pytest.fixture(scope='module')
@@ -176,39 +152,6 @@ def test_events_list_violation_latch_saturation_and_plant_change(folder):
         ('saturation', 3.996): 'elbow at its torque limit for 4 samples',
         ('plant', 2.5): 'load.torque: [1.0, 0.0]',
     }
-
-
-def diagnosed(at, level, message):
-    """Return a message of diagnostics `at` [ns]."""
-    types = typestore().types
-    status = types['diagnostic_msgs/msg/DiagnosticStatus'](
-        level=level, name='state', message=message, hardware_id='', values=[]
-    )
-    stamp = types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
-    header = types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
-    array = types[DIAGNOSTICS.type](header=header, status=[status])
-    raw = typestore().serialize_cdr(array, DIAGNOSTICS.type)
-    return DIAGNOSTICS, at, bytes(raw)
-
-
-def test_waiting_before_the_first_sample_is_no_event_but_an_error_is(tmp_path):
-    before, after = START - 1_000_000, START + 500_000_000
-    messages = [
-        diagnosed(before, 1, 'waiting for a joint state'),
-        diagnosed(before, 2, 'start rejected'),
-        *Synthetic(1000).messages(),
-        diagnosed(after, 1, 'half of the states are late'),
-    ]
-    bag = read_bag(recorded_run.write_made(tmp_path / 'bag', messages))
-    told = [
-        (round(t, 2), kind, text)
-        for t, kind, text in bag.events
-        if kind in ('WARN', 'ERROR')
-    ]
-    assert told == [
-        (0.0, 'ERROR', 'state: start rejected'),
-        (0.5, 'WARN', 'state: half of the states are late'),
-    ]
 
 
 def test_several_bags_are_overlaid_and_their_parameter_differences_listed(

@@ -29,8 +29,7 @@ from rosbags.rosbag2 import (
 from rosbags.typesys import Stores, get_typestore
 
 from blf_dsc_controller import BlfDscError, load_loop, read_run, share_folder
-from blf_dsc_controller.bags.content import NameMap, read_content
-from blf_dsc_controller.bags.reader import applied_torque, single_run
+from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.messages.codecs import (
@@ -161,41 +160,6 @@ def test_shuffled_and_extra_joints_are_read_by_name(
     expected = (ARM.position, ARM.error, ARM.disturbance, ARM.torque)
     for values, known in zip(found, expected, strict=True):
         np.testing.assert_array_equal(values, known)
-
-
-def torque_of(path, messages, names):
-    """Torques as `identify` reads them, and where they are from."""
-    content = read_content(write(path, messages), '', names)
-    states, _, _ = single_run(content, names.joints_of(('joint1', 'joint2')))
-    source, torque = applied_torque(content, states)
-    return source, np.asarray(torque.field(2))
-
-
-def test_torques_are_those_of_the_commands_or_measured_or_unknown(tmp_path):
-    unmapped = names_of(commands=None)
-    source, torque = torque_of(tmp_path / 'bag', foreign('effort'), unmapped)
-    assert source == 'effort of /arm/states'
-    # The effort of a state is the torque that led to it: the last torque is unknown.
-    np.testing.assert_array_equal(torque[:-1], ARM.disturbance[1:])
-    assert np.isnan(torque[-1]).all()
-    pairs = list(foreign('pair'))
-    mixed = pairs[:100] + list(foreign('array'))[100:]
-    for messages, names, words in (
-        (foreign('', ('position', 'velocity')), unmapped, '--map commands='),
-        (foreign('three'), names_of(), '3 values, but there are 2 joints, and 4 in'),
-        (mixed, names_of(), 'not every message holds the same number'),
-    ):
-        with pytest.raises(BlfDscError, match=words):
-            torque_of(tmp_path / words[:3], messages, names)
-    kept = [
-        entry
-        for k, entry in enumerate(pairs)
-        if entry[0] != '/arm/torque' or k % 4 == 1
-    ]
-    source, torque = torque_of(tmp_path / 'slow', kept, names_of())
-    assert source == '/arm/torque'
-    np.testing.assert_array_equal(torque[1], ARM.torque[0])  # previous command held
-    np.testing.assert_array_equal(torque[2], ARM.torque[2])
 
 
 def test_wrong_names_are_reported_with_the_names_in_the_bag(bag, tmp_path):
@@ -425,36 +389,6 @@ def test_files_that_are_missing_or_hold_other_numbers_than_stated(
 
 
 @pytest.mark.parametrize(
-    ('bag', 'told'),
-    [
-        (
-            'lost',
-            'no file in .mcap beside its metadata.yaml: the messages were in that',
-        ),
-        ('full', 'it is empty: nothing was recorded, as on a full disk: give another'),
-        ('full/full_0.mcap', 'it is empty: nothing was recorded, as on a full disk: g'),
-        ('sql', '`sqlite3 sql/sql_0.db3 .recover | sqlite3 recovered.db3`'),
-        ('sql/sql_0.db3', 'or its file in .mcap: only these are recovered'),
-        ('nothing', 'there is no file in .mcap: give the folder that has one, or the'),
-        ('ful', 'there is none, did you mean full?'),
-        ('elsewhere/bag', 'there is none: give the folder of a bag'),
-    ],
-)
-def test_what_holds_nothing_to_recover_says_what_is_missing(bag, told, tmp_path, run):
-    for name, file in (('lost', ''), ('full', 'full_0.mcap'), ('sql', 'sql_0.db3')):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / 'metadata.yaml').write_text('{}')
-        if file:
-            (tmp_path / name / file).touch()
-    (tmp_path / 'nothing').mkdir()
-    code, output, error = run('recover', bag, '--out', 'clean')
-    assert (code, output) == (1, '')
-    assert error.startswith(f'blf_dsc recover: {bag} cannot be read as a bag: ')
-    assert told in error
-    assert not (tmp_path / 'clean').exists()
-
-
-@pytest.mark.parametrize(
     ('original', 'replacement', 'words'),
     [
         ('version: 9', 'version: 99', 'Rosbag2 version 99 not supported'),
@@ -474,20 +408,6 @@ def test_bag_of_another_format_or_without_metadata(
     all_say(copy, words, f'to save the undamaged part: blf_dsc recover {copy}')
     code, output, _ = run('recover', copy, '--out', 'clean')
     assert (code, 'none of the recorded messages was lost' in output) == (0, True)
-
-
-def test_file_of_another_format_is_not_worth_a_recovery(tmp_path, all_say):
-    file = tmp_path / 'notes.mcap'
-    file.write_text('notes')
-    all_say(file, 'it is no MCAP file: give a bag')
-
-
-def test_file_to_which_nothing_was_written_is_called_empty(tmp_path, all_say):
-    file = tmp_path / 'full_disk.mcap'
-    file.touch()
-    all_say(
-        file, 'it is empty: nothing was recorded, as on a full disk: give another bag'
-    )
 
 
 @pytest.mark.parametrize('declared', [1 << 27 | 1, 1 << 62])

@@ -4,25 +4,16 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
-import struct
-import tracemalloc
 
-import lz4.frame
 import numpy as np
 import pytest
 import recorded_run
-import zstandard
-from mcap.opcode import Opcode
-from mcap.records import Chunk
 from recorded_run import BOUND_RAD, JOINTS, LIMIT_NM, PARAMETERS, TRUE, Synthetic
 
 from blf_dsc_controller import BagError, read_run
 from blf_dsc_controller.bags.content import NameMap, read_content
-from blf_dsc_controller.bags.sources import BagMessage, next_record, records_in
-from blf_dsc_controller.bags.topic_messages import TopicMessages, UnreadableMessageError
-from blf_dsc_controller.bags.unpacking import LARGEST, unpacked
+from blf_dsc_controller.bags.topic_messages import UnreadableMessageError
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (
@@ -209,38 +200,6 @@ def test_repeated_states_and_those_of_other_joints_are_counted(tmp_path):
     )
 
 
-def test_record_longer_than_its_chunk_is_an_error_without_a_checksum_too():
-    data = bytes([Opcode.MESSAGE, 30, *bytes(7), *bytes(25)])
-    with pytest.raises(match='does not match its length'):
-        list(records_in(Chunk('', data, 0, 0, 0, len(data))))
-
-
-@pytest.mark.parametrize(
-    ('opcode', 'length', 'held', 'problem'),
-    [
-        (Opcode.MESSAGE, 26, 26, ''),
-        (Opcode.MESSAGE, 27, 26, 'cut off'),
-        (Opcode.MESSAGE, LARGEST + 1, LARGEST + 1, f'a record has {LARGEST + 1} bytes'),
-        (Opcode.CHUNK, LARGEST + 1, LARGEST + 1, f'a record has {LARGEST + 1} bytes'),
-        (Opcode.ATTACHMENT, LARGEST + 1, LARGEST + 1, ''),  # not read
-        (Opcode.ATTACHMENT, 27, 26, 'cut off'),
-    ],
-)
-def test_records_that_are_cut_off_or_too_long_are_errors(opcode, length, held, problem):
-    """Of a file of this size, of which nothing is held but the beginning."""
-    head = struct.pack('<BQ', opcode, length)
-    stream = io.BytesIO(head + bytes(26))
-    kinds = {Opcode.CHUNK: Chunk}
-    size = len(head) + held
-    if problem:
-        with pytest.raises(ValueError, match=problem):
-            next_record(stream, size, kinds)
-    else:
-        found = next_record(stream, size, kinds)
-        assert (found is None) == (opcode is Opcode.ATTACHMENT)
-        assert stream.tell() == size
-
-
 def test_text_without_end_is_refused(tmp_path):
     """It compresses to nothing."""
     message = typestore().types[JOURNAL.type](data='x' * (1 << 24))
@@ -249,66 +208,6 @@ def test_text_without_end_is_refused(tmp_path):
     entries.insert(3, [JOURNAL.resolved, JOURNAL.type, 0, raw])
     with pytest.raises(BagError, match=f'a message of {JOURNAL.resolved} has 17 MB'):
         read_run(recorded_run.write(tmp_path / 'bag', entries))
-
-
-@pytest.mark.parametrize('compression', ['zstd', 'lz4', ''])
-def test_stated_sizes_of_compressed_data_are_not_believed(compression):
-    data = bytes(50_000_000)
-    packed = {'zstd': zstandard.compress, 'lz4': lz4.frame.compress, '': bytes}
-    raw = packed[compression](data)
-    assert unpacked(raw, compression, len(data)) == data
-    tracemalloc.start()
-    with pytest.raises(ValueError, match='more than 1000 bytes'):
-        unpacked(raw, compression, 1000)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 1_000_000
-
-
-def streamed(data):
-    """Compress without stating the size, as a pipe does."""
-    frame = zstandard.ZstdCompressor().compressobj()
-    return frame.compress(data) + frame.flush()
-
-
-@pytest.mark.parametrize(
-    ('compression', 'pack'),
-    [
-        ('zstd', zstandard.compress),
-        ('zstd', streamed),
-        ('lz4', lz4.frame.compress),
-    ],
-)
-def test_compressed_data_that_are_cut_off_are_an_error(compression, pack):
-    """What is left of them unpacks to their beginning."""
-    data = bytes(range(256)) * 1000
-    raw = pack(data)
-    assert unpacked(raw, compression) == data
-    for size in (len(raw) - 1, len(raw) - 8, len(raw) // 2):
-        with pytest.raises(ValueError, match='cut off'):
-            unpacked(raw[:size], compression)
-
-
-def test_gaps_in_sequence_numbers_are_losses():
-    """Each publisher has its own numbers."""
-    messages = TopicMessages('/x', JOINT_STATES.type)
-    for k, sequence in enumerate((4, 5, 0, 8, 9, 2, 3, 10, 4, 4, 5, 1, 2)):
-        messages.add(BagMessage('/x', 0, bytes([k]), sequence))
-    assert messages.lost == '2 missed, 7 sent before the recorder connected'
-    for sequence in range(99, 1, -1):  # of whatever it may be
-        messages.add(BagMessage('/x', 0, b'', sequence))
-    assert messages.lost == ''
-
-
-@pytest.mark.parametrize('apart', [1, 10])
-def test_message_that_was_recorded_twice_is_no_loss(apart):
-    """It has the number and the content of another; those of two publishers differ."""
-    messages = TopicMessages('/x', JOINT_STATES.type)
-    for sequence in (*range(1, 21), 21 - apart, 21):
-        messages.add(BagMessage('/x', 0, bytes([sequence]), sequence))
-    assert (messages.size, messages.lost) == (22, '')
-    messages.add(BagMessage('/x', 0, b'other', 3))
-    assert messages.lost == '0 missed, 2 sent before the recorder connected'
 
 
 def test_undecodable_message_is_reported_with_topic_and_number(tmp_path):

@@ -8,7 +8,6 @@ untouched.
 from __future__ import annotations
 
 import re
-import resource
 import tracemalloc
 from threading import Event
 
@@ -469,25 +468,6 @@ def test_a_loop_does_not_wait_for_a_disk_that_does_not_write(tmp_path):
     disk.goes_on.set()
     file.close()
     assert (tmp_path / 'file').read_bytes() == b''.join(pieces)
-
-
-def test_an_error_of_the_disk_is_raised_once_by_a_later_call(tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    file = BackgroundFile(tmp_path / 'file')
-
-    def write_on():
-        while True:
-            file.write(bytes(600))
-            file.flush()
-
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
-        with pytest.raises(OSError, match='too large'):
-            write_on()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    file.write(b'')
-    file.close()
 
 
 @pytest.mark.parametrize('in_background', [False, True])

@@ -88,25 +88,6 @@ def test_every_panel_is_drawn_and_fits_the_window(pages, name, width):
         page.screenshot(path=SHOTS / f'report_{name}_{width}.png', full_page=True)
 
 
-@pytest.mark.parametrize('width', [500, 1400])
-def test_no_tick_is_cut_and_no_name_is_broken(pages, width):
-    with shown(pages / 'one.html', width) as page:
-        cut = page.evaluate(
-            f'Array.from({PLOTS}).filter((plot) => {{'
-            '  const left = plot.getBoundingClientRect().left;'
-            "  return Array.from(plot.querySelectorAll('.ytick text')).some("
-            '    (tick) => tick.getBoundingClientRect().left < left); })'
-            '.map((plot) => plot.layout.title.text)'
-        )
-        assert cut == []
-        heights = page.evaluate(
-            "Array.from(document.querySelectorAll('.scroll td:first-child'))"
-            '.map((cell) => cell.getBoundingClientRect().height).filter((it) => it)'
-        )
-        assert len(heights) > 2
-        assert max(heights[:2]) < 2 * 21  # px, of a line: the names of two joints
-
-
 def test_dragging_zooms_all_time_panels(pages):
     with shown(pages / 'one.html') as page:
         assert all(limits == pytest.approx([0.0, 4.0]) for limits in ranges(page))

@@ -323,17 +323,6 @@ def is_full(words, folder, tmp_path):
     assert not any(path.is_file() for path in set(folder.rglob('*')) - before)
 
 
-def test_recordings_are_read_before_it_is_said_that_nothing_is_to_be_written(
-    given, tmp_path
-):
-    folder = shutil.copytree(given, tmp_path / 'here')
-    ended = Ended(['identify', 'run.csv', '--urdf', 'pendulum.urdf'], folder)
-    assert (ended.code, ended.lines) == (
-        1,
-        ['blf_dsc identify: nothing to write: give --out, --report or --payload'],
-    )
-
-
 AT_IMPORTS = """
 import os, signal, sys
 

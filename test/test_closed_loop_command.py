@@ -31,11 +31,6 @@ from rosbags.highlevel import AnyReader
 from blf_dsc_controller import read_run
 from blf_dsc_controller.bags.recovery import recover
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.result_folder import (
-    BAG,
-    discard_unbegun,
-    make_folder,
-)
 
 HALF = {'two_link.initial_estimate': [0.5, 0.16, 0.2]}
 DURATION = 1  # s
@@ -259,18 +254,6 @@ def test_interrupted_before_the_loop_began_a_run_leaves_nothing_and_may_be_repea
     assert errors.splitlines()[-1] == 'blf_dsc run: interrupted'
     assert 'Traceback' not in errors
     assert not out.exists()
-
-
-def test_folder_of_a_run_without_a_bag_goes_at_an_interrupt(tmp_path):
-    """And one that is empty; not that of a recorded run, nor what another command has made."""
-    made = [make_folder(tmp_path / name, BAG) for name in ('waiting', 'recorded')]
-    (made[0] / 'config.yaml').touch()
-    (made[1] / 'bag').mkdir()
-    others = [make_folder(tmp_path / name) for name in ('empty', 'figures')]
-    (others[1] / 'figures.json').touch()
-    assert discard_unbegun() == [made[0], others[0]]
-    assert [made[1], others[1]] == [each for each in (*made, *others) if each.exists()]
-    assert discard_unbegun() == []
 
 
 @pytest.mark.parametrize(

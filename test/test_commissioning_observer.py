@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -24,12 +23,8 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.commissioning import simulated
 from blf_dsc_controller.commissioning.commissioned import commissioned
-from blf_dsc_controller.commissioning.margin import BARELY
 from blf_dsc_controller.commissioning.observer_pole import (
-    ENOUGH,
     POLES,
-    RESONANT,
-    ObserverPole,
 )
 from blf_dsc_controller.commissioning.page import sentences
 from blf_dsc_controller.commissioning.planned import plan
@@ -148,21 +143,6 @@ def test_arm_whose_gears_resonate_gets_a_slower_pole():
     assert found(STIFF).observer.pole == POLES[-1]
 
 
-def test_pole_is_the_fastest_with_the_margin():
-    result = found(SOFT)
-    pole, margin, *_ = result.observer
-    assert margin.value >= ENOUGH
-    assert margin.frequency >= RESONANT
-    f = result.responses[0].frequency
-    counted = result.responses[0].seen & (f >= RESONANT)
-    ((value, doubt, _),) = result.sensed.singular_values(result.choice.gains, pole)
-    assert value[counted].min() == margin.value
-    assert (value - doubt)[counted].min() >= BARELY
-    faster = dict(pairwise(POLES))[pole]
-    ((value, doubt, _),) = result.sensed.singular_values(result.choice.gains, faster)
-    assert value[counted].min() < ENOUGH or (value - doubt)[counted].min() < BARELY
-
-
 def picked_up(springs, pole):
     """Return the run of the arm along its motion, with an r of this pole that begins at once."""
     config = blf.change(found(springs).config, {'disturbance.observer_bandwidth': pole})
@@ -207,20 +187,6 @@ def test_efforts_that_do_not_move_the_links_are_not_used(effort_of):
     assert why.startswith('efforts do not move the links: ')
 
 
-def test_posture_with_a_load_does_not_speak_against_sensors():
-    """Its links are heavier than those of the model, by up to several times."""
-    result = found()
-    (response,) = result.responses
-    loaded = result.sensed._replace(links=0.2 * result.sensed.links)
-    assert loaded.why_no_sensors.startswith('efforts do not move the links: 80 %')
-    both = loaded._replace(
-        loops=result.loops._replace(responses=[response, response]),
-        sensed=2 * loaded.sensed,
-        links=np.vstack((loaded.links, result.sensed.links)),
-    )
-    assert both.why_no_sensors == ''
-
-
 def test_parameters_have_the_pole_only_where_sensors_are_declared_and_read():
     """Also if nothing had proven them: then the law did not use them."""
     name = 'disturbance.observer_bandwidth'
@@ -237,20 +203,3 @@ def test_parameters_have_the_pole_only_where_sensors_are_declared_and_read():
         assert result.observer is None
         assert name not in result.parameters_but_bounds()
         assert not [each for each in sentences(result) if 'load observer' in each]
-
-
-def test_page_says_the_pole_and_what_limits_it():
-    def said(result):
-        (text,) = [
-            each for each in sentences(result) if 'load observer' in each.lower()
-        ]
-        return text
-
-    fast, slow = found(STIFF), found(SOFT)
-    assert 'a pole of 300 rad/s' in said(fast)
-    assert 'a faster one gains little' in said(fast)
-    assert f'a pole of {slow.observer.pole:g} rad/s' in said(slow)
-    assert f'margin of {slow.observer.margin.value:.2g} near' in said(slow)
-    assert 'a faster one less than 0.25' in said(slow)
-    none = slow._replace(observer=ObserverPole(0.0, slow.observer.margin))
-    assert said(none).startswith('NO LOAD OBSERVER: with the slowest pole, 10 rad/s')

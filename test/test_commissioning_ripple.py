@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import pickle
 import re
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,9 +15,8 @@ from elastic_two_link import ARM, NEAR, shorten_motions, shorten_moves
 from plant_driver import PlantDriver
 
 import blf_dsc_controller as blf
-from blf_dsc_controller import BlfDscError, change
+from blf_dsc_controller import change
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.cli.commission_ripple import on_robot
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import (
@@ -28,17 +26,12 @@ from blf_dsc_controller.commissioning import (
     simulated,
     slow_motion,
 )
-from blf_dsc_controller.commissioning.driven import Driven
-from blf_dsc_controller.commissioning.measurement import Measured, measured_in
 from blf_dsc_controller.commissioning.planned import FROM_LIMITS
-from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.commissioning.ripple import ripples_in, to_learn
-from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.run import TURNING, Stop
+from blf_dsc_controller.run import TURNING
 
 DRIVER = """
 from math import inf
@@ -176,31 +169,6 @@ def test_bags_give_the_same_and_replay(whole, monkeypatch):
     )
 
 
-@pytest.mark.parametrize(
-    ('preset', 'effort'), [('fr3', 'without-gravity'), ('ur5e', 'command')]
-)
-def test_commands_lack_the_gravity_that_drives_add(preset, effort, whole, monkeypatch):
-    shorten(monkeypatch)
-    monkeypatch.setattr(ripple, 'find_ripples', lambda *given: given[2])
-    run = blf.read_run(whole.arm.with_name('out_bags') / 'slow_motion')
-    assert ripples_in([Measured(run, blf.load_loop(preset).controller)]) == effort
-
-
-def test_run_that_goes_on_after_a_stop_shows_no_ripple(whole, monkeypatch):
-    shorten(monkeypatch)
-    run, config = measured_in(whole.arm.with_name('out_bags') / 'slow_motion')
-    stopped = replace(run, stops=(Stop(int(run.stamp[7000]), 'fault', 'a push'),))
-    with pytest.raises(BlfDscError, match=r'^second: the arm stopped 7 s .* a push'):
-        ripples_in([Measured(run, config), Measured(stopped, config)], ['', 'second'])
-
-
-def test_slow_motion_alone_gives_no_gains(whole, monkeypatch, capsys):
-    shorten(monkeypatch)
-    bag = whole.arm.with_name('out_bags') / 'slow_motion'
-    assert commission(whole.arm, str(bag), out='alone.yaml') == 1
-    assert 'there is no run of a motion in a posture' in capsys.readouterr().err
-
-
 def test_ctrl_c_in_the_slow_motion_keeps_the_gains(whole, arm, capsys, monkeypatch):
     """State 17000 is in it; the arm comes to rest."""
     monkeypatch.setattr(proof, 'SHARES', (1.0,))
@@ -247,57 +215,6 @@ def test_gains_of_a_file_are_proven_and_its_ripple_added(whole, capsys, monkeypa
     assert (
         f'# torque ripple is written as learning.ripple_cycles: [{cycles:g}]' in comment
     )
-
-
-class Pushed(PlantDriver):
-    """An arm that somebody pushes past its bound."""
-
-    def happen(self):
-        if self.what == 'push':
-            self.push = np.array([500.0, 0.0])  # N m
-        else:
-            super().happen()
-
-    def write(self, torque):
-        super().write(None if torque is None else torque + self.push)
-
-    push = np.zeros(2)
-
-
-@pytest.mark.parametrize(
-    ('what', 'number', 'end', 'told'),
-    [
-        ('push', 8000, End.STOPPED, '^slow motion: the controller stopped: joint '),
-        ('silent', 8000, End.LOST, '^slow motion: the connection was lost: no state'),
-        ('push', 1000, End.STOPPED, 'The gains are not proven: no share of the'),
-    ],
-)
-def test_end_before_its_time_says_that_ripple_was_not_measured(
-    what, number, end, told, whole, tmp_path, monkeypatch
-):
-    shorten(monkeypatch)
-    monkeypatch.setattr(proof, 'SHARES', (1.0,))
-    config = whole.found.before
-    driver = Pushed(f'{what}@{number}', config, DriveConfig(settle_time=0.5))
-    driver.arm = whole.arm
-    driver.connect()
-    robot = Driven(driver, blf.Commissioning(config), tmp_path / 'bags')
-    file = file_in(tmp_path, whole)
-    file.write(whole.found, file.content(whole.found))
-    before = file.path.read_text()
-    with pytest.raises(EndedError, match=told) as caught:
-        on_robot(robot, file, whole.found, [])
-    assert caught.value.end is end
-    assert str(caught.value).endswith(
-        f'Torque ripple was not measured; {file.path} has all else'
-    )
-    assert file.path.read_text() == before
-    if number == 8000:
-        bag = tmp_path / 'bags' / 'slow_motion'
-        posture = whole.arm.with_name('out_bags') / 'posture_1'
-        assert bag.exists()
-        with pytest.raises(BlfDscError, match=r'slow motion, which shows torque'):
-            blf.Commissioning(config).result([posture, bag])
 
 
 def file_in(folder, whole):

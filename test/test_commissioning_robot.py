@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from elastic_two_link import ARM, BEGIN, FAR, NEAR, shorten_motions, shorten_moves
+from elastic_two_link import ARM, FAR, NEAR, shorten_motions, shorten_moves
 from plant_driver import PlantDriver
 from recorded_run import small_disk
 
@@ -18,16 +18,10 @@ from blf_dsc_controller import BlfDscError, change
 from blf_dsc_controller.arms.urdf import frames
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.commissioning import motion as motions
 from blf_dsc_controller.commissioning import proof
 from blf_dsc_controller.commissioning.driven import Driven
-from blf_dsc_controller.commissioning.planned import plan
-from blf_dsc_controller.commissioning.postures import SPEED, EndedError, move
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.factory.gains import law_gains
-from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 
 pytestmark = pytest.mark.usefixtures('blank_pictures')
@@ -267,42 +261,6 @@ def test_arm_that_moves_is_not_measured(arm):
     assert PlantDriver.last.calls == ['connect']
 
 
-def test_request_between_two_runs_starts_no_other(arm):
-    robot = driven(arm)
-    robot.request_end()
-    with pytest.raises(EndedError, match='move 1: ended on request') as caught:
-        next(robot.runs(np.array([NEAR])))
-    assert caught.value.end is End.REQUESTED
-    assert PlantDriver.last.calls == ['connect']
-
-
-def test_move_is_slow_straight_and_at_rest_at_both_ends(whole):
-    config = blf.load_loop(whole).controller
-    here, there = np.array(BEGIN), np.array([-2.0, 0.9])
-    made = move(config, here, there)
-    times = np.linspace(0.0, made.duration, 2001)
-    q, dq, _ = sampled(reference_of(made.config), times).transpose(1, 0, 2)
-    np.testing.assert_allclose(q[[0, -1]], (here, there), atol=1e-9)
-    np.testing.assert_allclose(dq[[0, -1]], 0.0, atol=1e-9)
-    assert np.abs(dq).max() == pytest.approx(SPEED, rel=1e-3)
-    share = (q - here) / (there - here)
-    np.testing.assert_allclose(share[:, 0], share[:, 1], atol=1e-9)
-
-
-def test_contacts_end_a_motion_and_loads_are_not_told_in_it():
-    preset = blf.load_loop('fr3_direct').controller
-    given = {
-        'contact.enabled': True,
-        'contact.reaction': 'yield',
-        'load.tell_drive': True,
-    }
-    posture = np.array(preset.reference.offset)
-    (motion,) = plan(change(preset, given), posture[None])
-    assert motion.config.contact.reaction == 'stop'
-    assert not motion.config.load.tell_drive
-    assert motion.duration > motions.SETTLING + motion.excitation.period
-
-
 def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):
     """Its soft damping would let it drift on, if the run ended in the middle of a swing."""
     friction = '{coulomb: [1.0, 0.5], stribeck: 0.5, '
@@ -433,12 +391,3 @@ def test_gains_that_are_not_proven_are_told(
     told = capsys.readouterr().err
     for each in (*printed, 'The gains are not proven'):
         assert each in told
-
-
-def test_move_takes_half_of_slower_limits(whole):
-    slow = change(blf.load_loop(whole).controller, {'limits.velocity': [0.2, 0.4]})
-    made = move(slow, np.array(BEGIN), np.array([-2.0, 0.9]))
-    times = np.linspace(0.0, made.duration, 2001)
-    _, dq, _ = sampled(reference_of(made.config), times).transpose(1, 0, 2)
-    share = np.abs(dq).max(axis=0) / [0.2, 0.4]
-    assert share.max() == pytest.approx(0.5, rel=1e-3)

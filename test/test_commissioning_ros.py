@@ -16,22 +16,14 @@ from ros_rig import PATIENCE
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import BlfDscError
-from blf_dsc_controller.cli.commission_ripple import on_robot
 from blf_dsc_controller.cli.commission_ros import made
-from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import (
     over_ros,
-    postures,
-    proof,
-    ripple,
-    simulated,
-    slow_motion,
 )
 from blf_dsc_controller.commissioning.motion import is_motion
 from blf_dsc_controller.commissioning.over_ros import OverRos
-from blf_dsc_controller.commissioning.postures import EndedError, ripples_by_bags
-from blf_dsc_controller.commissioning.ripple import to_learn
+from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.messages import topics
@@ -127,52 +119,6 @@ def test_arm_is_measured_and_its_bags_give_gains_with_the_margin(rig, monkeypatc
     words = ['commission', str(bag), '--config', str(rig.file), '--out', str(out)]
     assert main(words) == 0
     assert 'with a modulus margin' in out.read_text()
-
-
-RIPPLE = (
-    '    actuator: {torque_limit: [60.0, 30.0], ripple: 0.004, ripple_cycles: 40.0}\n'
-)
-MOVES = """
-    reference: {type: sinusoids, offset: [0.3, 1.1], amplitude: [0.3, 0.1, 0.3, 0.1],
-                frequency: [1.6, 2.6], phase: [1.5, 0.0]}
-"""
-
-
-@pytest.fixture
-def slow(ros, tmp_path, monkeypatch):
-    """Return a rigid arm with ripple, and what it takes to find it in less time."""
-    shorten_motions(monkeypatch)
-    shorten_moves(monkeypatch)
-    for name, value in (('_LAST', 0.3), ('SHARES', (1.0,))):
-        monkeypatch.setattr(proof, name, value)
-    for name, value in (('HOLD', 0.5), ('_REST', 0.2)):
-        monkeypatch.setattr(postures, name, value)
-    for module in (slow_motion, ripple):
-        monkeypatch.setattr(module, 'SECONDS', 15.0)
-    text = ARM.replace('    joint.stiffness: [3.0e+3, 1.5e+3]\n', RIPPLE)
-    return Rig(ros, tmp_path, text.rstrip() + MOVES)
-
-
-def test_ripple_is_found_after_the_proof_and_its_bag_gives_the_same(slow):
-    motion = slow.commissioning.motion(NEAR)
-    run = simulated.measured(motion, blf.load_loop(slow.file).plant)
-    found = slow.commissioning.result([run])
-    file = CommissionedFile(
-        path=slow.file.with_name('out.yaml'),
-        source=slow.file,
-        name='arm',
-        command='',
-        is_simulated=False,
-        ripple_follows=True,
-    )
-    slow.robot.wait()
-    on_robot(slow.robot, file, found, [])
-    (cycles,) = blf.load_loop(file.path).controller.learning.ripple_cycles
-    assert cycles == pytest.approx(40.0, abs=1.0)
-    bag = slow.bags / 'slow_motion'
-    assert blf.verify(bag).difference is None
-    (listed,) = to_learn(ripples_by_bags([bag]))
-    assert listed.cycles == cycles
 
 
 def test_a_run_goes_on_from_the_torque_that_holds_the_arm(ros, tmp_path):

@@ -56,12 +56,6 @@ def test_configuration_says_what_the_controller_would_say(capsys):
     assert any('nobody has measured' in text for _, text in others)
 
 
-def test_gains_in_motors_are_not_judged_as_if_they_were_over_the_bus(capsys):
-    _, found = diagnosed(capsys, '--config', 'yam')
-    (_, (_, note)) = found['config']
-    assert 'begin with those of its maker' in note
-
-
 def test_configuration_with_a_mistake_is_a_problem(capsys, tmp_path):
     path = tmp_path / 'my.yaml'
     path.write_text('/**:\n  ros__parameters:\n    sample_tme: 0.001\n')

@@ -13,7 +13,6 @@ from random_arm import chain_of, random_urdf
 from blf_dsc_controller import ControllerConfig, load_loop, simulate
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.clearance import Clearance, distance
 from blf_dsc_controller.identification.exciting_reference import (
     ExcitationProblem,
@@ -87,28 +86,6 @@ def test_search_keeps_its_limits_is_repeatable_and_beats_random_motions():
     allowed = [other.gain for other in others if other.is_allowed]
     assert len(allowed) > 3
     assert max(allowed) < reached.gain
-
-
-def test_predicted_information_of_a_panda_matches_its_loop():
-    loop = load_loop('panda')
-    names = ('offset', 'amplitude', 'frequency', 'phase')
-    motion = {name: getattr(loop.controller.reference, name) for name in names}
-    plant = replace(loop.plant, duration=11.0)
-    state = simulate(loop.controller, plant).controller.state
-    upper = np.triu(state.window.running[:-1, :-1]) / state.window.rows[0]
-    Phi = upper + np.triu(upper, 1).T
-    settings = settings_of_config(loop.controller)
-    a = settings.window.prior_weight
-    gain = np.linalg.slogdet(
-        np.linalg.solve(settings.information, Phi) / a + np.eye(len(Phi))
-    )[1]
-
-    problem = ExcitationProblem(loop.controller, 3)
-
-    found = problem.evaluate(motion)
-    assert found.gain == pytest.approx(gain, rel=0.01)
-    assert found.left == pytest.approx(np.exp(-0.5 * gain / len(Phi)), rel=0.01)
-    assert found.ratios[1].max() > 0.8
 
 
 def test_torque_ratio_is_the_larger_with_and_without_the_payload():
@@ -197,21 +174,3 @@ def test_panda_must_not_touch_itself_or_the_floor():
     assert panda().room(folded).min() < 0.0
     assert panda().room(low).min() < 0.0 < panda(floor=-1.0).room(low).min()
     assert panda(radius=0.03).room(folded).min() > panda().room(folded).min()
-
-
-def test_links_that_touch_in_every_posture_do_not_count():
-    """With thick links only a Panda's base and what is beyond its elbow are left."""
-    q = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 7))
-    assert panda(radius=0.3).room(q).shape[1] < panda().room(q).shape[1]
-    assert np.all(panda(radius=0.005).room(q).max(axis=0) > 0.0)
-
-
-def test_link_with_an_offset_from_its_joints_is_checked_where_it_is():
-    """The upper arm of a UR5e is 11 cm beside the line from shoulder to elbow."""
-    corners, straight = (
-        Clearance(chain_of('ur5e'), radius, 0.0).corners(np.zeros(6))
-        for radius in (0.07, 0.2)
-    )
-    assert len(corners) == len(straight) + 1 == 9
-    apart = distance(corners[3], corners[3], straight[2], straight[3])
-    assert apart == pytest.approx(0.11336, abs=1e-4)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import re
-import tracemalloc
 
 import mujoco
 import numpy as np
@@ -31,7 +30,7 @@ from random_arm import (
 )
 from scipy.integrate import solve_ivp
 
-from blf_dsc_controller import BlfDscError, load_loop, share_folder, simulate
+from blf_dsc_controller import BlfDscError, load_loop, simulate
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
@@ -44,18 +43,10 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.identification.identify import STAGES, identify_arm
-from blf_dsc_controller.identification.physical import Cone, solve
-from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.problems import problems_of
 from blf_dsc_controller.identification.reading import read_recording
-from blf_dsc_controller.identification.recording import (
-    Recording,
-    joined,
-)
-from blf_dsc_controller.identification.regression import regression
 from blf_dsc_controller.identification.sliding import sliding_direction
 from blf_dsc_controller.identification.values import base_matrix
-from blf_dsc_controller.identification.windows import rows_of
 from blf_dsc_controller.simulation.loop import write_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT)
@@ -350,21 +341,6 @@ def test_terms_that_the_data_do_not_show_are_left_out(simple):
     assert np.count_nonzero(stribeck) + np.count_nonzero(quadratic) <= 1
 
 
-def test_joint_whose_link_is_far_from_the_urdf_keeps_its_weight():
-    """Weighted by correlation lengths, too, joints that fit badly would be left to the prior.
-
-    With the last link 14 cm from where the URDF has it, they then stay 5 % off.
-    """
-    T = np.eye(4)
-    T[:2, 3] = 0.1
-    bodies = PANDA_CHAIN.inertias.copy()
-    bodies[-1] = inertia_of(T @ pseudo_inertia(bodies[-1]) @ T.T)
-    states = moved(30.0, truth=TRUTH._replace(inertias=bodies))
-    robot = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp', payload=0.0)
-    found = identified(states, robot=robot)
-    assert (found.score.errors[2] < 0.005 * found.score.torque).all()
-
-
 def test_load_friction_and_stribeck_friction_are_recognised(plain):
     states = plain.copy()
     gravity = gravity_of(TRUTH.inertias, plain[:, 0])
@@ -485,13 +461,6 @@ def loaded():
     return moved(20.0, 5, TRUTH._replace(inertias=bodies))
 
 
-def test_load_is_weighed_with_a_recording_without_and_one_with_it(plain, loaded):
-    together, (boundary,) = joined(
-        recording_of(measured(plain, 3)), recording_of(measured(loaded, 4))
-    )
-    is_the_load(identify_arm(together, AT_TIP, picked_up=boundary))
-
-
 def test_load_that_is_picked_up_is_found_and_weighed(
     plain, loaded, tmp_path, capsys, identified_by_command
 ):
@@ -517,81 +486,6 @@ def test_gains_turn_currents_into_torques(plain, simple, tmp_path):
     np.testing.assert_allclose(other.score.torque, simple.score.torque, rtol=0.01)
     with pytest.raises(BlfDscError, match='got 2 gains for 7 joints'):
         identify_bag(bag, AT_TIP, gains=(1.0, 2.0))
-
-
-UNIT = np.array([pseudo_inertia(e) for e in np.eye(10)])  # E_a of sum_a ten_a E_a
-
-
-# At 10 ms the error is that of interpolating torques between samples: (w h)^2 / 8 of them.
-@pytest.mark.parametrize(('period', 'tolerance'), [(0.001, 1e-5), (0.01, 1e-3)])
-def test_rows_hold_for_an_exact_motion(period, tolerance):
-    """X P = u with the torques of a smooth motion; no acceleration is given."""
-    parameters = base_parameters(PANDA_CHAIN, GRAVITY)
-    model = parameters.model
-    P = parameters.of(PANDA_CHAIN.inertias, np.full(7, 0.1))
-    delay = 0.004
-    t = np.arange(0.0, 4.0, period)[:, None]
-    speed = np.linspace(1.0, 3.0, 7)
-    angle = speed * (t - delay)
-    dq = speed * np.cos(speed * (t - delay))
-    torque = (
-        regressors_at(model, np.sin(angle), dq, dq, -(speed**2) * np.sin(angle)) @ P
-    )
-    gap = np.zeros(len(t), dtype=bool)
-    gap[len(t) // 2] = True
-    rows = rows_of(Recording(PANDA, period, np.sin(speed * t), torque, gap, ''), model)
-    residual = rows.matrix()[:, :, : model.p] @ P - rows.u(delay)
-    inner = slice(1, -1)  # at both ends the torque has no delayed values
-    scale = np.abs(torque).max(axis=0)
-    assert (np.abs(residual[inner]) < tolerance * scale).all()
-    # No window contains the gap.
-    assert np.abs(rows.time - t[len(t) // 2]).min() >= 0.1
-
-
-def test_memory_of_identification_does_not_grow_with_the_recording():
-    """In memory, the samples and the regression of the longer one would be 35 MB more."""
-    urdf = (share_folder() / 'config' / 'two_link.urdf').read_text()
-    chain = Robot(urdf=urdf).chain(('joint1', 'joint2'))
-    model = base_parameters(chain, GRAVITY).model
-    peaks = []
-    for duration in (50.0, 50.0, 250.0):  # the first compiles
-        t = np.arange(0.0, duration, 0.001)[:, None]
-        q = np.sin(np.array([1.0, 2.0]) * t)
-        gap = np.zeros(len(t), dtype=bool)
-        recording = Recording(('joint1', 'joint2'), 0.001, q, q, gap, '')
-        tracemalloc.start()
-        rows = rows_of(recording, model)
-        windows = np.arange(rows.time.size)
-        size = rows.unknowns + 1
-        prior = Prior(np.zeros(size), np.eye(size), [], np.zeros(size))
-        regression(rows, windows, np.eye(size), prior)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[2] < peaks[1] + 7_000_000
-
-
-def test_nearest_physical_body_is_found():
-    """The J >= 0 nearest in the Frobenius norm is known: the eigenvalues clipped at zero."""
-    target = np.diag([1.0, 2.0, -1.0, 3.0])
-    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
-    target = rotation @ target @ rotation.T
-    A = 1e3 * UNIT.reshape(10, 16).T  # so large that |z|^2 and mu hardly count
-    z = solve(
-        A,
-        1e3 * target.ravel(),
-        [Cone(0, np.zeros((4, 4)), UNIT)],
-        inertia_of(np.eye(4)),
-    )
-    expected = rotation @ np.diag([1.0, 2.0, 0.0, 3.0]) @ rotation.T
-    np.testing.assert_allclose(pseudo_inertia(z), expected, atol=2e-3)
-    assert np.linalg.eigvalsh(pseudo_inertia(z))[0] > 0.0
-    # Far from the bounds it is that of least squares.
-    random = np.random.default_rng(1)
-    A = random.normal(size=(20, 3))
-    b = random.normal(size=20)
-    far = [Cone(k, np.array([[1e3]]), np.array([[[1.0]]])) for k in range(3)]
-    expected = np.linalg.solve(A.T @ A + np.eye(3), A.T @ b)
-    np.testing.assert_allclose(solve(A, b, far, np.zeros(3)), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -675,18 +569,3 @@ def test_contacts_that_yield_at_reversals_are_found(plain):
     assert total(found) < 0.005
     found_friction = found.parts.terms[2, 1] - TRUTH.coulomb[1]
     assert found_friction == pytest.approx(5.0, rel=0.05)
-
-
-def test_prior_yields_where_the_recording_contradicts_the_urdf(plain):
-    """With masses a tenth of the truth, nine deviations off, the torques are still explained."""
-    text = corrected_urdf(
-        PANDA_TEXT, PANDA_CHAIN, 0.1 * PANDA_CHAIN.inertias, *np.zeros((2, 7)), ''
-    )
-    robot = Robot(urdf=text, tip='panda_hand_tcp')
-    found = identified(plain, robot=robot)
-    assert found.score.total[2] < 1.0
-    expected = BASE.of(TRUTH.inertias, TRUTH.rotors)
-    parameters = base_parameters(robot.chain(PANDA), GRAVITY)
-    shown = base_matrix(parameters, 7)[: expected.size] @ found.values
-    u = regressors_at(BASE.model, *np.zeros((4, 1, 7)))[0]
-    np.testing.assert_allclose(u @ shown, u @ expected, atol=0.05)

@@ -20,12 +20,9 @@ from random_arm import (
     truth_of,
 )
 
-from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
-from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identify import identify_arm
-from blf_dsc_controller.identification.mounting import gravity_columns
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.problems import is_usable, problems_of
 from blf_dsc_controller.identification.summary import notes_of
@@ -110,13 +107,6 @@ def test_right_signs_stay_where_links_are_heavier_than_the_urdf_says():
     assert (share[5:] < 0.05).all()  # of torques with 1 % of noise
 
 
-@pytest.mark.parametrize('signs', [(1, 1, 1, 1, 1, -1, 1), (-1, 1, -1, -1, 1, 1, -1)])
-def test_opposite_signs_are_found_by_the_fit_of_the_whole_arm(wide, narrow, signs):
-    for states in (wide, narrow):
-        other = with_torque(states, states[:, TORQUE] * signs)
-        assert problem(other).reversed.tolist() == (np.array(signs) < 0).tolist()
-
-
 MOUNTINGS = {
     'ceiling': (0.0, 0.0, 9.81),
     'wall': (9.81, 0.0, 0.0),
@@ -155,17 +145,6 @@ def test_wrong_mounting_is_not_taken_for_a_load_or_other_joints(wide, given):
 def test_right_mounting_is_not_doubted(wide):
     assert problem(wide).other_gravity is None
     assert problem(moved(heavier_on_the_other_side())).other_gravity is None
-
-
-def test_columns_of_gravity_are_those_of_the_regressor():
-    q = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 7))
-    still = np.zeros_like(q)
-    for gravity in (GRAVITY, (1.0, -2.0, 3.0)):
-        parameters = base_parameters(PANDA_CHAIN, gravity)
-        P = parameters.of(PANDA_CHAIN.inertias, np.zeros(7))
-        expected = regressors_at(parameters.model, q, still, still, still) @ P
-        found = gravity_columns(PANDA_CHAIN, q) @ gravity
-        np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_rows_with_clipped_torques_are_left_out_and_said(wide):

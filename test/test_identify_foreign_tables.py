@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import os
-import tracemalloc
 import warnings
-from io import BytesIO
 from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
@@ -16,7 +14,6 @@ from scipy.io import savemat
 
 from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.bags.content import NameMap
-from blf_dsc_controller.bags.sources import next_record
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.identification.from_table import read_table
 
@@ -33,10 +30,6 @@ ORDER = [UR5E.index(name) for name in SHUFFLED]
 
 def numbered(stem, unit=''):
     return [f'{stem}_{k}{unit}' for k in NUMBERS]
-
-
-def named(field, joints=UR5E, unit=''):
-    return [f'{field} {joint}{unit}' for joint in joints]
 
 
 def written(path, names, columns, delimiter=',', decimal='.', before='', **how):
@@ -106,24 +99,6 @@ def test_ros2_topic_echo_csv_is_read_without_a_header(tmp_path):
     is_read(path)
 
 
-def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path):
-    nanoseconds = np.round(TIME * 1e9).astype(int)
-    seconds = EPOCH + nanoseconds // 10**9
-    for first, second in (
-        ('sec', 'nanosec'),
-        ('header.stamp.secs', 'header.stamp.nsecs'),
-    ):
-        path = tmp_path / f'{first}.csv'
-        np.savetxt(
-            path,
-            np.column_stack((seconds, nanoseconds % 10**9, Q, TAU)),
-            delimiter=',',
-            header=','.join([first, second, *numbered('q'), *numbered('tau')]),
-            comments='',
-        )
-        is_read(path)
-
-
 # Separators, headers, orders.
 
 
@@ -150,14 +125,6 @@ def test_header_of_savetxt_and_lines_above_and_units_below_it_are_read(tmp_path)
     is_read(path)
 
 
-def test_text_of_spreadsheets_is_read_in_any_encoding(tmp_path):
-    names = ['t', *(f'{name} [°]' for name in numbered('q')), *numbered('tau')]
-    for encoding in ('utf-8-sig', 'utf-16', 'cp1252'):
-        path = tmp_path / f'{encoding}.csv'
-        written(path, names, (TIME, np.rad2deg(Q), TAU), encoding=encoding)
-        is_read(path)
-
-
 def test_table_that_was_cut_off_and_one_with_empty_cells_are_read(tmp_path):
     names = ['t', *numbered('q'), *numbered('tau')]
     path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
@@ -173,40 +140,6 @@ def test_table_that_was_cut_off_and_one_with_empty_cells_are_read(tmp_path):
 
 
 # Units.
-
-
-@pytest.mark.parametrize(
-    ('time', 'q', 'tau'),
-    [
-        ('t [s]', ' [rad]', ' [N m]'),
-        ('t [ms]', ' [deg]', ' [Nmm]'),
-        ('time (us)', '_deg', '_mNm'),
-        ('stamp_ns', ' (degrees)', ' [N·m]'),
-        ('time', ' [mrad]', ' {kN m}'),
-        ('time_ms', ' [rev]', ' [N cm]'),
-    ],
-)
-def test_units_in_the_names_are_used(tmp_path, time, q, tau):
-    of_time = {'ms': 1e3, 'us': 1e6, 'ns': 1e9}
-    of_q = {'deg': 180 / np.pi, 'degrees': 180 / np.pi, 'mrad': 1e3, 'rev': 0.5 / np.pi}
-    of_tau = {'Nmm': 1e3, 'mNm': 1e3, 'kN m': 1e-3, 'N cm': 1e2}
-    factors = (
-        next(
-            (
-                f
-                for unit, f in units.items()
-                if unit in name.replace('_', ' ').split(' ', 1)[-1]
-            ),
-            1,
-        )
-        for units, name in ((of_time, time), (of_q, q), (of_tau, tau))
-    )
-    columns = [values * f for values, f in zip((TIME, Q, TAU), factors, strict=True)]
-    for names in (
-        [time, *numbered('q', q), *numbered('tau', tau)],
-        [time, *named('position', unit=q), *named('effort', unit=tau)],
-    ):
-        is_read(written(tmp_path / 'a.csv', names, columns))
 
 
 @pytest.mark.parametrize('unit', [' [%]', ' [A]', '_mA'])
@@ -349,24 +282,6 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, suffix, kind, capsys):
     assert len(PANDA) == 7
 
 
-def test_memory_for_a_long_table_is_a_few_times_its_numbers(tmp_path):
-    """An honest CSV with an empty cell: all rows as lists would be three times as much."""
-    names = ['t', *numbered('q'), *numbered('dq'), *numbered('tau')]
-    repeats = 100  # 30,000 rows, 6 MB
-    time = np.arange(repeats * TIME.size) * PERIOD
-    q, tau = (np.tile(values, (repeats, 1)) for values in (Q, TAU))
-    path = written(tmp_path / 'a.csv', names, (time, q, q, tau))
-    head, last = path.read_text().rsplit(',', 1)
-    path.write_text(f'{head},\n{head.rsplit(chr(10), 1)[1]},{last}')  # an empty cell
-    numbers = 8 * time.size * (1 + q.shape[1] + tau.shape[1])  # bytes
-    tracemalloc.start()
-    read_table(path, UR5E_TEXT)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    # as they stand in the file, in rad and N m, and masks; and a block of lines
-    assert peak < 3.5 * numbers + 5_000_000
-
-
 def test_arrays_that_unpack_to_gigabytes_are_refused(tmp_path):
     """A third of a gigabyte of zeros, in a third of a megabyte."""
     shape = (7_000_000, 6)
@@ -420,9 +335,3 @@ def test_a_row_for_each_joint_is_refused(tmp_path):
     columns = [np.repeat(values, 2, axis=0) for values in (TIME, Q, TAU)]
     names = ['t', *numbered('q'), *numbered('tau')]
     is_read(written(path, names, columns))  # the same rows twice are no fault
-
-
-def test_hole_in_a_bag_is_no_record():
-    """Nine zeros would be a record without content: two gigabytes are read for hours."""
-    with pytest.raises(ValueError, match='zeros instead of a record'):
-        next_record(BytesIO(bytes(100)), 100, {})

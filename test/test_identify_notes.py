@@ -20,11 +20,9 @@ from random_arm import (
     truth_of,
 )
 
-from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import problems_of
-from blf_dsc_controller.identification.recording import joined
 from blf_dsc_controller.identification.summary import (
     notes_of,
 )
@@ -83,46 +81,6 @@ def test_offset_for_which_a_urdf_has_no_place_is_named(plain):
     found = identified(states)
     assert mentions(found, f'{PANDA[4]} has an offset of 1.5 N m')
     assert not mentions(found, f'{PANDA[1]} has an offset')
-
-
-def test_joint_that_hardly_needs_a_torque_is_named(plain):
-    """Its error in % is large, though it is but a torque that drifts by 20 mN m."""
-    states = plain.copy()
-    late = len(states) * 4 // 5
-    states[:late, TORQUE, 6] = 0.02
-    states[late:, TORQUE, 6] = -0.02
-    found = identified(states)
-    assert found.score.errors[2, 6] > found.score.torque[6]
-    assert mentions(found, f'{PANDA[6]} hardly needs a torque (0.02 N m)')
-
-
-def test_joint_whose_torque_is_hardly_explained_is_named_also_if_it_is_small(plain):
-    """The last joint turned round, and counted from half a turn: 1 % of all torques."""
-    states = plain.copy()
-    states[:, 0, 6] = np.pi - states[:, 0, 6]
-    states[:, 1:, 6] *= -1.0
-    found = identified(states)
-    assert found.score.total[2] < 2.0
-    assert mentions(found, f' % of the torque of {PANDA[6]} are not explained')
-    assert found.other_convention.convention.unlike.tolist() == [6]
-
-
-def test_load_that_is_weighed_is_not_taken_for_double_gravity(plain):
-    """6 kg in the hand of an arm of 18 kg: without its columns, gravity looks double."""
-    mass = 6.0  # kg
-    bodies = TRUTH.inertias.copy()
-    T = PANDA_CHAIN.tip_placement
-    bodies[-1] += inertia_of(T @ (mass * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
-    loaded = moved(20.0, 5, TRUTH._replace(inertias=bodies))
-    heavy = recording_of(measured(loaded, 4))
-    together, (boundary,) = joined(recording_of(measured(plain, 3)), heavy)
-    found = identify_arm(together, ROBOT, picked_up=boundary)
-    assert found.load[0][0] == pytest.approx(mass, rel=0.05)
-    assert found.gravity == pytest.approx(1.0, abs=0.3)
-    assert not list(problems_of(found, 'torque'))
-    assert 'GRAVITY IS DOUBLE' in next(
-        problems_of(identify_arm(heavy, ROBOT), 'torque')
-    )
 
 
 @pytest.mark.parametrize('law', ['Stribeck', 'elastic'])

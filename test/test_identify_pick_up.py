@@ -18,7 +18,6 @@ from random_arm import (
 from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identify import identify_arm
-from blf_dsc_controller.identification.pick_up import _best_interval
 from blf_dsc_controller.identification.problems import is_usable, problems_of
 from blf_dsc_controller.identification.summary import load_table
 from blf_dsc_controller.identification.windows import Carried
@@ -91,16 +90,3 @@ def test_load_that_stays_is_not_said_to_change(motions):
     asked = identify_arm(recorded(motions, np.inf, np.inf), ROBOT, picked_up=FIND)
     assert 'none that shows' in next(load_table(asked))
     assert is_usable(asked)
-
-
-def test_load_of_the_whole_recording_is_none_that_changes():
-    """It cannot be told from the last body."""
-
-    def cost(begin, end):
-        return abs(begin) + abs(end - 50)
-
-    assert _best_interval(cost, 50) in {(0, 49), (1, 50)}
-    assert _best_interval(lambda begin, end: abs(begin - 7) + abs(end - 33), 50) == (
-        7,
-        33,
-    )

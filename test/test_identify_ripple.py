@@ -4,18 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from random_arm import recording_of, reference_of
 
-from blf_dsc_controller import change, load_loop, simulate
-from blf_dsc_controller.commissioning.slow_motion import slow_frequencies
+from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.identification.identify import ripples_left
 from blf_dsc_controller.identification.problem import problem_of
-from blf_dsc_controller.identification.recording import resampled
 from blf_dsc_controller.identification.regression import fitted
 from blf_dsc_controller.identification.ripple import (
     NOTHING,
@@ -133,31 +130,6 @@ def test_no_ripple_is_claimed_where_there_is_none(preset, seed):
 def test_a_load_that_is_picked_up_does_not_hide_a_ripple():
     found, amplitudes = found_in([[30.0]], events=LOAD, load=10.0)
     check(found, amplitudes, [[30.0]])
-
-
-@cache
-def along_reference(preset, *, slow, ripple):
-    """Return what is found of an arm in its closed loop, for 30 s without a load."""
-    nothing = {f'events.{name}': () for name in ('begin', 'duration', 'payload')}
-    given = {'duration': 30.0, 'actuator.ripple': ripple, **nothing}
-    loop = load_loop(preset, {PLANT: given})
-    controller = loop.controller
-    if slow:
-        rates = list(slow_frequencies(controller))
-        controller = change(controller, {'reference.frequency': rates})
-    run = simulate(controller, loop.plant).run()
-    states = run.stamp[::EVERY], run.position[::EVERY], run.torque[::EVERY]
-    turning = np.zeros(len(run.joints), dtype=bool)
-    recording = resampled(run.joints, *states, '', turning)
-    return found_in_recording(recording, controller.robot)
-
-
-def test_motion_that_repeats_is_told():
-    """An FR3's drives compensate friction, not exactly: that repeats, and passes for ripples."""
-    found = along_reference('fr3', slow=False, ripple=0.0)
-    assert listed_cycles(found)
-    assert all(own.repeats for own in found)
-    assert listed_cycles(along_reference('fr3', slow=True, ripple=0.0)) == ()
 
 
 def test_an_arm_that_hardly_moves_shows_no_ripple():

@@ -24,14 +24,12 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.from_table import read_table
 from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import joined, resampled
 from blf_dsc_controller.identification.stiffness import compliance_of
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
-from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.simulation.loop import simulate_into_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
@@ -83,46 +81,6 @@ def motion():
     return Motion()
 
 
-def holds_the_truth(found, times=1.0):
-    """Whether every interval, so many times as wide, contains the stiffness."""
-    off = np.abs(found.value - 1.0 / STIFFNESS)
-    return bool((off < times * TWO_SIDED * found.deviation).all())
-
-
-@pytest.mark.parametrize('side', ['link', 'motor'])
-def test_stiffness_is_that_of_the_gears_behind_friction_and_rotors(motion, side):
-    torque = getattr(motion, side)
-    noise = 0.5 * torque.std(axis=0)
-    torque = torque + noise * np.random.default_rng(0).normal(size=torque.shape) + 0.2
-    found = motion.compliance(motion.link / STIFFNESS, torque)
-    assert found.is_known.all()
-    assert found.is_twist
-    assert not found.is_computed.any()
-    np.testing.assert_allclose(found.stiffness[0], STIFFNESS, rtol=0.15)
-    # seven intervals of 95 %: 1.7 times as wide, they all hold with 99 %
-    assert holds_the_truth(found, 1.7)
-
-
-@pytest.mark.parametrize('what', ['encoder', 'hysteresis', 'play', 'damping'])
-def test_what_else_moves_the_encoders_does_not_change_the_stiffness(motion, what):
-    twist = motion.link / STIFFNESS
-    size = 0.2 * twist.std(axis=0)
-    twist = (
-        twist
-        + {
-            'encoder': size * np.sin(motion.q + 0.7),  # once per turn
-            'hysteresis': -size * np.sign(motion.rate),  # the spring lags
-            'play': size * np.sign(motion.link),
-            'damping': -2e-3 * motion.rate / STIFFNESS,
-        }[what]
-    )
-    found = motion.compliance(twist)
-    assert found.is_known.all()
-    # 0.2 of the twist are not the spring's
-    np.testing.assert_allclose(found.stiffness[0], STIFFNESS, rtol=0.02)
-    assert holds_the_truth(found, 1.7)
-
-
 # Recordings.
 
 
@@ -144,30 +102,6 @@ def table(path, motion, names, twist=0.001):
     header = ','.join(heads)
     np.savetxt(path, np.hstack(values), header=header, delimiter=',', comments='')
     return path
-
-
-LINKS, MOTORS, TORQUES = ('q_{}', 'q'), ('theta_{}', 'theta'), ('tau_J_{}', 'tau')
-
-
-@pytest.mark.parametrize(
-    ('motors', 'entries'),
-    [
-        ([MOTORS, ('dtheta_{}', 'dtheta')], ()),
-        ([('motor_position_{}', 'theta'), ('theta_dot_{}', 'dtheta')], ()),
-        ([('q_motor_{} [rad]', 'theta')], ()),
-        ([('encoder_{}', 'theta')], ('theta=encoder_*',)),
-    ],
-)
-def test_positions_of_motors_in_tables_are_found(tmp_path, motion, motors, entries):
-    twist = 0.001 * np.arange(600)[:, None] / 600 * np.arange(1, N + 1)
-    path = table(tmp_path / 'a.csv', motion, [*motors, LINKS, TORQUES], twist)
-    recording = read_table(path, PANDA_TEXT, PANDA, NameMap.parse(entries))
-    assert 'positions of motors' in recording.source
-    expected = twist - np.median(twist, axis=0)
-    np.testing.assert_allclose(recording.twist[:590], expected[:590], atol=1e-9)
-    np.testing.assert_allclose(
-        recording.q[:590], motion.q[: 590 * EVERY : EVERY], atol=1e-9
-    )
 
 
 def write_both(path, motion, twist, names=PANDA):
@@ -239,15 +173,6 @@ def test_simulated_arm_with_encoders_on_both_sides_shows_its_gears(tmp_path, cap
         simulate(loop.controller, links).run().torque,
         read_run(tmp_path / 'bag').torque,
     )
-
-
-def test_motors_that_move_as_their_links_show_no_stiffness(motion):
-    """As of a robot without a second encoder, which reports one position twice."""
-    found = motion.compliance(-0.3)  # the zero of the motors
-    assert found.is_twist
-    assert not (found.is_known | found.is_negative | found.is_computed).any()
-    assert np.isinf(found.stiffness).all()
-    assert (found.largest == 0.0).all()
 
 
 # What the command says.

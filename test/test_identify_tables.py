@@ -51,35 +51,6 @@ def is_read(path, *entries):
     np.testing.assert_allclose(recording.torque, TAU[:samples], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ('time', 'q', 'dq', 'tau', 'delimiter'),
-    [
-        ('t', numbered('q_'), numbered('dq_'), numbered('tau_'), ','),
-        ('time [s]', numbered('Joint'), numbered('v'), numbered('effort'), ';'),
-        (
-            'timestamp',
-            [f'position {name} [rad]' for name in PANDA],
-            [f'velocity {name} [rad/s]' for name in PANDA],
-            [f'effort {name} [N m]' for name in PANDA],
-            '\t',
-        ),
-    ],
-)
-def test_columns_are_found_by_their_names(tmp_path, time, q, dq, tau, delimiter):
-    if q[0] == 'Joint1':
-        q = [f'{name}_Pos' for name in q]
-    names = [time, *q, *dq, *tau]
-    columns = [TIME, Q, np.zeros_like(Q), TAU]
-    is_read(write_csv(tmp_path / 'a.csv', names, columns, delimiter))
-
-
-def test_desired_and_external_values_are_not_taken_for_measured_ones(tmp_path):
-    names = ['t', *numbered('q_'), *numbered('q_d_'), *numbered('tau_ext_')]
-    names += numbered('tau_')
-    columns = [TIME, Q, np.ones_like(Q), np.ones_like(Q), TAU]
-    is_read(write_csv(tmp_path / 'a.csv', names, columns))
-
-
 def test_matrices_of_npz_and_structures_of_mat_are_read(tmp_path):
     np.savez(tmp_path / 'a.npz', t=TIME, q=Q, dq=np.zeros_like(Q), tau=TAU.T)
     is_read(tmp_path / 'a.npz')

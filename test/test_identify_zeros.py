@@ -112,12 +112,3 @@ def test_right_joints_are_not_doubted():
     found = identified(states_of(7))
     assert found.other_convention is None
     assert is_usable(found)
-
-
-def test_efforts_in_another_order_are_not_taken_for_other_joints():
-    states = states_of(4)
-    efforts = states[:, TORQUE][:, [0, 3, 2, 1]]
-    other = np.stack((states[:, 0], states[:, 1], efforts), axis=1)
-    found = identified(other)
-    assert found.other_convention is None
-    assert not is_usable(found)

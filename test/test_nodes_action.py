@@ -27,16 +27,13 @@ from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from ros_rig import JOINTS, PATIENCE, START, RosRig, activate, deactivate
-from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
-from test_replay_ros import Recording
 from trajectory_msgs.msg import (
     JointTrajectory,
     JointTrajectoryPoint,
     MultiDOFJointTrajectoryPoint,
 )
 
-import blf_dsc_controller as blf
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes import action_process
 from blf_dsc_controller.supervision.supervisor import Reason
@@ -272,17 +269,6 @@ def test_goal_tolerance_aborts_a_goal_that_has_not_arrived_in_time(loop):
     np.testing.assert_allclose(rests_at(law), NEAR, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    'wrong', [[('joint1', 0.0, -2.0)], [('joint1', np.nan, 0.0)], [('elbow', 1.0, 0.0)]]
-)
-def test_wrong_tolerances_become_the_default_ones(loop, wrong):
-    """As for joint_trajectory_controller; a tight one beside them does not apply either."""
-    client = loop.client
-    tight = [('joint1', 1e-12, 0.0)]
-    handle = client.follow(point(NEAR, 0.5), path=tight, arrival=wrong)
-    assert client.result(handle)[0] == SUCCEEDED
-
-
 def test_cancelled_goal_decelerates_within_the_limits_and_holds(loop):
     arm, law, client = loop
     references = client.ros.listen(topics.REFERENCE)
@@ -482,53 +468,3 @@ def test_process_of_the_action_ends_with_its_node(own_loop, capfd, monkeypatch):
     said = capfd.readouterr().err
     assert 'Traceback' not in said
     assert 'has ended' not in said
-
-
-def test_streams_chunks_stops_and_goals_in_one_bag_replay_bit_for_bit(
-    control_msgs, tmp_path
-):
-    """All of them in motion, each replacing the one before."""
-    run = Recording(tmp_path / 'bag', **BRISK)
-    ros, law = run.ros, run.law
-    inputs = law.status.trajectories
-    client = Client(ros, control_msgs)
-    streamed = ros.publisher(topics.JOINT_POSITIONS)
-    chunks = ros.publisher(topics.JOINT_TRAJECTORY)
-    ros.until(
-        lambda: chunks.get_subscription_count() and streamed.get_subscription_count()
-    )
-
-    def sway(t):
-        return np.add(START, 0.1 * np.sin(2.0 * t))
-
-    def stream():
-        for k in range(20):
-            streamed.publish(Float64MultiArray(data=[*sway(0.02 * k)]))
-            ros.until(lambda count=inputs.targets: inputs.targets > count)
-            run.run(20)
-
-    run.run(50)
-    stream()
-    for k in range(3):
-        times = 0.05 * np.arange(1, 7)
-        points = [point(sway(0.4 + 0.1 * k + t), t) for t in times]
-        chunks.publish(JointTrajectory(joint_names=JOINTS, points=points))
-        ros.until(lambda count=inputs.accepted: inputs.accepted > count)
-        run.run(100)
-    client.follow(point(FAR, 1.0))
-    run.run(200)
-    client.cancel(client.follow(point(NEAR, LONG)))
-    run.run(100)
-    client.follow(point(NEAR, 1.0), point(START, 2.0))
-    run.run(200)
-    stream()
-    by_stop(law, client)
-    run.run(300)
-    assert inputs.rejected == 0, inputs.reason
-    client.close()
-    result = blf.verify(run.end())
-    assert (result.difference, result.remarks) == (None, ())
-    assert result.compared == 1.0
-    assert result.motions == 40 + 3 + 3
-    brakes = [event for event in result.events if event.type == 'brake']
-    assert len(brakes) == 2

@@ -7,7 +7,6 @@ import json
 import sys
 from collections import deque
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from std_msgs.msg import Float64MultiArray
 
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.nodes.controller_log import ControllerLog
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 
@@ -35,7 +33,6 @@ from blf_dsc_controller.nodes.plant_node import PlantNode
 KEPT = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PLAIN = {'disturbance.constant': [0.0, 0.0], 'disturbance.amplitude': [0.0, 0.0]}
 ZERO = (0.0, 0.0)
-WARN = int.from_bytes(Log.WARN, 'little') if isinstance(Log.WARN, bytes) else Log.WARN
 FATAL = (
     int.from_bytes(Log.FATAL, 'little') if isinstance(Log.FATAL, bytes) else Log.FATAL
 )
@@ -100,27 +97,6 @@ def test_each_phase_is_logged_and_after_a_stop_how_to_continue(ros, log):
     ros.until(lambda: logged('deactivated: zero torque'))
 
 
-def test_a_stop_is_logged_once_with_how_to_continue_on_a_real_arm(ros, log):
-    given = {'learning.window': 5.0, 'safety.torque': 'hold_gravity'}
-    node = ros.add(ControllerNode, given, namespace='real')
-    # before the first state
-    ros.until(lambda: log('real', 'learning.window: 5 s', WARN))
-    states = driver(ros, 'real')
-    encoder = JointStateEncoder(JOINTS)
-    states.publish(b'')
-    ros.until(lambda: log('real', 'not started, waiting for a usable joint state: '))
-    for k in (0, 1, 2, 60, 61, 62):
-        states.publish(encoder.encode(10**9 + k * 10**6, START, ZERO, ZERO))
-        ros.until(lambda k=k: node.guard.journal.stamp == 10**9 + k * 10**6)
-        node.report_if_changed(node.guard)
-    node.guard.journal.note('silence', torques=1)
-    node.report_if_changed(node.guard)
-    ros.until(lambda: log('real', '', FATAL))
-    ros.spin(0.2)
-    (stop,) = log('real', '', FATAL)
-    assert stop.endswith('/real/blf_dsc_controller/reset starts again')
-
-
 @pytest.mark.parametrize('others', [0, 1])
 def test_stop_by_the_stamps_of_two_publishers_names_them(ros, log, others):
     """As of an arm, and a simulated one that somebody else has started."""
@@ -146,34 +122,6 @@ def test_stop_by_the_stamps_of_two_publishers_names_them(ros, log, others):
     )
     assert (told in stop) is bool(others)
     assert ('publishers' in stop) is bool(others)
-
-
-def test_findings_of_a_running_law_are_warned_of_once_each():
-    told = []
-    logger = SimpleNamespace(warning=told.append)
-    log = ControllerLog(SimpleNamespace(get_logger=lambda: logger))
-    contacts = SimpleNamespace(count=0, last=None)
-    guard = SimpleNamespace(
-        findings=SimpleNamespace(contacts=contacts, untrusted=''),
-        oscillation=SimpleNamespace(count=0, text='oscillates'),
-    )
-
-    def warned():
-        told.clear()
-        for _ in range(2):
-            log.warn_of_findings(guard)
-        return told
-
-    assert warned() == []
-    contacts.count, contacts.last = 1, SimpleNamespace(text='a contact')
-    assert warned() == ['a contact']
-    guard.oscillation.count = 1
-    assert warned() == ['oscillates']
-    guard.findings.untrusted = 'no sensors'
-    assert warned() == ['no sensors']
-    guard.findings.untrusted = ''
-    contacts.count, contacts.last = 2, SimpleNamespace(text='another contact')
-    assert warned() == ['another contact']
 
 
 def test_leaving_node_commands_the_safe_torque_last(ros):

@@ -148,27 +148,6 @@ def test_lockstep_torques_and_stops_match_the_offline_run_bit_for_bit(ros, name)
     )
 
 
-def test_motors_with_encoders_of_their_own_have_a_topic(ros):
-    plant = ARM | {
-        'duration': 0.1,
-        'truth.rotor_inertia': [0.2, 0.2, 0.2],
-        'joint.stiffness': [1e4, 1e4, 1e4],
-        'sensor.side': 'both',
-        'sensor.resolution': 1e-5,
-    }
-    motors = ros.listen(topics.MOTOR_STATES, raw=True)
-    _, stamps = run_lockstep(ros, plant, ARM)
-    offline = blf.simulate(
-        build(blf.ControllerConfig, ARM), build(blf.PlantConfig, plant)
-    )
-    ros.until(lambda: len(motors) == len(stamps))
-    of_motors, read = states(motors, offline.config.joints)
-    np.testing.assert_array_equal(of_motors, stamps)
-    np.testing.assert_array_equal(read[:, :2], offline.motors)
-    twist = offline.motors[:, 0] - offline.run().position
-    assert (abs(twist).max(axis=0) > 1e-5).all()  # rad
-
-
 @pytest.mark.parametrize(
     ('kind', 'success', 'message'),
     [

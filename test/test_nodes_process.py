@@ -30,7 +30,6 @@ from blf_dsc_controller.configuration.robot import Realtime
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 
@@ -321,14 +320,6 @@ def test_launch_arguments_override_the_parameter_file(launched, start, tmp_path)
     assert {'output': 'run1', 'clock': 'wall'} in launched(bag='run1')[0].parameters
 
 
-def test_loop_shuts_down_with_any_of_its_nodes(launched):
-    nodes = launched(bag='run1')
-    required = {node.executable for node in nodes if getattr(node, 'on_exit', None)}
-    assert required == {'sim_plant', 'blf_dsc_controller', 'bag_recorder'}
-    commands = (ROOT / 'setup.cfg').read_text()
-    assert all(f'\n    {name} = ' in commands for name in NODES)
-
-
 def test_no_end_of_another_node_ends_what_holds_an_arm(launched):
     """The watchdog outlives the controller, and both the recorder, as on a full disk."""
     nodes = {node.executable: node for node in launched(driver='ur5e', bag='run1')}
@@ -377,31 +368,3 @@ def test_section_that_does_not_match_the_node_is_an_error(start, tmp_path):
     # for two arms
     path.write_text(right + right.replace('right', 'left').replace('1', '2'))
     assert start(*argv).config.seed == 2
-
-
-@pytest.mark.parametrize(
-    ('answers', 'levels'),
-    [([True], []), ([False, True], ['info']), ([False, False], ['info', 'warning'])],
-)
-def test_subscribers_that_are_late_are_waited_for_once_more_and_named(
-    answers, levels, monkeypatch
-):
-    """One has everything at once; of the other it is asked `answers`, in turn."""
-    said, asked = [], list(answers)
-    log = SimpleNamespace(
-        info=lambda text: said.append(('info', text)),
-        warning=lambda text: said.append(('warning', text)),
-    )
-    where = 'blf_dsc_controller.nodes.process.get_logger'
-    monkeypatch.setattr(where, lambda _: log)
-    swift, late = (
-        SimpleNamespace(topic_name=f'/{name}', wait_for_all_acked=answer)
-        for name, answer in (
-            ('swift', lambda _: True),
-            ('late', lambda _: asked.pop(0)),
-        )
-    )
-    drain([swift, late])
-    assert asked == []
-    assert [level for level, _ in said] == levels
-    assert all('/late' in text and '/swift' not in text for _, text in said)

@@ -13,7 +13,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
-from ros_rig import JOINTS, PATIENCE, activate, configure
+from ros_rig import JOINTS, PATIENCE
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 import blf_dsc_controller as blf
@@ -189,24 +189,6 @@ def test_rejected_trajectory_changes_nothing(ros, monkeypatch, spoil, watchdog):
     assert inputs(law).rejected == 1
     np.testing.assert_array_equal(law.guard.controller.reference_vector, before)
     ros.run(arm, 20)
-    assert phase(law) is blf.Phase.TRACKING
-
-
-def test_header_stamp_sets_the_start_of_a_trajectory(ros):
-    """Before the start of the loop it is rejected."""
-    arm, law = ros.loop({'autostart': False}, BRISK)
-    sent = trajectory(JOINTS, 0.0, duration=0.1)
-    assert 'not in command: starting' in send(ros, law, sent)
-    assert configure(ros, arm)
-    assert activate(ros, arm)
-    ros.run(arm, 20)
-    begin = law.guard.reference.start_stamp + 3 * SECOND
-    sent = trajectory(JOINTS, 0.0, duration=0.1, stamp=begin)
-    send(ros, law, sent)
-    assert inputs(law).accepted == 1
-    reference_at = law.guard.controller.reference_at
-    np.testing.assert_allclose(reference_at(4.0), two_tones(1.0, 0.0), atol=1e-9)
-    np.testing.assert_allclose(reference_at(2.0)[0], [1.8686, 1.2713], atol=1e-4)
     assert phase(law) is blf.Phase.TRACKING
 
 

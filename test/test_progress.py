@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import subprocess
 import sys
@@ -14,7 +13,6 @@ from test_cli_endings import FILE, PENDULUM
 
 from blf_dsc_controller.compiled.announcement import COMPILING
 from blf_dsc_controller.identification.identify import STAGES
-from blf_dsc_controller.progress import steps
 
 COMMAND = (sys.executable, '-m', 'blf_dsc_controller')
 
@@ -109,17 +107,3 @@ def test_offline_run_and_search_say_how_long_they_take_in_a_pipe(given):
         'start 1 of 2',
         'start 2 of 2',
     ]
-
-
-def test_terminal_has_a_bar_instead_of_a_line_for_each_step(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    terminal = Terminal()
-    monkeypatch.setattr(sys, 'stderr', terminal)
-    assert [*steps('abc', 3, 'letter', 'spelling: a moment')] == ['a', 'b', 'c']
-    first, _, shown = terminal.getvalue().partition('\n')
-    assert first == 'spelling: a moment'
-    assert '0/3' in shown
-    assert '\n' not in shown

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from types import SimpleNamespace
 
 import pytest
 import recorded_run
@@ -29,7 +28,6 @@ from blf_dsc_controller.messages.topics import (
 )
 from blf_dsc_controller.reference.retargeting import Target
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
-from blf_dsc_controller.replay import rerun
 from blf_dsc_controller.replay.verify import verify
 
 # Messages show neither a corrupted state of the law nor the end of a process.
@@ -316,25 +314,6 @@ def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
         assert abs(difference.stamp - event.stamp) <= MILLISECOND
 
 
-def test_text_of_another_version_is_not_compared(tmp_path, monkeypatch):
-    """Its words may be others; those of what came from outside are only repeated."""
-    rig = eventful()
-    rig.publish_events()
-    events = [(entry, decode(entry[3])) for entry in of(rig.entries, JOURNAL)]
-    outside, own = [each for each in events if each[1].type == 'stop']
-    assert outside[1].content['reason'] == 'state timeout'
-    outside[0][3] = altered(text='silence')(outside[1]).encode()
-    assert rig.verify(tmp_path / 'outside').difference is None
-    own[0][3] = altered(text='all is well')(own[1]).encode()
-    monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
-    result = rig.verify(tmp_path / 'own')
-    assert result.difference is None
-    number = own[1].number
-    assert (
-        f'text of event {number} (stop) as this version words it' in result.incomplete
-    )
-
-
 def test_stop_that_the_recorded_controller_did_not_make_is_the_difference(tmp_path):
     """Its journal ends before the stop, but it answered all states that came after."""
     rig = Recorder(DAMPED)
@@ -394,18 +373,6 @@ def test_replay_ends_where_the_recorder_missed_what_it_needs(
     assert result.compared < 1.0
 
 
-def test_replay_that_has_ended_takes_no_further_state(tmp_path):
-    """Nor the one of a stop, which is another sample: a state before it is missing."""
-    rig = Recorder(DAMPED)
-    rig.step(50)
-    rig.base -= 20 * MILLISECOND
-    rig.step(5)
-    of(rig.entries, JOINT_STATES)[40][3] = None
-    result = rig.verify(tmp_path)
-    assert (result.difference, result.samples, result.skipped) == (None, 40, 0)
-    assert 'was used but is not in the bag' in result.remarks[0]
-
-
 @pytest.mark.parametrize('drops', [(), (40,)])
 def test_second_controller_in_a_bag_is_not_replayed(tmp_path, drops):
     """In lock-step the plant sends the state that killed a controller until another answers."""
@@ -439,20 +406,3 @@ def test_event_that_cannot_be_repeated_is_named(tmp_path, kind, content, words):
     entry[3] = event.encode()
     with pytest.raises(BlfDscError, match=rf'event {event.number} .* {words}'):
         rig.verify(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ('kind', 'own'),
-    [
-        ('start', True),
-        ('contact', True),
-        ('oscillation', True),
-        ('torque_sensors', True),
-        ('reset', False),
-        ('tare', False),
-        ('silence', False),
-    ],
-)
-def test_only_what_messages_show_is_decided_by_the_controller_itself(kind, own):
-    event = SimpleNamespace(type=rerun.EventType[kind.upper()], content={})
-    assert rerun.is_own(event) == own

@@ -18,7 +18,7 @@ from recorded_run import MILLISECOND, START, compared, of
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL, speed_text
+from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.errors import BlfDscError
@@ -160,13 +160,6 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
 FLIPPED = COMMANDS.resolved, MONITOR.resolved
 
 
-def test_message_with_another_stamp_is_a_difference(entries, tmp_path):
-    (bound,) = of(entries, BOUND)
-    bound[3] = bound[3][:4] + bytes([bound[3][4] ^ 1]) + bound[3][5:]
-    difference = verify(recorded_run.write(tmp_path / 'bag', entries)).difference
-    assert (difference.topic, difference.replayed) == (BOUND.resolved, np.inf)
-
-
 def test_repeated_and_unused_states_are_skipped(entries, tmp_path):
     states = of(entries, JOINT_STATES)
     at = START + 300 * MILLISECOND + 5
@@ -254,15 +247,6 @@ def test_recording_that_was_cut_is_incomplete(entries, tmp_path, capsys):
     assert 'has no release' in text
 
 
-def test_nan_is_not_equal_to_a_number(entries, tmp_path):
-    entry = of(entries, TRACKING_ERROR)[40]
-    entry[3] = entry[3][:-8] + np.float64(np.nan).tobytes()
-    difference = verify(recorded_run.write(tmp_path / 'bag', entries)).difference
-    assert difference.stamp == START + 40 * MILLISECOND
-    assert np.isnan(difference.recorded)
-    assert np.isfinite(difference.replayed)
-
-
 @pytest.mark.parametrize(
     ('keep', 'words'),
     [
@@ -298,24 +282,6 @@ def configured(entries, change):
     first[3] = event.encode()
 
 
-def test_what_limits_a_result_is_remarked(bag, entries, tmp_path, monkeypatch):
-    """Another version or law, and messages that the recorder missed."""
-
-    def change(content):
-        del content['parameters']['learning.residual_floor']
-
-    configured(entries, change)
-    of(entries, MONITOR)[7][3] = None
-    path = recorded_run.write(tmp_path / 'bag', entries, publishers=1)
-    missed, newer = verify(path).remarks
-    assert missed == f'the recorder missed messages of {MONITOR.resolved}: 1 missed'
-    assert 'before the law had learning.residual_floor' in newer
-
-    monkeypatch.setattr('blf_dsc_controller.replay.verify.__version__', '9.9.9')
-    (remark,) = verify(bag).remarks
-    assert 'recorded by version 0.1.0 and replayed by 9.9.9' in remark
-
-
 def test_journal_of_a_later_format_is_refused(entries, tmp_path):
     def change(content):
         content.update(format=FORMAT + 1, version='9.0.0')
@@ -343,20 +309,6 @@ def test_identical_replay_exits_with_zero_and_a_verdict_on_an_older_processor(ba
     assert run.returncode == 0, run.stderr
     assert '/blf_dsc_controller/commands: 2004 values bit-equal' in run.stdout
     assert 'x real time' in run.stdout
-
-
-@pytest.mark.parametrize(
-    ('times', 'said'),
-    [
-        (0.034, '0.034x real time'),
-        (0.42, '0.42x real time'),
-        (1.26, '1.3x real time'),
-        (9.7, '10x real time'),
-        (123.4, '123x real time'),
-    ],
-)
-def test_speed_of_a_slow_computer_is_not_rounded_to_zero(times, said):
-    assert speed_text(times) == said
 
 
 def test_bag_replays_without_its_urdf_file_and_is_read_with_unknown_parameters(

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import ast
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 
 from benchmark.__main__ import listing, main, parser_of
 from benchmark.studies import load_study
-from benchmark.tables import BENCH, TABLES, module_of
+from benchmark.tables import TABLES, module_of
 
 ROOT = Path(__file__).resolve().parents[1]
 NO_TABLES = {'__main__', 'null_node'}  # programs of their own
@@ -77,15 +76,3 @@ def test_error_of_a_table_is_one_line_and_an_exit_code(tmp_path):
         f'benchmark paper: {tmp_path} exists already and is not overwritten: '
         'choose another --out\n'
     )
-
-
-@pytest.mark.parametrize(('name', 'threads'), [('tuning', '1'), (BENCH, None)])
-def test_only_peers_have_the_threads_of_this_computer(monkeypatch, name, threads):
-    monkeypatch.setattr('importlib.import_module', lambda _: sys.modules[__name__])
-    monkeypatch.setattr(sys.modules[__name__], 'main', lambda _: None)
-    for variable in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-        monkeypatch.setenv(variable, 'restored afterwards')
-        monkeypatch.delenv(variable)
-    run = sys.modules['benchmark.__main__'].main
-    assert run([name]) == 0
-    assert os.environ.get('OPENBLAS_NUM_THREADS') == threads

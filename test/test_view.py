@@ -16,7 +16,6 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from random_arm import random_urdf
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('yourdfpy', reason='needs viser: pip install .[view]')
@@ -30,12 +29,10 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.view.node import ViewNode
 from blf_dsc_controller.view.page import Page
-from blf_dsc_controller.view.shown_arm import ShownArm
 from blf_dsc_controller.view.snapshot import Snapshot
 
 HOST = '127.0.0.1'
@@ -54,12 +51,6 @@ def moving(seconds, error=0.001):
     return [each._replace(load=LOAD) if each.time > 1.0 else each for each in first]
 
 
-def tip_of(q):
-    """The tip of two links of 1 m."""
-    angles = np.cumsum(q)
-    return np.array([np.cos(angles).sum(), 0.0, np.sin(angles).sum()])
-
-
 @pytest.fixture(scope='module')
 def page():
     page = Page(HOST, PORT)
@@ -71,22 +62,6 @@ def page():
 def node(page, name):
     """Return what is drawn in the 3D scene under this name."""
     return page.server.scene._handle_from_node_name[name]
-
-
-def test_arm_ghost_and_path_are_drawn(page):
-    past = moving(2.0)
-    page.move(past)
-    for root in ('/arm', '/reference'):
-        names = page.server.scene._handle_from_node_name
-        assert sum(name.startswith(root) for name in names) > 5
-    assert node(page, '/path').points.shape == (len(past) - 1, 2, 3)
-    tip = tip_of(past[-1].position)
-    np.testing.assert_allclose(node(page, '/payload').position, tip, atol=1e-6)
-    assert not node(page, '/payload').visible
-    assert not page.ghost.show_visual  # the error is too small to be seen
-    page.move([*past, past[-1]._replace(error=np.array([0.02, 0.0]), loaded=True)])
-    assert page.ghost.show_visual
-    assert node(page, '/payload').visible
 
 
 def test_plots_show_the_share_of_the_bound_and_a_caption_what_is_held(page):
@@ -103,60 +78,6 @@ def test_plots_show_the_share_of_the_bound_and_a_caption_what_is_held(page):
     model, weight = (plot.data for plot in page.plots[2:])
     assert (model[1][-1], model[2][-1]) == pytest.approx((10.0, 30.0))  # %
     assert [line[-1] for line in weight[1:4]] == pytest.approx([2.0, 1.95, 2.05])  # kg
-
-
-def test_events_are_lines_in_the_plots_and_named_at_the_arm(page):
-    past = moving(2.0)
-    page.events([(1.0, 'plant', '2 kg picked up')])
-    page.move(past)
-    page.plot(past)
-    for plot in page.plots:
-        (at,) = np.flatnonzero(plot.data[-1] == 1.0)
-        assert plot.data[0][at - 1 : at + 2] == pytest.approx([1.0, 1.0, 1.0])
-        assert np.all(np.diff(plot.data[0]) >= 0.0)
-        assert np.isfinite(plot.data).all()
-    assert node(page, '/event').text == 'plant: 2 kg picked up'
-    assert '2 kg picked up' in page.event_list.content
-    page.events([(1.5, 'release', '')])
-    page.move(past)
-    assert node(page, '/event').text == 'release'
-
-
-def test_run_that_has_ended_is_replayed_by_a_slider(page):
-    run = moving(30.0)
-    page.offer_replay(run)
-    slider = page.slider
-    assert (slider.min, slider.max) == (run[0].time, run[-1].time)
-    slider.value = 10.01
-    assert 't = 10.00 s' in page.caption.content
-    assert page.plots[0].data[0][[0, -1]] == pytest.approx([0.0, 10.0])
-    np.testing.assert_allclose(
-        node(page, '/path').points[-1, 1], tip_of(run[300].position), atol=1e-6
-    )
-    slider.value = 25.0
-    assert page.plots[0].data[0][0] == pytest.approx(5.0, abs=0.1)
-    page.offer_replay([])
-    assert page.slider is None
-
-
-def test_links_without_shapes_become_cylinders_from_joint_to_joint():
-    seed = 0
-    text = random_urdf(4, seed)[0]
-    chain = read_chain(text, '', 'tip', ('j1', 'j2', 'j3', 'j4'))
-    model = ShownArm(text, chain).model()
-    cylinders = 0
-    for joint in model.robot.joints:
-        end = model.get_transform(joint.child, joint.parent)[:3, 3]
-        drawn = model.scene.geometry.get(f'{joint.name} {joint.parent}')
-        if drawn is not None:
-            assert drawn.centroid == pytest.approx(end / 2, abs=1e-9)
-            cylinders += 1
-    assert cylinders > 4
-    q = np.random.default_rng(seed).uniform(-1.0, 1.0, 4)
-    model.update_cfg(dict(zip(('j1', 'j2', 'j3', 'j4'), q, strict=True)))
-    for number, frame in enumerate(frames(chain, q)[1:-1], 1):
-        placed = model.get_transform(f'l{number}', 'base')
-        assert placed == pytest.approx(frame, abs=1e-9)
 
 
 def test_port_in_use_is_skipped(page):

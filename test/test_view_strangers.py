@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import socket
 import zipfile
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +27,6 @@ from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.view.node import ViewNode
-from blf_dsc_controller.view.page import Page
 from blf_dsc_controller.view.shown_arm import ShownArm
 
 JOINTS = ['joint1', 'joint2']
@@ -206,18 +204,6 @@ def test_bound_from_before_the_view_was_started_is_shown(watched):
     late.close()
 
 
-def test_comment_that_another_encoding_makes_a_document_type_stays_one():
-    """Its entities can name files, and expand to gigabytes."""
-    plain = urdf(JOINTS, (1.0, 1.0), (1.0, 1.0))
-    comment = (
-        "<!-- +AC0ALQA+-+ADwAIQ-DOCTYPE robot [+ADwAIQ-ENTITY x 'y'>]>+ADwAIQAtAC0- -->"
-    )
-    odd = plain.replace('<robot name="', f'{comment}<robot name="+ACY-x;', 1)
-    text = f'<?xml version="1.0" encoding="UTF-7"?>{odd}'
-    model = ShownArm(text, read_chain(text, '', 'tip', tuple(JOINTS))).model()
-    assert model.robot.name.startswith('+ACY-x;')
-
-
 @pytest.mark.parametrize('name', ['arm.stl', 'arm.zip', 'arm.stl/inside'])
 def test_only_meshes_are_drawn_as_meshes(name, tmp_path):
     """A journal may name any file of this computer."""
@@ -275,10 +261,3 @@ def test_visitor_gets_no_public_link(watched, port, monkeypatch):
     with visitor(port, {'type': 'ShareUrlRequest'}):
         sender.ros.spin(1.0)  # a thread of viser's would ask, some time
     assert asked == []
-
-
-def test_release_of_viser_whose_requests_cannot_be_checked_serves_no_page(monkeypatch):
-    elsewhere = SimpleNamespace(serve=None)
-    monkeypatch.setattr('blf_dsc_controller.view.server.websockets', elsewhere)
-    with pytest.raises(blf.BlfDscError, match=r'viser .* install viser 1\.1'):
-        Page('127.0.0.1', 18400)

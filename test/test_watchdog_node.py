@@ -274,19 +274,6 @@ def test_watchdog_acts_by_the_parameters_in_force(ros, given, changed, restarted
     assert loop.watchdog is watchdog  # and knows what it has observed
 
 
-def test_watchdog_acts_by_what_the_drives_of_a_restarted_controller_compensate(ros):
-    """Without that an FR3 would get its gravity twice: 12 N m on joint 2."""
-    right = blf.load_loop(FR3).controller
-    wrong = blf.change(right, {'robot.drive_compensates': 'none'})
-    loop = ByHand(ros, wrong)
-    assert np.abs(loop.holding).max() > 10.0
-    loop.holding[:] = 0.0  # as the drives do it
-    loop.go_on(0.005, commands=True)
-    loop.restart(right)
-    loop.go_on(0.005, commands=True)
-    np.testing.assert_allclose(loop.torque(), 0.0, atol=0.1)
-
-
 def test_watchdog_reports_the_joint_that_swings_under_its_torque(ros):
     log = ros.listen(topics.Topic('', '/rosout', 'rcl_interfaces/msg/Log', *LOG))
     loop = ByHand(ros, build(blf.ControllerConfig, HOLDING))
