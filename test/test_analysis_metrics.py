@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from recorded_run import BOUND_RAD, LATCH_S, LIMIT_NM, PARAMETERS, TRUE, Synthet
 
 from blf_dsc_controller import Run, measure, read_run, simulate
 from blf_dsc_controller.analysis.metrics_table import format_table
-from blf_dsc_controller.analysis.output import plain, write_json
+from blf_dsc_controller.analysis.output import plain
 from blf_dsc_controller.messages.topics import LAMBDA_MIN, LATCHED, LATE_STEPS
 from blf_dsc_controller.run import LearnedArm, Series
 from blf_dsc_controller.simulation.loop import write_bag
@@ -124,39 +123,6 @@ def test_timing(run):
     assert measure(slow).timing['rate'] == pytest.approx(500.0)
 
 
-def test_unknown_values_are_null_and_never_nan(run, tmp_path):
-    optional = (
-        'reference',
-        'error',
-        'bound',
-        'torque_limit',
-        'monitor',
-        'truth',
-        'timing',
-    )
-    unknown = dict.fromkeys(optional) | {'torque': np.full_like(run.torque, np.nan)}
-    metrics = measure(replace(run, **unknown))
-    write_json(metrics, tmp_path / 'summary.json')
-    written = json.loads((tmp_path / 'summary.json').read_text())
-    assert written == plain(metrics)
-    known = {
-        name for name, value in written.items() if value not in (None, [None, None])
-    }
-    assert known == {
-        *(
-            'duration',
-            'samples',
-            'joints',
-            'sliding',
-            'violating_joint',
-            'stops',
-            'learns',
-            'model_changes',
-        ),
-        *('rejected_columns', 'loads', 'parameter_error'),
-    }
-
-
 def test_table_shows_the_metrics_and_what_is_unusual(run):
     bound = run.bound.copy()
     late = run.timing.values.copy()
@@ -179,6 +145,9 @@ def test_table_shows_the_metrics_and_what_is_unusual(run):
     ):
         assert text in usual
     assert max(map(len, usual.splitlines())) <= 120
+    changed = format_table(replace(measure(run), model_changes=(3.0,)))
+    assert 'arm         changed at 3.000 s: learning restarted' in changed
+    assert 'changed at' not in usual
     for changes, line in (
         ({'bound': bound}, '\nat widest   elbow 12.3 mrad\n'),
         ({'timing': timing}, '200 late steps: the computer was too busy for real time'),
@@ -213,6 +182,20 @@ def test_learning_begins_only_in_a_law_that_learns_in_simulation_and_its_bag(
     assert is_latched == ('law' not in changes)
     assert f'learning    {line}' in format_table(recorded)
     assert np.isnan(recorded.latch_time) == bool(changes)
+
+
+@pytest.mark.parametrize(
+    ('ratio', 'ending'),
+    [
+        (0.97, ', by the error of the stop; the table ends with the sample before'),
+        (1.2, ''),
+    ],
+)
+def test_bound_that_is_left_inside_the_table_is_explained(run, ratio, ending):
+    """No message has the sample that causes a stop."""
+    left = {'first_violation': 1.5, 'violating_joint': 'elbow', 'held': False}
+    table = format_table(replace(measure(run), **left, max_error_ratio=ratio))
+    assert f'bound       VIOLATED, first by elbow at 1.500 s{ending}\n' in table
 
 
 PERIOD = 10_000_000  # ns

@@ -17,14 +17,8 @@ from matplotlib.colors import to_hex, to_rgb
 from recorded_run import JOINTS, MILLISECOND, START, Synthetic
 
 from blf_dsc_controller import draw, measure, read_run
-from blf_dsc_controller.analysis import figures
 from blf_dsc_controller.analysis.metrics_table import format_table
-from blf_dsc_controller.analysis.panels import (
-    ALARM,
-    COLOURS,
-    panels,
-)
-from blf_dsc_controller.analysis.report import plots, read_bag, write_report
+from blf_dsc_controller.analysis.report import read_bag, write_report
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
@@ -85,7 +79,7 @@ def test_draw_writes_both_figures_and_leaves_no_trace(drawn):
     assert amount(tracking, '#DCE9F5') > 100_000
     assert amount(tracking, '#0072B2') > 1000
     assert amount(tracking, '#D55E00') > 1000
-    for colour in COLOURS[:2]:
+    for colour in ('#0072B2', '#D55E00'):
         assert amount(parameters, lightened(colour, 0.6)) > 500
 
 
@@ -109,14 +103,21 @@ def folder(tmp_path_factory):
     return path
 
 
-def by_title(bags):
-    return {
-        plot['title']: plot for plot in plots(panels([bag.run for bag in bags]), bags)
-    }
+@pytest.fixture
+def by_title(tmp_path):
+    """Return a function from bags to the panels of their page, by title."""
+
+    def read(*bags):
+        write_report(bags, tmp_path / 'page.html')
+        text = (tmp_path / 'page.html').read_text()
+        data = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]
+        return {panel['title']: panel for panel in json.loads(data)['panels']}
+
+    return read
 
 
-def test_every_quantity_has_a_panel(folder, run, tmp_path, monkeypatch):
-    titles = set(by_title([read_bag(folder / 'synthetic')]))
+def test_every_quantity_has_a_panel(folder, by_title):
+    titles = set(by_title(read_bag(folder / 'synthetic')))
     expected = {
         f'{quantity} of {joint}'
         for quantity in ('error', '|error|', 'position', 'torque')
@@ -125,16 +126,10 @@ def test_every_quantity_has_a_panel(folder, run, tmp_path, monkeypatch):
     expected |= {'(m1+m2)*l1^2', 'm2*l2^2', 'm2*l1*l2', 'relative parameter error'}
     expected |= {'minimum eigenvalue of Φ', 'disturbance estimates'}
     assert titles == expected
-    drawn = []  # in the pictures, each once
-    monkeypatch.setattr(
-        figures, 'draw_panels', lambda _p, _t, shown, *_, **__: drawn.extend(shown)
-    )
-    draw(run, tmp_path)
-    assert sorted(panel.title for panel in drawn) == sorted(expected)
 
 
-def test_peak_of_one_sample_survives_thinning(folder):
-    panel = by_title([read_bag(folder / 'synthetic')])['error of shoulder']
+def test_peak_of_one_sample_survives_thinning(folder, by_title):
+    panel = by_title(read_bag(folder / 'synthetic'))['error of shoulder']
     error, bound, _ = panel['traces']
     k = int(np.argmin(error['y']))
     assert (error['x'][k], error['y'][k]) == (1.234, -5.0)
@@ -155,10 +150,10 @@ def test_events_list_violation_latch_saturation_and_plant_change(folder):
 
 
 def test_several_bags_are_overlaid_and_their_parameter_differences_listed(
-    folder, tmp_path
+    folder, by_title, tmp_path
 ):
     bags = [read_bag(folder / 'one'), read_bag(folder / 'other')]
-    panel = by_title(bags)['error of joint1']
+    panel = by_title(*bags)['error of joint1']
     names = [trace['name'] for trace in panel['traces']]
     one, other = (bag.name for bag in bags)
     assert names == [
@@ -169,8 +164,8 @@ def test_several_bags_are_overlaid_and_their_parameter_differences_listed(
     assert (one, other) == (f'{folder.name}/one', f'{folder.name}/other')
     # what they share, once
     assert shown == [f'{one}: error', f'{one}: bound', f'{other}: error']
-    write_report(bags, tmp_path / 'page.html')
     text = (tmp_path / 'page.html').read_text()
+    assert text.count('Every joint stayed inside its bound.') == 2
     assert '<p>1 parameters differ.</p>' in text
     row = 'two_link.feedback_gain</td><td>[60.0, 20.0]</td><td>[30.0, 10.0]</td>'
     assert f'blf_dsc_controller: {row}' in text
@@ -200,7 +195,9 @@ def test_joint_states_alone_suffice_for_a_page(tmp_path, capsys):
         main(['report', str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')])
         == 0
     )
-    assert 'not recorded in the bag' in (tmp_path / 'page.html').read_text()
+    text = (tmp_path / 'page.html').read_text()
+    assert 'not recorded in the bag' in text
+    assert 'The bag has no bounds, or no errors, to compare.' in text
     assert (
         main(
             ['report', str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'none.html')]
@@ -286,28 +283,22 @@ def test_stop_outside_the_bound_is_a_violation_at_the_stamp_of_the_last_state(
     assert f"stopped     at 2.345 s, {reason}: joint 'elbow' is +0.0023 rad" in table
 
 
-def test_figures_and_page_show_the_stop(tmp_path):
+def test_figures_and_page_show_the_stop(tmp_path, by_title):
     path = stopped(tmp_path)
-    run = read_run(path)
-    shown = [
-        panel
-        for panel in panels([run])
-        if panel.group in ('Motion', 'Tracking', 'Torque')
-    ]
-    assert len(shown) == 8
-    for panel in shown:
-        assert [(mark.text, mark.colour) for mark in panel.marks] == [
-            ('stop: error past the bound', ALARM)
-        ]
-        assert panel.marks[0].time == pytest.approx(STOP_S)
-        assert panel.marks[0].until == run.duration
+    run, bag = read_run(path), read_bag(path)
+    shown = by_title(bag).values()
+    page = (tmp_path / 'page.html').read_text()
+    assert f'elbow left its bound at {STOP_S} s.' in page
+    marked = [p for p in shown if p['group'] in ('Motion', 'Tracking', 'Torque')]
+    assert len(marked) == 8
+    for panel in marked:
+        ((time, text, colour, until),) = panel['marks']
+        assert (time, until) == pytest.approx((STOP_S, run.duration))
+        assert text == 'stop: error past the bound'
     draw(run, tmp_path)
     figure = pixels(tmp_path / 'tracking.png')
-    assert amount(figure, ALARM) > 100
-    assert amount(figure, lightened(ALARM, 0.1)) > 50_000  # shaded after the stop
-    bag = read_bag(path)
-    ((time, text),) = (
-        (time, text) for time, kind, text in bag.events if kind == 'stop'
-    )
+    assert amount(figure, colour) > 100
+    assert amount(figure, lightened(colour, 0.1)) > 50_000  # shaded after the stop
+    ((time, text),) = ((at, what) for at, kind, what in bag.events if kind == 'stop')
     assert time == pytest.approx(STOP_S)
     assert text.startswith("error past the bound: joint 'elbow'")

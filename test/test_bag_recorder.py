@@ -24,7 +24,7 @@ from command import PATIENCE, PATIENT, closed_loop
 from mcap.reader import make_reader
 from nav_msgs.msg import Goals
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from recorded_run import messages_on_disk, read, small_disk
+from recorded_run import messages_on_disk, read
 from ros_rig import RosRig
 from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
@@ -41,13 +41,14 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 
 # s
-KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (3, 1000, 1)
+KILLS, MOST, DURATION = (20, 10_000, 60) if os.environ.get('NIGHTLY') else (1, 1000, 1)
 RECORDER = (
     sys.executable,
     '-m',
     'blf_dsc_controller.nodes.recorder_node',
     '--ros-args',
 )
+REALTIME = 'import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))'
 ODD_PARTICIPANT = Path(__file__).with_name('odd_participant.py')
 ENCODER = JointStateEncoder(['joint1', 'joint2'])
 # Kept for the recorder, which may match slightly later than the publisher.
@@ -266,12 +267,11 @@ def rig():
     ros.close()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_all_is_on_disk_while_it_runs_and_a_signal_completes_the_bag(rig, bag, number):
+def test_all_is_on_disk_while_it_runs_and_ctrl_c_completes_the_bag(rig, bag):
     process = rig.record(bag)
     rig.publish(*range(2000))  # then no message follows to flush it
     rig.until(lambda: messages_on_disk(bag / 'bag_0.mcap') == 10_000)
-    code, output = rig.end(process, number)
+    code, output = rig.end(process)
     assert code == 0, output
     assert Counter(topic for topic, *_ in read(bag)) == {
         f'/{topic}': 2000 for topic in TOPICS
@@ -291,19 +291,6 @@ def test_signal_before_any_message_leaves_an_empty_bag_that_is_not_overwritten(
         )
         assert (returned, words in output) == (code, True), output
         assert read(bag) == []
-
-
-def test_full_disk_stops_the_recorder_with_one_error(rig, tmp_path):
-    with small_disk(tmp_path / 'disk', 2) as disk:
-        process = rig.record(disk / 'bag', 'a')
-        deadline = time.monotonic() + PATIENCE
-        while process.poll() is None:
-            assert time.monotonic() < deadline, 'still recording'
-            rig.publish(*range(100))
-        code, output = rig.output(process)
-        hint = f'No space left on device; blf_dsc recover {disk / "bag"}'
-        assert (code, output.count(hint), output.count('No space left')) == (1, 1, 1)
-        assert recover(disk / 'bag', tmp_path / 'clean').messages['/a'] > 1000
 
 
 def test_unknown_message_packages_are_not_imported_and_do_not_stop_the_recorder(
@@ -402,6 +389,10 @@ def test_real_time_loop_is_timed_and_every_message_of_it_is_in_the_bag(tmp_path)
     # again.
     log = (out / 'logs' / f'{PLANT}.log').read_text()
     again = log.count('sending the state again')
+    # what the system refuses is named, with who can grant it
+    asked = [sys.executable, '-c', REALTIME]
+    granted = subprocess.run(asked, capture_output=True, check=False).returncode == 0
+    assert ('rtprio' in log) is not granted
     assert len(numbers[topics.JOINT_STATES.resolved]) == 1000 * DURATION + 1 + again
     assert len(numbers[topics.TIMING.resolved]) == 1000 * DURATION  # one for each step
     # Nor were the last ones lost, which no later sequence number would reveal.

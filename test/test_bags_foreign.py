@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import recorded_run
 from mcap.opcode import Opcode
+from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from recorded_run import Synthetic, raw_records
 from rosbags.rosbag1 import Writer as Writer1
@@ -269,14 +270,18 @@ def all_say(run):
     return check
 
 
-def write_mcap(folder, entries, schema):
+def defined(type_name):
+    return 'ros2msg', definition(type_name)[0].encode()
+
+
+def write_mcap(folder, entries, schema=defined, compression='zstd'):
     """Write one MCAP file.
 
     `schema` returns encoding and text of a type, or None for no schema.
     """
     folder.mkdir()
     with (folder / 'bag_0.mcap').open('wb') as stream:
-        writer = McapWriter(stream)
+        writer = McapWriter(stream, compression=CompressionType[compression.upper()])
         writer.start('ros2', 'another')
         channels = {}
         for topic, type_name, at, raw in entries:
@@ -353,9 +358,7 @@ def test_missing_definition_of_another_topic_loses_no_other_message(
     file = write_mcap(
         tmp_path / 'bag',
         [ODD, *entries],
-        lambda name: (
-            schema if name == ODD[1] else ('ros2msg', definition(name)[0].encode())
-        ),
+        lambda name: schema if name == ODD[1] else defined(name),
     )
     for command in ('replay', 'report', 'export'):
         assert run(command, file)[0] == 0
@@ -420,6 +423,25 @@ def test_chunk_that_declares_too_large_a_size_is_not_unpacked(copy, all_say, dec
     size = chunk + 9 + 16  # after its times
     file.write_bytes(data[:size] + declared.to_bytes(8, 'little') + data[size + 8 :])
     all_say(file, f'a chunk would unpack to {declared} bytes')
+
+
+@pytest.mark.parametrize('compression', ['zstd', 'lz4'])
+def test_compressed_chunk_that_is_cut_off_is_an_error_and_a_loss(
+    entries, tmp_path, all_say, run, compression
+):
+    """What is left of it unpacks to its beginning; nothing else shows that it is not whole."""
+    file = write_mcap(tmp_path / 'bag', entries, compression=compression)
+    data = file.read_bytes()
+    at, raw = next(each for each in raw_records(data) if each[1][0] == Opcode.CHUNK)
+    head = 9 + 24 + 4 + 4 + len(compression)  # its times, sizes and name
+    packed = raw[head + 8 : -8]
+    body = raw[9:33] + bytes(4) + raw[37:head]  # without a checksum
+    body += len(packed).to_bytes(8, 'little') + packed
+    cut = raw[:1] + len(body).to_bytes(8, 'little') + body
+    file.write_bytes(data[:at] + cut + data[at + len(raw) :])
+    all_say(file, 'cut off')
+    _, output, _ = run('recover', file, '--out', 'clean')
+    assert 'LOST' in output
 
 
 @pytest.mark.parametrize('inside', [False, True])

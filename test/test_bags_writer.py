@@ -8,7 +8,6 @@ untouched.
 from __future__ import annotations
 
 import re
-import tracemalloc
 from threading import Event
 
 import pytest
@@ -20,11 +19,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from recorded_run import MILLISECOND, messages_on_disk, raw_records, read
 from rosbags.rosbag2 import (
-    CompressionFormat,
-    CompressionMode,
     Reader,
-    StoragePlugin,
-    Writer,
 )
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -38,10 +33,7 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
-    UnknownTypeError,
-    typestore,
 )
-from blf_dsc_controller.messages.strings import encode_string
 from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATES, STREAM, Quality
 
 START = 1_734_000_000_000_000_000
@@ -183,21 +175,6 @@ def test_metadata_matches_rosbag2(tmp_path):
             assert yaml.safe_load(channel.metadata['offered_qos_profiles']) == [quality]
 
 
-def test_empty_bag_is_valid_and_an_existing_folder_is_left_alone(tmp_path):
-    with (
-        BagWriter(tmp_path / 'bag') as bag,
-        pytest.raises(UnknownTypeError, match='nowhere_msgs'),
-    ):
-        bag.add_topic('/nothing', 'nowhere_msgs/msg/Nothing', [])
-    assert read(tmp_path / 'bag') == []
-    before = information(tmp_path / 'bag')
-    # rosbag2 reads it as unsigned
-    assert before['files'][0]['duration'] == {'nanoseconds': 0}
-    with pytest.raises(BagError, match=r'bag exists already.*choose another folder'):
-        BagWriter(tmp_path / 'bag')
-    assert information(tmp_path / 'bag') == before
-
-
 @pytest.mark.parametrize('compression', ['none', 'zstd'])
 def test_data_is_flushed_periodically(tmp_path, compression, monkeypatch):
     """What another process sees on the disk survives a kill of this one."""
@@ -218,22 +195,13 @@ def test_data_is_flushed_periodically(tmp_path, compression, monkeypatch):
     assert read(path) == complete
 
 
-def test_memory_of_a_recorder_is_bounded_and_its_files_are_read_as_one(
-    tmp_path, monkeypatch
-):
+def test_long_recording_is_in_several_files_that_are_read_as_one(tmp_path, monkeypatch):
     """Every chunk has an entry in the index, which is in memory until its file ends."""
     monkeypatch.setattr(writer, '_MOST_CHUNKS', 1_000)  # 10_000 for users
     with BagWriter(tmp_path / 'bag', flush_interval=0.0) as bag:
         handle = bag.add_topic('/a', JOINT_STATES.type, [STREAM])
-        peaks = []
-        tracemalloc.start()
         for k in range(4_000):
             bag.write(handle, message(k), k)
-            if k % 1_000 == 999:
-                peaks.append(tracemalloc.get_traced_memory()[1])
-                tracemalloc.reset_peak()
-        tracemalloc.stop()
-    assert max(peaks) < 1.1 * peaks[1]
     found = information(tmp_path / 'bag')
     assert (found['starting_time'], found['duration']) == (
         {'nanoseconds_since_epoch': 0},
@@ -384,27 +352,6 @@ def test_damaged_missing_or_doubled_chunk_is_reported(
     )
 
 
-def test_recording_that_was_not_closed_is_reported_and_keeps_its_topics(
-    whole, tmp_path, capsys
-):
-    content = whole.read_bytes()
-    folder = damaged(tmp_path / 'bag', content[: chunks(content)[-1][0]])
-    assert main(['recover', str(folder)]) == 0
-    output = capsys.readouterr().out
-    clean = tmp_path / 'bag_recovered'
-    assert (
-        'bag_0.mcap: the recording was not closed; it ends at 1734000000.024000 s'
-        in output
-    )
-    assert f'wrote {clean}' in output
-    with open_bag(clean) as opened:
-        assert list(opened.messages(())) == []
-    with Reader(clean) as reader, Reader(whole.parent) as before:
-        for found, original in zip(reader.connections, before.connections, strict=True):
-            assert (found.topic, found.digest) == (original.topic, original.digest)
-            assert found.ext.offered_qos_profiles == original.ext.offered_qos_profiles
-
-
 def test_compressed_messages_that_cannot_be_unpacked_are_losses(tmp_path, capsys):
     """A recorder may compress each message by itself; some are cut off here.
 
@@ -423,19 +370,6 @@ def test_compressed_messages_that_cannot_be_unpacked_are_losses(tmp_path, capsys
     assert output.splitlines()[:-1] == ['a: 2 messages', 'b: 0 messages', loss]
     with open_bag(out) as opened:
         assert [each.raw for each in opened.messages({'a'})] == 2 * [message(0)]
-
-
-@pytest.mark.parametrize('mode', [CompressionMode.NONE, CompressionMode.MESSAGE])
-def test_bag_from_rosbags_writer_is_recovered(tmp_path, mode):
-    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connection = writer.add_connection('/x', COMMANDS.type, typestore=typestore())
-        for k in range(100):
-            writer.write(connection, START + k, Float64MultiArrayEncoder(1).encode([k]))
-    (file,) = (tmp_path / 'bag').glob('*.mcap')
-    messages, _ = recovered(tmp_path / 'cut', file.read_bytes()[:-1])
-    assert messages == read(tmp_path / 'bag')
 
 
 class Stuck:
@@ -476,9 +410,9 @@ def test_bag_is_the_same_whichever_thread_writes_it(tmp_path, in_background):
     with BagWriter(
         tmp_path / 'bag', flush_interval=0.0, in_background=in_background
     ) as bag:
-        handle = bag.add_topic('/x', 'std_msgs/msg/String', [Quality(1)])
+        handle = bag.add_topic('/x', COMMANDS.type, [Quality(1)])
         for stamp in stamps:
-            bag.write(handle, encode_string(f'{stamp}'), stamp)
+            bag.write(handle, TORQUES.encode([stamp, 0]), stamp)
     with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
         found = [message.log_time for *_, message in make_reader(file).iter_messages()]
     assert found == list(stamps)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from benchmark.__main__ import main
-from blf_dsc_controller.errors import BlfDscError
 
 pytestmark = pytest.mark.nightly
 
@@ -81,16 +80,3 @@ def test_node_compared_with_null_node(monkeypatch):
         for what in ('median latency', 'CPU', 'first torque')
         for name in (nodes._QUIET, nodes._RECORDED)
     ]
-
-
-def test_dead_or_silent_contestant_aborts_the_measurement(monkeypatch):
-    nodes = tiny(monkeypatch, 'nodes', _STEPS=2, _WARM_UP=1, _NULL_NODE='not_there')
-    with pytest.raises(
-        BlfDscError, match=r'not_there exited with code 1:[^!]*No module'
-    ):
-        list(nodes.measure())
-    monkeypatch.setattr(nodes, '_PATIENCE', 0.1)
-    silent = nodes.StandIn('silent node')
-    with pytest.raises(BlfDscError, match=r'no sign of a torque after 0\.1 s'):
-        silent.until(lambda: False, 'a torque')
-    silent.close()

@@ -73,13 +73,10 @@ BEFORE_THEIR_LOOP = {
 ELSEWHERE = {'arms'}  # which has processes of its own
 
 
-@pytest.fixture(scope='module')
-def given(tmp_path_factory):
-    """A folder with all that the commands read."""
-    folder = tmp_path_factory.mktemp('given')
+def write_arm(folder):
+    """Write an arm, its parameter file, and a recording of it into a folder."""
     (folder / 'pendulum.urdf').write_text(PENDULUM)
     (folder / 'arm.yaml').write_text(FILE)
-    (folder / 'study.yaml').write_text(STUDY)
     time = np.arange(0.0, 8.0, 0.01)
     q = 0.8 * np.sin(2.0 * time) + 0.4 * np.sin(5.0 * time)
     ddq = -3.2 * np.sin(2.0 * time) - 10.0 * np.sin(5.0 * time)
@@ -88,6 +85,14 @@ def given(tmp_path_factory):
     np.savetxt(
         folder / 'run.csv', rows, delimiter=',', header='time,q1,tau1', comments=''
     )
+
+
+@pytest.fixture(scope='module')
+def given(tmp_path_factory):
+    """A folder with all that the commands read."""
+    folder = tmp_path_factory.mktemp('given')
+    write_arm(folder)
+    (folder / 'study.yaml').write_text(STUDY)
     done = Ended(COMMANDS['run'].split(), folder)
     assert done.code == 0, done.lines
     (folder / 'out' / 'bag').rename(folder / 'bag')

@@ -85,7 +85,9 @@ def test_bag_has_every_message(out):
 
 
 def test_command_reports_where_the_results_are(out):
-    summary = json.loads((out / 'summary.json').read_text())
+    # what is unknown is null, since JSON has no NaN
+    text = (out / 'summary.json').read_text()
+    summary = json.loads(text, parse_constant=pytest.fail)
     assert summary['samples'] == SAMPLES
     assert summary['held'] is True
     for picture in ('tracking.png', 'parameters.png'):

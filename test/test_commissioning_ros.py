@@ -222,22 +222,6 @@ def test_what_would_spoil_a_motion_ends_it(rig, name, told):
     rig.ros.until(lambda: calm(rig))
 
 
-def test_somebody_who_came_between_two_runs_is_noticed(rig):
-    found = []
-
-    def come():
-        if rig.bags.joinpath('move_1').exists() and rig.node.guard.is_settled:
-            rig.always = lambda: None
-            found.append(rig.ros.publisher(topics.COMMANDS))
-            rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
-            rig.node.on_second()
-
-    rig.always = come
-    with pytest.raises(EndedError, match='another node publishes torques on'):
-        rig.measured(NEAR)
-    assert len(found) == 1
-
-
 def test_watchdog_relies_on_each_run(rig):
     watchdog = rig.ros.add(WatchdogNode)
 

@@ -136,14 +136,6 @@ def test_scara_has_the_units_of_each_joint(tmp_path, capsys):
     assert values['feedback.joint_stiffness'][2] > 18.0 * (2.0 * np.pi) ** 2
     for unit in ('kg m^2 or kg', 'N m/rad or N/m', 'N m s/rad or N s/m', 'N m or N'):
         assert unit in text
-    # of one joint, a unit alone
-    for name, unit in re.findall(
-        r'\b(shoulder|elbow|quill) [\d.e+-]+ ([^\d;.,]+)', text
-    ):
-        if not unit.startswith(('ms', ' ')):
-            slides = name == 'quill'
-            own = r'(m|N|kg|mm)( (?!m\b)|$)' if slides else r'(rad|N m|kg m)'
-            assert re.match(own, unit)
     assert re.search(r'with [\d.]+ mrad and [\d.]+ mm at most', text)
     told = re.sub(r'\n(# )?', ' ', text)
     assert re.search(r'gains: [\d.]+ mrad and [\d.]+ mm by friction', told)
@@ -171,22 +163,6 @@ def test_drives_of_a_gantry_are_no_placeholders():
     )
     unknown, chain = robot_of(GANTRY.replace('"400"', '"0"'))
     np.testing.assert_allclose(unknown.efforts(chain), [600.0, weight[1], 300.0])
-
-
-def test_what_slides_out_has_a_lever():
-    """A shoulder that pans a slide of 0.6 m; nothing else is away from its axis."""
-    text = urdf(
-        joint('pan', 'revolute', 'base', '0 0 1', '0 0 0', (-2, 2), 0, 4),
-        joint('out', 'prismatic', 'pan_link', '1 0 0', '0 0 0', (-0.1, 0.6), 0, 2),
-    )
-    robot, chain = robot_of(text, payload=0.0)
-    assert chain.reach == pytest.approx(0.6)
-    turns, slides = robot.efforts(chain)
-    assert turns == pytest.approx(0.5 * 2.0 * 9.81 * 0.6)
-    assert slides == pytest.approx(2.0 * 9.81)
-    # half a turn of the lever more, and what a drive of 300 N holds
-    _, chain = robot_of(text.replace('effort="0"', 'effort="300"'))
-    assert robot.carried(chain) == pytest.approx(300.0 / (9.81 * 0.6))
 
 
 def test_postures_of_a_joint_that_slides_may_be_2_cm_from_its_limits():

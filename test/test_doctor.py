@@ -78,49 +78,41 @@ def test_computer_without_ros_is_no_problem(capsys, monkeypatch):
     assert 'source /opt/ros/jazzy/setup.bash' in text
 
 
-def test_full_and_read_only_disks_are_named(capsys, monkeypatch):
-    monkeypatch.setattr(computer, '_ENOUGH', float('inf'))
-    _, found = diagnosed(capsys)
-    assert found['disk'][0][0] == 'note'
-    monkeypatch.setattr(computer.os, 'access', lambda *_: False)
-    _, found = diagnosed(capsys)
-    assert 'cannot be written' in found['disk'][0][1]
+@pytest.fixture
+def ping(monkeypatch, tmp_path):
+    """Return a function that lets `ping` answer with a script."""
+
+    def answer(script):
+        ping = tmp_path / 'ping'
+        ping.write_text(script)
+        ping.chmod(0o755)
+        monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
+
+    return answer
 
 
 @pytest.mark.parametrize(
     ('mean', 'level'), [('0.150', 'ok'), ('0.700', 'note')], ids=['cable', 'switch']
 )
-def test_robot_is_asked_how_fast_it_answers(capsys, monkeypatch, tmp_path, mean, level):
-    ping = tmp_path / 'ping'
-    ping.write_text(PING.format(mean=mean))
-    ping.chmod(0o755)
-    monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
+def test_robot_is_asked_how_fast_it_answers(capsys, ping, mean, level):
+    ping(PING.format(mean=mean))
     code, found = diagnosed(capsys, '--robot', '172.16.0.2')
     assert code == 0
     assert found['robot'][0][0] == level
     assert 'at worst 0.90 ms of 200' in found['robot'][0][1]
 
 
-def test_robot_that_does_not_answer_is_a_problem(capsys, monkeypatch, tmp_path):
-    ping = tmp_path / 'ping'
-    ping.write_text(SILENT)
-    ping.chmod(0o755)
-    monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
-    code, found = diagnosed(capsys, '--robot', '172.16.0.2')
-    assert code == 1
-    assert '172.16.0.2 does not answer' in found['robot'][0][1]
-
-
-@pytest.mark.parametrize('address', ['simulated', 'can0', 'slcan:/dev/ttyACM0'])
-def test_robot_that_is_in_no_network_is_not_asked(
-    capsys, monkeypatch, tmp_path, address
-):
-    ping = tmp_path / 'ping'
-    ping.write_text(SILENT)
-    ping.chmod(0o755)
-    monkeypatch.setenv('PATH', str(tmp_path), prepend=':')
-    code, found = diagnosed(capsys, '--robot', address)
-    assert code == 0
+@pytest.mark.parametrize(
+    ('address', 'code', 'said'),
+    [
+        ('172.16.0.2', 1, ['PROBLEM', '172.16.0.2 does not answer']),
+        ('simulated', 0, ['ok', 'simulated is not in the network']),
+        ('can0', 0, ['ok', 'can0 is not in the network']),
+    ],
+)
+def test_only_robots_in_a_network_must_answer(capsys, ping, address, code, said):
+    ping(SILENT)
+    ended, found = diagnosed(capsys, '--robot', address)
     ((level, text),) = found['robot']
-    assert level == 'ok'
-    assert text.startswith(f'{address} is not in the network')
+    assert (ended, level) == (code, said[0])
+    assert text.startswith(said[1])

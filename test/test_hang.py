@@ -15,7 +15,7 @@ import blf_dsc_controller as blf
 
 PATIENT = {'safety.state_timeout': 10.0, 'safety.overrun_fraction': 1.0}
 SLACK = 0.2
-"""rad/s: what a load of 2 kg that nobody knows adds while it is observed, as in `soak_motion`.
+"""rad/s: what a load of 2 kg that nobody knows adds while it is observed.
 
 At most 0.15 was seen, of a UR5e that goes on; before, 1.2 of it and 0.95 of an FR3.
 """

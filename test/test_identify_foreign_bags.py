@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 from random_arm import PANDA, PANDA_TEXT
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.bags.content import NameMap
@@ -19,7 +16,7 @@ from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.identification.reading import read_recording
-from blf_dsc_controller.messages.codecs import JointStateEncoder, typestore
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 
 PERIOD = 0.005  # s
@@ -86,66 +83,21 @@ def test_joints_that_come_in_two_messages_are_one_arm(tmp_path, late):
         read_recording(bag, PANDA_TEXT, commanded=True)
 
 
-def test_joints_of_two_publishers_of_ros1_are_one_arm(tmp_path):
-    parts = messages(PANDA[:4], TIME), messages(PANDA[4:], TIME)
-    is_the_motion(read_recording(ros1_file(tmp_path / 'bag', *parts), PANDA_TEXT), 2e-4)
-
-
 # What is checked of tables is checked of bags.
 
 
 SLOW = 0.15 * np.sin(np.multiply.outer(TIME, SPEED))  # rad
 
 
-def ros2_folder(path, entries):
-    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as bag:
-        topic = bag.add_connection('/joint_states', JOINT_STATE, typestore=typestore())
-        for received, raw in entries:
-            bag.write(topic, received, raw)
-    return path
-
-
-def ros1_file(path, *parts):
-    """Write a bag of ROS 1 of these parts, each of a publisher of its own."""
-    ros1 = get_typestore(Stores.ROS1_NOETIC)
-    ros2 = typestore()
-    path = path.with_suffix('.bag')
-    with Ros1Writer(path) as bag:
-        topics = [
-            bag.add_connection(
-                '/joint_states', JOINT_STATE, typestore=ros1, callerid=f'/{k}'
-            )
-            for k in range(len(parts))
-        ]
-        entries = sorted(
-            (*entry, topic)
-            for topic, part in zip(topics, parts, strict=True)
-            for entry in part
-        )
-        for k, (received, raw, topic) in enumerate(entries):
-            message = ros2.deserialize_cdr(raw, JOINT_STATE)
-            header = ros1.types['std_msgs/msg/Header'](
-                seq=k, stamp=message.header.stamp, frame_id=''
-            )
-            other = ros1.types[JOINT_STATE](
-                header, message.name, message.position, message.velocity, message.effort
-            )
-            bag.write(topic, received, ros1.serialize_ros1(other, JOINT_STATE))
-    return path
-
-
-FORMATS = {'mcap': written, 'sqlite': ros2_folder, 'ros1': ros1_file}
-
-
-def states_bag(path, q, torque, form='mcap'):
-    """A bag of states at TIME in a format."""
+def states_bag(path, q, torque):
+    """A bag of states at TIME."""
     encoder = JointStateEncoder(PANDA)
     zero = np.zeros(7)
     entries = [
         (stamp, bytes(encoder.encode(stamp, q[k], zero, torque[k])))
         for k, stamp in enumerate(stamps_of(TIME))
     ]
-    return FORMATS[form](path, entries)
+    return written(path, entries)
 
 
 def refused(bag, *entries, urdf=PANDA_TEXT):
@@ -155,12 +107,11 @@ def refused(bag, *entries, urdf=PANDA_TEXT):
     return str(error.value)
 
 
-@pytest.mark.parametrize('form', FORMATS)
 @pytest.mark.parametrize('factor', [1.0, 10.0])
-def test_degrees_in_bags_are_refused_with_what_to_type(tmp_path, form, factor):
+def test_degrees_in_bags_are_refused_with_what_to_type(tmp_path, factor):
     """Of small motions, which stay within two turns, by their speed."""
     q = factor * SLOW
-    bag = states_bag(tmp_path / 'bag', np.degrees(q), TAU, form)
+    bag = states_bag(tmp_path / 'bag', np.degrees(q), TAU)
     message = refused(bag)
     assert 'the position of panda_joint' in message
     assert "If it is in degrees: --map 'q=[deg]'; if it is in rad" in message
@@ -172,15 +123,12 @@ def test_degrees_in_bags_are_refused_with_what_to_type(tmp_path, form, factor):
     np.testing.assert_allclose(kept.q[:390], np.degrees(q[:390]), atol=1e-5)
 
 
-@pytest.mark.parametrize('form', FORMATS)
-def test_stand_ins_and_torques_that_nobody_recorded_are_missing_in_bags(tmp_path, form):
+def test_stand_ins_and_torques_that_nobody_recorded_are_missing_in_bags(tmp_path):
     q, torque = Q.copy(), TAU.copy()
     q[[50, 51, 90], 2] = -9999.0
     torque[60, 4] = 1e10
     torque[200:205] = 0.0
-    recording = read_recording(
-        states_bag(tmp_path / 'bag', q, torque, form), PANDA_TEXT
-    )
+    recording = read_recording(states_bag(tmp_path / 'bag', q, torque), PANDA_TEXT)
     for said in (
         'the position of panda_joint3 is -9999 in 3 row(s), read as missing',
         'the effort of panda_joint5 is 1e+10 in 1 row(s), read as missing',

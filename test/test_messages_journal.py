@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
+import yaml
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.messages.codecs import typestore
@@ -16,53 +18,8 @@ from blf_dsc_controller.messages.journal import (
 )
 from blf_dsc_controller.messages.topics import JOURNAL
 
-POINT = {'time': 1.0, 'positions': [0.5, 1], 'velocities': []}
-WHOLE = POINT | {'accelerations': [0.1, 0.2], 'effort': [0.0, 3.0]}  # has every field
-EXAMPLES = {
-    'configure': {'parameters': {'joints': ['a'], 'law': 'dsc', 'x': 1.5, 'y': True}},
-    'activate': {},
-    'prepare': {'positions': [0.5, 1]},
-    'takeover': {'torque': [1.5, -2.0]},
-    'start': {'resumed': False},
-    'trajectory': {
-        'joints': ['a', 'b'],
-        'points': [POINT, WHOLE],
-        'begin': None,
-        'at': 0.0,
-    },
-    'target': {
-        'positions': [0.5, 1],
-        'velocities': [0.0, 0.1],
-        'due': 1.0,
-        'until': 1.25,
-        'held': False,
-        'at': 0.9,
-    },
-    'brake': {},
-    'parameters': {'parameters': {'two_link.feedback_gain': [1.0, 2.0]}},
-    'drive load': {'mass': 1.5, 'centre': [0.0, 0.0, 0.1]},
-    'tare': {},
-    'contact': {
-        'reaction': 'hold',
-        'joint': 'joint1',
-        'torque': -3.5,
-        'interval': 0.5,
-        'text': 'something touches the arm',
-    },
-    'oscillation': {
-        'joint': 'joint1',
-        'frequency': 31.0,
-        'torque': 14.0,
-        'text': 'joint1 oscillates',
-    },
-    'torque sensors': {'joint': 'joint1', 'text': 'the efforts are commands'},
-    'stop': {'reason': 'failed', 'text': ''},
-    'silence': {'torques': 3},
-    'deactivate': {},
-    'reset': {},
-    'withdraw': {'text': 'the states were away'},
-    'release': {'resting': True},
-}
+EXAMPLES = yaml.safe_load(Path(__file__).with_name('journal_events.yaml').read_text())
+POINT = EXAMPLES['trajectory']['points'][0]
 
 
 def encoded(text):

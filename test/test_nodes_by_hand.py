@@ -175,12 +175,6 @@ def test_single_live_state_is_started_from_as_its_sender_waits_for_a_torque(ros)
             '; to use it anyway, start the node with it',
         ),
         (
-            'barrier.bound',
-            [1e-6, 0.002],
-            'barrier.bound: joint1 is ',
-            '',
-        ),
-        (
             'sample_time',
             0.002,
             'sample_time is fixed at the start: arm and law are built',

@@ -113,21 +113,6 @@ def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send)
     assert law.guard.supervisor.phase is blf.Phase.TRACKING
 
 
-@pytest.mark.parametrize('send', [positions_of, points_of])
-def test_reference_brakes_when_a_stream_ends(ros, send):
-    arm, law = ros.loop(None, PATIENT)
-    ros.run(arm, 50)
-    for k in range(20):
-        send(law, k, 0.02)
-        ros.run(arm, 20)
-    ros.run(arm, 800)
-    reference = law.guard.controller.reference_at(law.guard.reference.time)
-    np.testing.assert_array_equal(reference[1:], 0.0)
-    if send is points_of:  # the last point of a trajectory is held
-        np.testing.assert_allclose(reference[0], sway(0.38), atol=1e-7)
-    assert law.guard.supervisor.phase is blf.Phase.TRACKING
-
-
 def test_stop_brakes_and_outlasts_a_stream_until_that_pauses(ros):
     arm, law = ros.loop(None, PATIENT)
     ros.run(arm, 50)

@@ -11,19 +11,16 @@ import recorded_run
 from fault_table import FAULTS, JOINTS, MILLISECOND, Rig, run
 from recorded_run import compared, of
 
-from blf_dsc_controller.bags import content
-from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.estimate import estimate_names
-from blf_dsc_controller.messages.journal import MOTIONS, decode
+from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.messages.topics import (
     BOUND,
     COMMANDS,
     JOINT_STATES,
     JOURNAL,
-    TARGETS,
     TRACKING_ERROR,
 )
 from blf_dsc_controller.reference.retargeting import Target
@@ -184,26 +181,6 @@ def test_every_kind_of_event_and_watchdog_torques_replay(tmp_path):
     )
     assert compared(result)['commands'] == 2 * commands
     assert commands > states + 10
-
-
-@pytest.mark.parametrize('topic', [JOURNAL, TARGETS])
-def test_stream_of_any_length_replays(tmp_path, monkeypatch, topic):
-    """Motions are read one by one, so only other events may not exceed what memory holds."""
-    rig = eventful()
-    rig.release()
-    rig.publish_events()
-    size = 0
-    for entry in of(rig.entries, JOURNAL):
-        if decode(entry[3]).type in MOTIONS:
-            entry[0] = topic.resolved
-        else:
-            size += len(entry[3])
-    monkeypatch.setattr(content, '_MOST_JOURNAL', size)
-    result = rig.verify(tmp_path / 'all')
-    assert (result.difference, result.remarks, result.motions) == (None, (), 8)
-    monkeypatch.setattr(content, '_MOST_JOURNAL', size - 1)
-    with pytest.raises(BagError, match='besides motions, which no controller'):
-        rig.verify(tmp_path / 'too many')
 
 
 def test_dropped_states_are_detected(tmp_path):

@@ -17,7 +17,7 @@ import recorded_run
 from rclpy.parameter import Parameter
 from recorded_run import compared, of
 from ros_rig import FakeClock, RosRig, activate, configure, deactivate
-from test_nodes_trajectory import JOINTS, SECOND, send, trajectory
+from test_nodes_trajectory import JOINTS, SECOND
 
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.messages.journal import EventType
@@ -29,10 +29,6 @@ from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from blf_dsc_controller.replay.verify import verify
 
-BRISK = {
-    'limits__acceleration': [4.0, 4.0],  # rad/s^2, for a trajectory of one second
-    'barrier__bound': [0.02, 0.02],  # rad, twenty times what this run needs
-}
 # no two torques alike
 DAMPED = {'safety__torque': 'hold_gravity', 'safety__damping': [2.0, 1.0]}
 
@@ -66,38 +62,6 @@ class Recording:
         self.recorder.close()
         self.ros.close()
         return self.path
-
-
-def test_trajectories_and_gain_change_replay_where_they_took_effect(tmp_path):
-    """The second trajectory begins later; the journal holds both as they were sent."""
-    run = Recording(tmp_path / 'bag', **BRISK)
-    run.run(200)
-    sent = trajectory(JOINTS, np.zeros(2), duration=1.0)
-    assert send(run.ros, run.law, sent) == ''
-    run.run(300)
-    run.change('two_link.feedback_gain', [50.0, 25.0])
-    run.run(200)
-    begin = run.law.guard.reference.last_stamp + SECOND // 4
-    later = trajectory(
-        JOINTS[::-1], np.array([0.05, -0.1]), duration=0.5, fields=2, stamp=begin
-    )
-    assert send(run.ros, run.law, later) == ''
-    run.run(600)
-    result = verify(run.end())
-    assert (result.difference, result.remarks) == (None, ())
-    assert [event.type for event in result.events].count(EventType.PARAMETERS) == 1
-    assert result.samples >= 1300
-    assert compared(result)['commands'] == 2 * result.samples
-    assert compared(result)['reference'] == 4 * -(-result.samples // 10)
-    assert result.motions == 2
-    first, second = (each.content for _, each in read_content(run.path).motions)
-    assert (tuple(first['joints']), tuple(second['joints'])) == (JOINTS, JOINTS[::-1])
-    errors = read_content(run.path).topics[TRACKING_ERROR].joint_states(JOINTS, ())
-    assert first['begin'] is None
-    assert second['begin'] == (begin - int(errors.stamp[0])) * 1e-9
-    for recorded, point in zip(first['points'], sent.points, strict=True):
-        np.testing.assert_array_equal(recorded['positions'], point.positions)
-        np.testing.assert_array_equal(recorded['accelerations'], point.accelerations)
 
 
 def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
@@ -147,6 +111,3 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
     assert compared(result)['commands'] == 2 * torques
     assert compared(result)['tracking_error'] == 6 * errors.size
     assert torques - result.samples >= 600 + 2 * 50
-
-
-# Playing a bag: its messages byte for byte over ROS, in its time.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmark.__main__ import listing, main, parser_of
+from benchmark.__main__ import main, parser_of
 from benchmark.studies import load_study
 from benchmark.tables import TABLES, module_of
 
@@ -54,13 +54,6 @@ def test_every_study_of_the_tables_loads_and_varies(name):
     study = load_study(name)
     assert study.settings.pairs
     assert len(study.variations) > 10
-
-
-def test_unknown_table_is_answered_by_the_list(capsys):
-    assert main(['papers']) == 2
-    error = capsys.readouterr().err
-    assert error.startswith('benchmark: no table papers\n')
-    assert listing() in error
 
 
 def test_error_of_a_table_is_one_line_and_an_exit_code(tmp_path):

@@ -37,6 +37,9 @@ from blf_dsc_controller.view.snapshot import Snapshot
 
 HOST = '127.0.0.1'
 PORT = 18080
+LOG = topics.Topic(
+    '', '/rosout', 'rcl_interfaces/msg/Log', topics.STREAM, topics.STREAM
+)
 LOAD = (2.0, *[np.nan] * 3, 0.05, *[np.nan] * 3)
 
 
@@ -181,6 +184,7 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     """4 N at 8 s, once the arm has been learned."""
     view = ros.add(ViewNode, port=18280)
     said = ros.listen(topics.DIAGNOSTICS)
+    log = ros.listen(LOG)
 
     def contact_statuses():
         found = [each for message in said for each in message.status]
@@ -205,6 +209,9 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     status = contact_statuses()[-1]
     assert 'something touches the arm' in status.message
     assert values(status)['joint'] == 'joint1'
+    ros.run(arm, 100)  # it is warned of once, however many samples it lasts
+    warned = [each.msg for each in log if each.msg.startswith('something touches')]
+    assert len(warned) == 1
     (event,) = events_with(view, "N m on joint 'joint1', and model error")
     assert 8.0 < event[0] < 8.1
     # Once it has ended, all of it can be looked at.

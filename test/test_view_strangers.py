@@ -204,24 +204,32 @@ def test_bound_from_before_the_view_was_started_is_shown(watched):
     late.close()
 
 
-@pytest.mark.parametrize('name', ['arm.stl', 'arm.zip', 'arm.stl/inside'])
-def test_only_meshes_are_drawn_as_meshes(name, tmp_path):
+@pytest.mark.parametrize(
+    'mesh',
+    [
+        '{share}/arm.stl',
+        'package://described/arm.stl',  # of a wheel
+        '{share}/arm.zip',
+        '{share}/arm.stl/inside',
+    ],
+)
+def test_only_meshes_are_drawn_as_meshes(mesh, tmp_path, monkeypatch):
     """A journal may name any file of this computer."""
-    ball = tmp_path / 'arm.stl'
-    trimesh.creation.icosphere().export(ball)
-    with zipfile.ZipFile(tmp_path / 'arm.zip', 'w') as archive:
-        archive.write(ball, 'arm.stl')
-    mesh = f'<visual><geometry><mesh filename="{tmp_path / name}"/></geometry></visual>'
+    monkeypatch.setattr('sysconfig.get_path', lambda _: tmp_path)
+    share = tmp_path / 'cmeel.prefix' / 'share' / 'described'
+    share.mkdir(parents=True)
+    trimesh.creation.icosphere().export(share / 'arm.stl')
+    with zipfile.ZipFile(share / 'arm.zip', 'w') as archive:
+        archive.write(share / 'arm.stl', 'arm.stl')
+    name = mesh.format(share=share)
+    visual = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
     text = urdf(JOINTS, (1.0, 1.0), (1.0, 1.0)).replace(
-        '<inertial>', f'{mesh}<inertial>'
+        '<inertial>', f'{visual}<inertial>'
     )
-    shapes = (
-        ShownArm(text, read_chain(text, '', 'tip', tuple(JOINTS)))
-        .model()
-        .scene.geometry
-    )
-    drawn = [each for each in shapes.values() if each.extents == pytest.approx(2.0)]
-    assert bool(drawn) == (name == 'arm.stl')
+    chain = read_chain(text, '', 'tip', tuple(JOINTS))
+    shapes = ShownArm(text, chain).model().scene.geometry.values()
+    drawn = [each for each in shapes if each.extents == pytest.approx(2.0)]
+    assert bool(drawn) == name.endswith('.stl')
 
 
 # Other pages in the same browser.
