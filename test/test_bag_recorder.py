@@ -181,6 +181,24 @@ def test_topics_of_every_quality_and_type_are_recorded_as_offered(ros, bag):
     assert kinds == {'RELIABLE', 'BEST_EFFORT'}
 
 
+def test_message_that_two_subscriptions_bring_is_recorded_once(ros, bag):
+    """A best-effort publisher that appears later needs a subscription of its own."""
+    recorder = ros.add(BagRecorderNode, output=str(bag), topics=['mixed'])
+    first = connected(ros, recorder, JointState, 'mixed')
+    unreliable = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    late = ros.tester.create_publisher(JointState, 'mixed', unreliable)
+    ros.until(lambda: first.get_subscription_count() == 2)
+    until_subscribed(ros, recorder, late)
+    for k in range(20):
+        first.publish(encoded(k))
+    until_recorded(ros, recorder, mixed=20)
+    late.publish(encoded(99))
+    until_recorded(ros, recorder, mixed=21)
+    ros.spin(0.2)
+    recorder.close()
+    assert [joint_state_stamp(raw) for *_, raw in read(bag)] == [*range(20), 99]
+
+
 def test_losses_are_counted_and_reported(ros, bag, capfd):
     """Messages sent before the recorder connected, and those dropped by a full queue."""
     publisher = ros.tester.create_publisher(JointState, 'joint_states', 100)

@@ -182,6 +182,17 @@ def test_chosen_gains_have_the_margin_of_the_true_loop_and_twice_of_them_do_not(
     assert twice.value < 0.4
 
 
+def test_gains_have_the_margin_where_resonances_are_sharp():
+    """Hardly damped, they are higher between two lines of the motion than at any of them."""
+    viscous = [0.2, 0.1]  # N m s/rad
+    sharp = change(ARM, {'disturbance.viscous': viscous})
+    result = result_of(CONFIG, simulated.measured(planned(), sharp))
+    loop = true_loop(result.choice.gains, result.loops.inertia)
+    loop = loop._replace(joints=loop.joints._replace(viscous=np.array(viscous)))
+    assert result.has_margin
+    assert loop.margin().value > 0.4
+
+
 def test_friction_does_not_hide_where_the_loop_is_unstable():
     """In one direction Coulomb friction damps nothing: the loop without it is the true one.
 
