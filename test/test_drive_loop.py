@@ -300,6 +300,24 @@ def test_run_with_all_of_it_replays_bit_for_bit(all_of_it):
     assert latched[-1] == 1.0
 
 
+def test_drives_that_refuse_a_load_are_asked_once():
+    class Refusing(LoadedDriver):
+        refuses = True
+
+    driver, loop, _ = run_with_load(Refusing, 8.0)
+    assert loop.remark == 'the load was refused: see Desk'
+    assert driver.mass == 0
+
+
+def test_drives_that_forbid_it_are_not_told_while_they_move():
+    class Forbidding(LoadedDriver):
+        facts = LoadedDriver.facts._replace(load_in_motion=False)
+
+    driver, loop, _ = run_with_load(Forbidding, 8.0)
+    assert not driver.told
+    assert not loop.remark
+
+
 FACTS = Facts(2, 0.001, 'none', 'unknown', (20.0, 20.0), (inf, inf))
 
 

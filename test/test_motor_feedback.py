@@ -178,3 +178,17 @@ def test_the_loop_sends_frames_whose_sum_is_in_the_bag_which_replays(tmp_path):
     assert (stopping.stiffness == 0.0).all()
     assert (stopping.damping > 0.0).all()
     assert np.abs(driver.plant.measure()[1]).max() < 0.03  # rad/s: at rest, to a step
+
+
+@pytest.mark.parametrize('kind', ['zero', 'damping'])
+def test_frames_of_a_stop_damp_unless_its_torque_is_zero(kind):
+    config = blf.change(loop_of(SLOW).controller, {'safety.torque': kind})
+    controller = blf.ArmController(config)
+    q, dq = np.array(config.reference.offset), np.full(7, 0.2)
+    controller.update(1.0, q, dq)
+    torque = controller.fail('by hand')
+    frame = MotorFeedback(controller, RANGES, 0.0).frame(torque)
+    assert (frame.stiffness == 0.0).all()
+    assert (frame.damping > 0.0).all() == (kind == 'damping')
+    if kind == 'zero':
+        np.testing.assert_allclose(frame.torque_at(q, dq), torque, atol=0.02)

@@ -452,6 +452,7 @@ def sequence_of_references(seed):
         accepted += planned is not vector
         before, vector = vector, remaining(planned, (sample - 1) * PERIOD)
         check_seams(before, vector, sample - 1, sample + lead - taken)
+        assert len(unpack(remaining(vector, 1e3))) == 1  # what is finished is forgotten
         gap = int(rng.choice([1, 7, 10, 50, 400, 1500]))
         seen.append(sampled(vector, PERIOD * np.arange(sample, sample + gap)))
         sample += gap

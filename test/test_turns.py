@@ -182,6 +182,17 @@ def test_normalised_plan_is_followed_the_short_way(start, points):
     assert np.abs(dq).max() < 0.3  # 0.1 rad/s on average
 
 
+def test_short_way_that_the_limits_forbid_is_not_taken():
+    """As of a cable: from 2.9 to -2.9 rad through zero, and not past 3 rad."""
+    limits = {'limits.position_lower': [-3.0] * 2, 'limits.position_upper': [3.0] * 2}
+    still = {'reference.offset': [0.0, 0.0], **limits}
+    rig = resting((2.9, 0.0), **still)
+    point = TrajectoryPoint(20.0, (-2.9, 0.0))
+    plan = rig.guard.motions.plan(Trajectory(JOINTS, (point,)))
+    assert plan.motion.turned == ''
+    assert sampled(plan.motion.vector, [99.0])[0, 0, 0] == pytest.approx(-2.9)
+
+
 class Kept:
     """A log that keeps what it is told."""
 
