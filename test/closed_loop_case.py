@@ -12,8 +12,8 @@ import plants
 from plain_law import R, dynamics
 from symbols import replaced
 
+from blf_dsc_controller import ControllerConfig
 from blf_dsc_controller.arms.two_link import TwoLink
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import load_law
 from blf_dsc_controller.configuration.law_traits import gains_of
 from blf_dsc_controller.configuration.schema import build

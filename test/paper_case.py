@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller import change, load_loop, simulate
 from blf_dsc_controller.analysis.lyapunov import energies
-from blf_dsc_controller.configuration.nodes import LoopConfig, load_loop
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.samples import sample_columns
-from blf_dsc_controller.simulation.loop import simulate
 
 P = np.array([1.0, 0.32, 0.4])
 NO_DISTURBANCE = {

@@ -18,7 +18,6 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Annotated, NamedTuple
 
 import mpmath
@@ -28,13 +27,13 @@ import plants
 import pytest
 from closed_loop_case import closed_loop, controller, quick
 from command import OLDER, finished
-from llvmlite import binding as llvm
 from numba.core import event
-from numba.core.errors import TypingError, UnsupportedError
+from numba.core.errors import UnsupportedError
 from planted import Planted
 from random_arm import fill_states, random_urdf
 
 import blf_dsc_controller
+from blf_dsc_controller import BlfDscError, load_loop, simulate
 from blf_dsc_controller.arms import model
 from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.compiled import (
@@ -48,19 +47,14 @@ from blf_dsc_controller.compiled.layout import (
     Array,
     Cell,
     Passed,
-    _view_arguments,
-    _view_lines,
-    filled,
     pack,
     size_of,
     view_of,
 )
 from blf_dsc_controller.configuration import nodes
 from blf_dsc_controller.configuration.law_file import load_law
-from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.control import arm_controller
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import called_law
 from blf_dsc_controller.law.laws import for_law
 from blf_dsc_controller.law.step import update
@@ -68,10 +62,8 @@ from blf_dsc_controller.numerics import elementary
 from blf_dsc_controller.numerics.algebra import independent_columns, inverse, product
 from blf_dsc_controller.reference.terms import cubics, minimum_jerk
 from blf_dsc_controller.simulation import loop
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.supervision.model_torque import friction_torque, model_torque
-from blf_dsc_controller.tool.errors import Tool, _fill_errors
 from sim_plant.kernels import run_plant
 from sim_plant.settings import plant_settings
 
@@ -320,12 +312,6 @@ def test_kernel_calls_a_kernel_by_its_address():
         sum_of_means(mean, -rows)
 
 
-@compiling
-def test_kernel_is_called_with_the_types_that_it_is_compiled_for():
-    with pytest.raises(TypingError, match='but the kernel takes'):
-        sum_of_means(entry.Entry(mean_root, np.ones(2)), np.ones((2, 2, 2)))
-
-
 def test_kernels_of_two_laws_with_the_same_name_are_told_apart():
     """Or the loop of the first would be called with the second, whose type it rejects."""
     laws = [NamedTuple('Law', [('gain', float)]) for _ in range(2)]
@@ -335,18 +321,6 @@ def test_kernels_of_two_laws_with_the_same_name_are_told_apart():
     assert str(first) == str(other)
     assert first != other
     assert first == entry.EntryType(numba.types.none(numba.typeof(laws[0](2.0))))
-
-
-@compiling
-def test_errors_at_the_tool_are_compiled_once_for_all_arrays():
-    tool = Tool(load_loop('panda').controller.robot.chain(()), np.ones(7))
-    many = np.full((4, 7), 0.3)
-    fixed = many.copy()
-    fixed.flags.writeable = False
-    for q in (many, fixed, many[0], fixed[0], np.asfortranarray(many), [0.3] * 7):
-        for k in (np.full(7, 1e-2), fixed[0]):
-            tool.errors(q, many[0], k)
-    assert len(_fill_errors.signatures) == 1
 
 
 @jit.kernel
@@ -360,39 +334,6 @@ def test_kernel_that_allocates_an_array_is_rejected():
         UnsupportedError, match='the kernel allocating allocates an array'
     ):
         allocating(1.0)
-
-
-DEFINED = """
-@data = global [80 x double] zeroinitializer
-declare i64 @other(i64)
-define i64 @"of \\22a\\22 law"(i64 %x) {
-  %1 = mul i64 %x, %x
-  %2 = call i64 @other(i64 %1)
-  ret i64 %2
-}
-"""
-CALLING = """
-declare i64 @"of \\22a\\22 law"(i64)
-define i64 @calling(i64 %x) {
-  %1 = call i64 @"of \\22a\\22 law"(i64 %x)
-  ret i64 %1
-}
-"""
-
-
-@compiling
-def test_symbols_of_a_stored_kernel_are_known_and_not_taken_for_its_code():
-    stored = sys.modules[jit.KernelCompiler.__module__]._symbols(
-        llvm.parse_assembly(DEFINED).as_bitcode()
-    )
-    symbols = llvm.parse_bitcode(stored)
-    found = {each.name for each in symbols.global_variables if not each.is_declaration}
-    assert found == {'data', 'of "a" law'}
-    calling = llvm.parse_assembly(CALLING)
-    calling.verify()
-    calling.link_in(symbols)
-    with pytest.raises(RuntimeError, match='is called by its Entry alone'):
-        calling.verify()
 
 
 @jit.kernel
@@ -471,33 +412,6 @@ def test_kernels_and_python_see_the_same_layout_of_every_size():
             assert (state[0], state[last]) == (0.5, columns + 1.0)
             assert np.count_nonzero(state) == 2
     assert len(compiled_advance.signatures) == (0 if numba.config.DISABLE_JIT else 1)
-
-
-def test_layout_is_filled_with_parameters_of_the_same_names():
-    """What is computed goes before; a switch is a number in the vector."""
-    group = SimpleNamespace(limit=(2.0, 3.0), delay=True, unknown='not a field')
-    motor = filled(Motor, group)
-    np.testing.assert_array_equal(pack(motor), [2.0, 3.0, 1.0])
-    assert filled(Motor, group, delay=7).delay == 7
-
-
-def test_generated_view_can_be_read():
-    assert _view_arguments(State) == '_vector, _sizes'
-    assert _view_lines(State) == [
-        '_at = 0',
-        'count = _part(_vector, _at, (1,))',
-        '_at += (1)',
-        'ring = _part(_vector, _at, (_sizes.motor.delay, _sizes.joints,))',
-        '_at += (_sizes.motor.delay) * (_sizes.joints)',
-        'motor_limit = _part(_vector, _at, (_sizes.joints,))',
-        '_at += (_sizes.joints)',
-        'motor_delay = int(_vector[_at])',
-        '_at += 1',
-        (
-            'return _reference(State(count=count, ring=ring, '
-            'motor=motor_Motor(limit=motor_limit, delay=motor_delay)))'
-        ),
-    ]
 
 
 SHOW = """

@@ -20,16 +20,14 @@ from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
 from scipy.integrate import solve_ivp
 
+from blf_dsc_controller import ControllerConfig, controller_of, read_run, simulate
 from blf_dsc_controller.analysis.lyapunov import energies as offline_energies
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.factory.estimate import columns_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.simulation.loop import write_bag
 
 
 def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():

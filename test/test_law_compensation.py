@@ -16,7 +16,7 @@ from symbols import replaced
 
 import blf_dsc_controller as blf
 from benchmark.studies import load_study
-from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller import controller_of
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.simulation.loop import new_record, run_alone
 from blf_dsc_controller.studies.summary import compare_pairs

@@ -21,8 +21,7 @@ from plain_law import R, dynamics, regressor
 from plants import QUIET, START
 from symbols import replaced
 
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.errors import StartError
+from blf_dsc_controller import ControllerConfig, StartError
 from blf_dsc_controller.law import adaptation, learning
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.surface import virtual_control

@@ -20,18 +20,26 @@ from numba import typeof
 
 import blf_dsc_controller as blf
 from benchmark.studies import path_of
+from blf_dsc_controller import (
+    BlfDscError,
+    ConfigurationError,
+    ControllerConfig,
+    PlantConfig,
+    StartError,
+    change,
+    controller_of,
+    load_loop,
+    load_study,
+    run_chunk,
+)
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.compiled.jit import SLOW, kernel
 from blf_dsc_controller.compiled.layout import Array, pack, view_of
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import digest, load_law
 from blf_dsc_controller.configuration.law_traits import LAWS, traits_of
-from blf_dsc_controller.configuration.nodes import load_loop, locate
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change, flatten
-from blf_dsc_controller.errors import BlfDscError, ConfigurationError, StartError
-from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.configuration.nodes import locate
+from blf_dsc_controller.configuration.schema import build, flatten
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.called_law import called
@@ -46,8 +54,7 @@ from blf_dsc_controller.law.state import (
 from blf_dsc_controller.law.step import update
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
-from blf_dsc_controller.studies.monte_carlo import UNSEEN, load_study, torque_rows
-from blf_dsc_controller.studies.runs import run_chunk
+from blf_dsc_controller.studies.monte_carlo import UNSEEN, torque_rows
 from blf_dsc_controller.supervision.retuning import apply_bumpless
 
 LAW = COMPUTED_TORQUE

@@ -12,14 +12,17 @@ from plants import rigid_gears
 from random_arm import PANDA_TEXT
 
 from benchmark.studies import load_study
-from blf_dsc_controller import simulate
+from blf_dsc_controller import (
+    ConfigurationError,
+    ControllerConfig,
+    change,
+    controller_of,
+    load_loop,
+    simulate,
+)
 from blf_dsc_controller.arms.tuning import over_postures
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import load_loop
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import ConfigurationError
-from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.estimate import (
     columns_of,
     doubting_covariance,

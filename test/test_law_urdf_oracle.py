@@ -9,8 +9,7 @@ from plain_urdf_law import PlainArm, PlainUrdfLaw
 from random_arm import UR5E, UR5E_TEXT, pinocchio_model
 from symbols import replaced
 
-from blf_dsc_controller import load_loop
-from blf_dsc_controller.factory.controller import controller_of
+from blf_dsc_controller import controller_of, load_loop
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.terms import sampled

@@ -22,16 +22,13 @@ import numpy as np
 import pytest
 from test_monte_carlo_study import LOOP, RUNS, STUDY, study, whole, write
 
-from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller import BlfDscError, load_loop, read_run, run_chunk, simulate
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.cli.result_folder import make_folder
-from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import runs as engines
 from blf_dsc_controller.studies.report import format_report
 from blf_dsc_controller.studies.reproduction import reproduce
-from blf_dsc_controller.studies.runs import Store, compute, run_chunk, warm_up
+from blf_dsc_controller.studies.runs import Store, compute, warm_up
 from blf_dsc_controller.studies.summary import summarize
 
 

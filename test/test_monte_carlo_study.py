@@ -11,18 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmark.studies import path_of
-from blf_dsc_controller.errors import ConfigurationError
+from blf_dsc_controller import ConfigurationError, load_study, run_chunk, simulate
 from blf_dsc_controller.law.samples import sample_columns
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies.distributions import parse
 from blf_dsc_controller.studies.monte_carlo import (
     another_motion,
     draw,
-    load_study,
     plant_with,
     torque_rows,
 )
-from blf_dsc_controller.studies.runs import run_chunk
 from blf_dsc_controller.studies.summary import compare_pairs
 
 RUNS = 24

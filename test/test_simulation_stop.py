@@ -10,20 +10,19 @@ import pytest
 import recorded_run
 from paper_case import configured, several
 
-from blf_dsc_controller.analysis.metrics import measure
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.plant import PlantConfig
+from blf_dsc_controller import (
+    ControllerConfig,
+    PlantConfig,
+    StartError,
+    measure,
+    read_run,
+    simulate,
+    verify,
+)
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.messages.journal import decode_change
 from blf_dsc_controller.messages.topics import CHANGES
-from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import (
-    simulate,
-    simulate_into_bag,
-    write_bag,
-)
+from blf_dsc_controller.simulation.loop import simulate_into_bag, write_bag
 
 HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
 NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed': 3}

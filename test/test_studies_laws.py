@@ -17,18 +17,22 @@ from scipy.linalg import expm
 from benchmark import arms, tuning
 from benchmark.__main__ import main as table
 from benchmark.paper import CASES, FAILS, HOLDS, ONLY_IF, case_name
-from blf_dsc_controller.analysis.metrics import measure
+from blf_dsc_controller import (
+    BlfDscError,
+    ControllerConfig,
+    PlantConfig,
+    change,
+    load_loop,
+    measure,
+    simulate,
+)
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import known_names, load_loop, locate
-from blf_dsc_controller.configuration.plant import PlantConfig
-from blf_dsc_controller.configuration.schema import build, change
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.configuration.nodes import known_names, locate
+from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
-from blf_dsc_controller.simulation.loop import simulate
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.monte_carlo import torque_rows
 from blf_dsc_controller.studies.tuning import Gain, parameters_at, value_at
@@ -267,14 +271,6 @@ def test_law_of_a_file_acts_at_the_right_time():
     assert coarse / fine == pytest.approx(4.0, rel=0.1)
 
 
-def test_torque_is_cut_at_its_limit():
-    gains, loop = GAINS | {'gains.position': 1e9}, ideal(1e-3)
-    _, torques = simulated(loop, gains)
-    np.testing.assert_array_equal(
-        np.abs(torques).max(axis=0), loop.controller.torque.limit
-    )
-
-
 def test_integrator_of_computed_torque_removes_the_error_of_a_push():
     rest = ideal(1e-3, FRICTIONLESS | {'reference.amplitude': [0.0] * 18})
     push = {'load.torque': [3.0, -2.0, 1.0, 0.3, -0.2, 0.1], 'duration': 3.0}
@@ -335,17 +331,6 @@ def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
     soft = arms.soft_trial('ur5e_rigid', 1, 0.25).controller
     assert soft.barrier.bound == (16 * 0.005,) * 6
     assert soft.reference == stiff.reference
-
-
-def test_table_and_picture_of_soft_arms_show_each_law(tmp_path):
-    of_law = {'before': [1e-3, 2e-3, 3e-3, 4e-3], 'with the load': [5e-3] * 4}
-    errors = dict.fromkeys(arms.LAWS, of_law)
-    head, *lines = arms.format_errors(errors).splitlines()
-    assert head.split()[-4:] == ['1', '0.5', '0.25', '0.125']
-    assert len(lines) == 6
-    assert lines[0].split()[-4:] == ['1.00', '2.00', '3.00', '4.00']
-    arms.draw({'ur5e_rigid': errors}, tmp_path / 'stiffness.png')
-    assert (tmp_path / 'stiffness.png').stat().st_size > 10_000
 
 
 def test_events_of_a_file_become_the_pick_up_of_its_heaviest_load():

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 from ros_rig import RosRig
 
-from blf_dsc_controller.configuration.nodes import load_loop
+from blf_dsc_controller import load_loop
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
