@@ -115,3 +115,27 @@ def test_target_is_refused_if_the_arm_would_leave_its_limits_before_it_turns(sid
                 plan_target(target, moving, 0.0, config)
         else:
             plan_target(target, moving, 0.0, config)
+
+
+@pytest.mark.parametrize(
+    ('past', 'refused'), [(0.1, False), (0.5, True), (45.0, True), (-100.0, True)]
+)
+def test_target_in_other_units_is_refused_and_one_a_little_past_the_range_reduced(
+    past, refused
+):
+    """Degrees, or parts of a range: an arm swept through its range at up to 1.4 rad/s."""
+    limit = {
+        'limits.position_lower': [-1.0, -1.0],
+        'limits.position_upper': [1.0, 1.0],
+    }
+    config = change(ControllerConfig(), limit)
+    q = past + np.sign(past)
+    target = Target((q, 0.0), (0.0, 0.0), 1.0, 1.1, held=True)
+    start = pack(2, [hold(np.zeros(2))])
+    if refused:
+        with pytest.raises(TrajectoryError, match=r"'joint1' .* are they in degrees"):
+            plan_target(target, start, 0.0, config)
+        return
+    motion = plan_target(target, start, 0.0, config)
+    reached, _, _ = sampled(motion.vector, np.array([motion.end]))[0]
+    assert reached[0] == pytest.approx(1.0)

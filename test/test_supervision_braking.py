@@ -26,13 +26,14 @@ def inertia(settings, q):
 
 @pytest.mark.parametrize('seed', range(5))
 def test_braking_takes_energy_out_of_any_motion(settings, seed):
-    """And each joint's own damping is as configured."""
+    """And each joint's own damping is as configured, or what a low pass of 30 ms bears."""
     draw = np.random.default_rng(seed)
     q = draw.uniform(-1.5, 1.5, settings.n)
     damping = 10.0 ** draw.uniform(-1.0, 1.5, settings.n)
     D = braking_matrix(settings, damping, q)
     np.testing.assert_allclose(D, D.T, atol=1e-12)
-    np.testing.assert_allclose(np.diagonal(D), damping)
+    borne = np.diagonal(inertia(settings, q)) / 0.03
+    np.testing.assert_allclose(np.diagonal(D), np.minimum(damping, borne))
     assert np.linalg.eigvalsh(D).min() > 0.0
 
 
@@ -69,7 +70,8 @@ def test_damping_that_is_held_for_a_gap_reverses_no_motion_of_the_model(
         kept = np.linalg.eigvals(np.eye(settings.n) - gap * np.linalg.solve(M, D))
         assert kept.real.min() > -1e-9
         assert kept.real.max() <= 1.0
-    np.testing.assert_array_equal(within_gap(settings, damping, q, 0.0), damping)
+    borne = np.minimum(damping, np.diagonal(M) / 0.03)
+    np.testing.assert_allclose(within_gap(settings, damping, q, 0.0), borne)
 
 
 def test_without_an_estimate_each_joint_brakes_alone():

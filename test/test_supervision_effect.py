@@ -248,11 +248,14 @@ def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     assert arm.text.endswith('rad/s: engage the brakes')
     after = arm.run(0.05, reach=lambda _: stuck)
     assert arm.text.count('speeds up') == 1
-    # Without a load the torque is that of the model at rest, as at the stop.
-    known = Scenario('recommended', given, plant=still)
-    known.run(0.3)
+    # Without a load the torque is that of the model at rest, as at a stop there.
+    there = {'initial.position': after.q[-1].tolist()}
+    known = Scenario(
+        'recommended', given | {'reference.type': 'hold'}, plant=still | there
+    )
+    known.run(0.01)
     known.controller.fail('by hand')
-    held = known.run(0.01, spoil=changed(q=lambda _: after.q[-1])).torque[-1]
+    held = known.run(0.1).torque[-1]
     assert np.abs(falling.torque[-2] - held).max() > 1.0
     np.testing.assert_allclose(after.torque[-1], held, atol=0.2)
 

@@ -166,8 +166,9 @@ def test_arm_that_falls_after_a_refused_start_is_said_to_be_without_a_torque():
     refused = {'reference.type': 'hold', 'safety.torque': 'damping'}
     arm = arm_of(limits | refused)
     for k in range(400):
-        q = [1.2 + 1.5e-3 * k, 0.0]
-        assert arm.controller.update(1.0 + 1e-3 * k, q, [1.5, 0.0]) is None
+        t = 1e-3 * k
+        q, dq = [1.2 + 6.0 * t * t, 0.0], [12.0 * t, 0.0]
+        assert arm.controller.update(1.0 + t, q, dq) is None
     assert arm.reason == 'start rejected'
     assert 'speeds up while nothing is commanded' in arm.text
 

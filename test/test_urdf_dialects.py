@@ -190,4 +190,27 @@ def test_parts_beside_the_arm_do_not_matter_in_mujoco(beside):
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-# Joints that slide.
+@pytest.mark.parametrize(
+    ('rpy', 'expected'),
+    [
+        ((0.0, 0.0, 0.7), (0.0, 0.0, -9.81)),
+        ((np.pi / 2, 0.0, 0.0), (0.0, -9.81, 0.0)),
+        ((np.pi, 0.0, 0.0), (0.0, 0.0, 9.81)),
+        ((0.0, np.pi / 2, 0.0), (9.81, 0.0, 0.0)),
+    ],
+)
+def test_gravity_turns_with_the_fixed_joints_below_the_base(rpy, expected):
+    """A bimanual OpenArm got -10.1 instead of -0.06 N m."""
+    stand = (
+        '<link name="stand"/><joint name="mount" type="fixed"><parent link="stand"/>'
+        f'<child link="panda_link0"/><origin rpy="{" ".join(map(str, rpy))}"/></joint></robot>'
+    )
+    given = {
+        'robot.urdf': PANDA_TEXT.replace('</robot>', stand),
+        'robot.base': 'panda_link0',
+        'robot.tip': 'panda_hand_tcp',
+        'joints': PANDA,
+    }
+    np.testing.assert_allclose(
+        build(ControllerConfig, given).robot.gravity, expected, atol=1e-9
+    )

@@ -154,6 +154,15 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
     return Chain(base, tip, tuple(chain), frame)
 
 
+def placement_of(text: str, link: str) -> np.ndarray:
+    """Return the frame (4, 4) of a link in that of the root, with all joints between at zero."""
+    tree = Tree.of(text)
+    frame = np.eye(4)
+    for element in tree.path(tree.root, link):
+        frame = product(frame, _origin(element))
+    return frame
+
+
 def _check_kind(joint: ET.Element) -> None:
     """Raise BlfDscError if a joint cannot be part of a chain."""
     name = joint.get('name', '')

@@ -13,7 +13,7 @@ from functools import lru_cache
 from math import isfinite
 from typing import NamedTuple
 
-from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.arms.urdf import Chain, placement_of
 from blf_dsc_controller.arms.xml_text import parse_xml
 from blf_dsc_controller.errors import BlfDscError
 
@@ -81,9 +81,20 @@ def rotors_of(text: str, chain: Chain) -> tuple[float, ...]:
     return known if len(known) == len(found) and any(known) else ()
 
 
-def gravity_of(text: str, chain: Chain) -> tuple[float, ...]:
-    """Return gravity (3,) in the frame of the base; empty if the text does not say."""
-    return describe(text).gravity.get(chain.base, ())
+def gravity_of(
+    text: str, chain: Chain, at_root: tuple[float, ...]
+) -> tuple[float, ...]:
+    """Return gravity (3,) [m/s^2] in the frame of the base, as the text says.
+
+    Where it does not, gravity is `at_root` (3,) in the frame of the root, whose z is up, and fixed
+    joints may turn the base.
+    """
+    said = describe(text).gravity.get(chain.base)
+    if said is not None:
+        return said
+    turn = placement_of(text, chain.base)[:3, :3]
+    turned = (turn.T @ at_root).round(12) + 0.0  # no negative zeros
+    return tuple(turned.tolist())
 
 
 def _numbers(element: ET.Element, key: str, count: int) -> tuple[float, ...]:

@@ -90,7 +90,8 @@ class Robot:
     )
     gravity: Vector = _fixed(
         (0.0, 0.0, -9.81),
-        'gravity in the base frame (default for an MJCF: its own); (0, 0, 9.81): '
+        'gravity in the base frame (default: -9.81 along z of the root, for an MJCF its own); '
+        '(0, 0, 9.81): '
         'ceiling mount',
         'm/s^2',
         'g',
@@ -393,8 +394,8 @@ def given_robot(given: Mapping[str, Any]) -> tuple[Robot, Chain]:
     except BlfDscError as error:
         name = 'joints' if _has_chain(robot) else 'robot.urdf'
         raise ConfigurationError([f'{name}: {error}']) from error
-    gravity = gravity_of(robot.text, chain)
-    if gravity and 'robot.gravity' not in given:
+    if 'robot.gravity' not in given:
+        gravity = gravity_of(robot.text, chain, robot.gravity)
         robot = replace(robot, gravity=gravity)
     return robot, chain
 

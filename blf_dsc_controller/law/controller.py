@@ -16,6 +16,7 @@ from blf_dsc_controller.law.check_state import checks_of, checks_size
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
 from blf_dsc_controller.law.perception import sense, weigh
+from blf_dsc_controller.law.start import Start, keep
 from blf_dsc_controller.law.state import (
     Settings,
     sample_of,
@@ -120,6 +121,12 @@ class Controller:
         self.state.latch.active.fill(1.0)
         self.state.rotors.gain_scale.fill(1.0)
         friction.begin(self.settings.friction, self.state.friction)
+
+    def begin(self, start: Start) -> None:
+        """Begin with the next update; of the state, what `KEPT` names for this start goes on."""
+        before = state_of(self.save(), self.settings)
+        self.reset()
+        keep(start, before, self.state)
 
     def update(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.

@@ -73,7 +73,7 @@ class State(NamedTuple):
     filtered: Annotated[Array, 'n * contact.enabled', 'm + 1']  # [X_L | u_L]
     latch_time: Cell  # s, when the window of `factor` was latched; 0: it is the prior's
     factor: Annotated[Array, 'm * contact.enabled', 'm']  # of Phi_e + rho R, or of R
-    variance: Cell  # a: that times its inverse is the covariance of theta
+    variance: Cell  # a: that times its inverse is the covariance of theta; 0: it has not begun
     # of r by theta, less what a tare says of r, (N m)^2
     covariance: Annotated[Array, 'n * contact.enabled', 'n']
     spread: Annotated[Array, 'n * contact.enabled', 'n']  # factor of S

@@ -27,7 +27,7 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Let `load_observer` find r by the row of the last interval, before its poles."""
     of, now, row = settings.observer, state.observer, signals.row.Xu
-    if state.samples[0] <= 1.0:
+    if now.elapsed[0] == 0.0:
         load_observer.begin(now, state.disturbance)
     if load_observer.is_missing(signals.effort):
         return

@@ -38,7 +38,7 @@ CONTACT, DISTANCE = 0, 1  # in `sample.contact`
 @inner
 def update_covariance(settings: Settings, state: State) -> None:
     """Give `external_torque` the covariance of theta: of the prior, then of each full window."""
-    if state.samples[0] <= 1.0:
+    if state.external.variance[0] == 0.0:
         external_torque.begin(settings.external, state.external, settings.information)
         return
     if state.change.changes[0] != state.external.tare_changes[0]:

@@ -10,7 +10,8 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 
-_BRIDGED = 3.5  # samples, for which a reading may be repeated
+BRIDGED = 3.5
+"""Samples for which a reading may be repeated."""
 
 
 class State(NamedTuple):
@@ -36,7 +37,7 @@ def bridge(
         repeats = repeats and measurement[i] == state.read[i]
         state.read[i] = measurement[i]
     state.age[0] = state.age[0] + dt if repeats else 0.0
-    is_bridged = repeats and state.age[0] < _BRIDGED * sample_time
+    is_bridged = repeats and state.age[0] < BRIDGED * sample_time
     for i in range(n):
         state.used[i] = measurement[i]
         state.used[n + i] = measurement[n + i]

@@ -83,6 +83,7 @@ class Settings(NamedTuple):
 class State(NamedTuple):
     """What it keeps from one row to the next."""
 
+    begun: Cell  # 1: the load has been solved for, at first by the prior
     rows: Annotated[Array, 5]  # moving ones in each part
     sums: Annotated[Array, 5, 'weighing.size', 'weighing.size']  # of [X | u]^T [X | u]
     complete: Cell  # 1: the rows before are complete
@@ -144,7 +145,7 @@ def add_row(
     find_held(settings, state, work.held)
     extend_row(sample, work.held, row)
     weight_row(row, dqr)
-    if samples <= settings.row_interval:
+    if state.begun[0] == 0.0:
         begin(settings, state, work, prior, period)
     elif has_changed:
         end_part(settings, state, work, prior, period)
@@ -258,6 +259,7 @@ def begin(
     settings: Settings, state: State, work: Work, prior: Prior, period: float
 ) -> None:
     """Begin with an arm of which only the prior is known."""
+    state.begun[0] = 1.0
     innovation.begin(state.innovation, settings.unmodelled)
     discard(state, BEFORE)
     state.complete[0] = 0.0

@@ -55,6 +55,7 @@ _CHASES = 8  # attempts to join a line that moves on meanwhile ...
 _LATE = 1e-6  # ... up to this part of the duration
 _CHECKS = 17  # times at which a quintic is checked
 _PAST = 1e-9  # rad past a position limit, by rounding
+_OTHER_UNITS = 0.2  # of a range, past which a target is not reduced to its end
 _ROUNDING = 1.0 - 1e-9  # of a limit, for target velocities
 
 
@@ -303,7 +304,8 @@ def plan_target(
     """Return a reference that is `vector` until `now` [s], then goes to a target.
 
     It joins the target's line when it is due, or as soon as the limits allow. Positions
-    and velocities past the limits are reduced to them.
+    a little past the limits, as of a leader with a larger range, and velocities are reduced
+    to them.
 
     Raises:
         TrajectoryError: it is not valid, ruckig is not installed, or the motion would leave the
@@ -316,6 +318,7 @@ def plan_target(
         raise TrajectoryError([f'it has {given} for {n} joints'])
     if not np.isfinite((*target.positions, *target.velocities)).all():
         raise TrajectoryError(['its values are not all finite'])
+    _check_units(target, config)
     try:
         return _plan_line(target, vector, now, config)
     except MotionError as error:
@@ -361,6 +364,21 @@ def _plan_line(
     end = now + sum(part.duration for part in parts)
     _check_positions(term, now, end, config)
     return PlannedMotion(following(vector, term), now + join.duration, end)
+
+
+def _check_units(target: Target, config: ControllerConfig) -> None:
+    """Raise TrajectoryError for positions so far past the limits that they are in other units."""
+    limits = config.limits
+    lower, upper = np.array((limits.position_lower, limits.position_upper))
+    q = np.array(target.positions)
+    past = np.maximum(lower - q, q - upper)
+    for i in np.flatnonzero(past > _OTHER_UNITS * (upper - lower)):
+        unit = config.units[i].position
+        problem = (
+            f'joint {config.joints[i]!r} is sent to {q[i]:g} {unit}, far outside its range of '
+            f'{lower[i]:g} to {upper[i]:g} {unit}: are they in degrees, or in parts of a range?'
+        )
+        raise TrajectoryError([problem])
 
 
 def _within_limits(

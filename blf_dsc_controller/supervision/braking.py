@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import inertia_matrices
+from blf_dsc_controller.law.sensor import FILTER
 from blf_dsc_controller.law.state import Settings
 
 Array = NDArray[np.float64]
@@ -37,14 +38,15 @@ def braking_matrix(
 
 
 def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Array:
-    """Return the `damping` (n,) [N m s/rad] of joints that a gap of states allows them.
+    """Return the `damping` (n,) [N m s/rad] of joints that low pass and gap allow them.
 
-    A torque -D v that is held for h turns v into v - h M^-1 D v.  While no eigenvalue of
-    h M0^-1 D is above 1, it reverses no motion of the model; above 2, each gap leaves a
-    faster one than before.  So no rate is above 1/h, and what the coupling of the joints
-    adds to that divides D.  Without a gap, `gap` is 0.
+    Behind the low pass of v no rate D/M0 is above 1/tau (`Swing`).  A torque -D v that is held
+    for h turns v into v - h M^-1 D v.  While no eigenvalue of h M0^-1 D is above 1, it reverses
+    no motion of the model; above 2, each gap leaves a faster one than before.  So no rate is
+    above 1/h, and what the coupling of the joints adds to that divides D.  Without a gap, `gap`
+    is 0.
     """
-    M = _inertia(settings, q) if gap > 0.0 else None
+    M = _inertia(settings, q)
     if M is None:
         return damping
     inertia = np.diagonal(M)
@@ -62,7 +64,8 @@ def _inertia(settings: Settings, q: Array) -> Array | None:
 
 
 def _least_rate(rate: Array, gap: float) -> Array:
-    return np.minimum(rate, 1.0 / gap) if gap > 0.0 else rate
+    """Return the rates (n,) that low pass and gap bear: 1/tau makes a joint half critical."""
+    return np.minimum(rate, 1.0 / max(gap, FILTER))
 
 
 def _without_reversal(D: Array, M: Array, gap: float) -> Array:

@@ -39,6 +39,7 @@ from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
+from blf_dsc_controller.supervision.last_state import Doubt
 from blf_dsc_controller.supervision.motions import Motions
 from blf_dsc_controller.supervision.starting import Starting
 from blf_dsc_controller.supervision.state_check import SKIP
@@ -97,24 +98,39 @@ class Guard(InCommand):
         self.readings.take_stamp(stamp)
         self.watchdog.restart()
         measurement, wrapped = self._count_turns(measurement)
-        self.readings.replace_velocities(stamp, measurement)
+        doubt = self.doubt(stamp, measurement)
+        if doubt is Doubt.OUT_OF_REACH and self.supervisor.phase is Phase.STARTING:
+            self.readings.compare_anew()  # from where the next episode begins
+        if doubt is None or not self.supervisor.running:
+            self.readings.replace_velocities(stamp, measurement)
         if self.readings.is_after_gap:
             self.held.after_gap = measurement
         if not self.supervisor.uses_states:
+            if self.states.ignores(is_copy=doubt is Doubt.COPY):
+                return None
             self.withdraw_after_silence(gap)
             if self.silenced:
                 return None
-            return self._safe_at(stamp, measurement)
+            return self._safe_at(stamp, measurement, doubt)
         fault = self.states.check(self.config.safety, stamp)
         if fault is SKIP:
             return None
         fault = fault or wrapped
         if fault is None and self.supervisor.running:
-            fault = self._clock_step(measurement)
+            fault = self._doubtful(measurement, doubt) or self._clock_step(measurement)
         if fault is None:
-            return self._use(stamp, measurement)
+            return self._use(stamp, measurement, doubt)
         self._wait_or_stop(*fault)
-        return self._safe_at(stamp, measurement)
+        return self._safe_at(stamp, measurement, doubt)
+
+    def _doubtful(self, measurement: Vector, doubt: Doubt | None) -> Fault | None:
+        """Return the fault of a state in `doubt`, unless the law says what is wrong with it."""
+        if doubt is Doubt.OUT_OF_REACH and not self.readings.is_after_gap:
+            last = self.safe_torque.last.q
+            return self.states.jumped(self.readings.gap, last, measurement)
+        if doubt is Doubt.REPEATED:
+            return self.states.hangs(measurement)
+        return None
 
     def _count_turns(self, measurement: Vector) -> tuple[Vector, Fault | None]:
         """Count turns on in a measurement; return it, and the fault of an impossible wrap.
@@ -139,12 +155,14 @@ class Guard(InCommand):
             return None  # it has been braked or driven on: the time has passed
         return self.states.clock_step(gap, q - last.q, mean)
 
-    def _use(self, stamp: int, measurement: Vector) -> Vector | None:
+    def _use(
+        self, stamp: int, measurement: Vector, doubt: Doubt | None
+    ) -> Vector | None:
         """Return the law's torque for a state, or the safe torque if it cannot be used."""
         if self.supervisor.phase is Phase.STARTING:
-            if not is_valid_state(self.controller.checks, measurement):
-                self._wait_for_valid(measurement)
-                return self._safe_at(stamp, measurement)
+            if problem := self._problem_to_start(measurement):
+                self.starting.wait(problem)
+                return self._safe_at(stamp, measurement, doubt)
             self.starting.forget_load_after_gap(stamp, measurement)
             self._take(stamp, measurement)
             if not self.starting.start(stamp, measurement):
@@ -152,12 +170,12 @@ class Guard(InCommand):
         elif self.held.after_gap is not None and not self.starting.rejoin(
             stamp, measurement
         ):
-            return self._safe_at(stamp, measurement)
+            return self._safe_at(stamp, measurement, doubt)
         dt = (stamp - self.reference.last_stamp) * NANOSECOND
         torque = self._update_law(stamp, dt, measurement)
         if self.controller.flags & INVALID:
             self.findings.stop_at_invalid(stamp, measurement)
-            return self._safe_at(stamp, measurement)
+            return self._safe_at(stamp, measurement, doubt)
         self._take(stamp, measurement)
         self._advance_to(stamp)
         self.findings.check_efforts()
@@ -171,10 +189,13 @@ class Guard(InCommand):
         self.journal.commands += 1
         return torque
 
-    def _wait_for_valid(self, measurement: Vector) -> None:
-        """Wait for another state to start from, since the law finds this one invalid."""
-        invalid = self.states.invalid(self.config.safety, measurement)
-        self.starting.wait(invalid.text)
+    def _problem_to_start(self, measurement: Vector) -> str:
+        """Return why the law does not start from a state; empty if it does."""
+        if not is_valid_state(self.controller.checks, measurement):
+            return self.states.invalid(self.config.safety, measurement).text
+        if not self.readings.have_shown(measurement):
+            return 'its positions have not shown its velocities yet'
+        return ''
 
     def _update_law(self, stamp: int, dt: float, measurement: Vector) -> Vector:
         """Return the law's torque (n,) [N m], `dt` [s] after its last sample."""
@@ -196,10 +217,15 @@ class Guard(InCommand):
         self.readings.take_stamp(stamp)
         self.findings.compare_velocities(stamp, self._count_turns(measurement)[0])
 
-    def _safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
+    def _safe_at(
+        self, stamp: int, measurement: Vector, doubt: Doubt | None
+    ) -> Vector | None:
         """Return the safe torque for a state that the law has not used."""
-        self.findings.compare_velocities(stamp, measurement)
-        return self.safe_at(stamp, measurement)
+        if doubt is None:
+            self.findings.compare_velocities(stamp, measurement)
+        else:
+            self.readings.skip()
+        return self.safe_at(stamp, measurement, doubt)
 
     def _take(self, stamp: int, measurement: Vector) -> None:
         """Keep a state that the law uses, with its stamp [ns]."""

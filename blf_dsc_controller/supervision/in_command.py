@@ -24,6 +24,7 @@ from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
+from blf_dsc_controller.supervision.last_state import Doubt
 from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 from blf_dsc_controller.supervision.readings import Readings
 from blf_dsc_controller.supervision.running_reference import RunningReference
@@ -88,6 +89,8 @@ class InCommand:
         sensor = self.controller.checks.sensor
         self.safe_torque.noise = sensor.noise[:n]
         self.safe_torque.resolution = sensor.resolution
+        self.safe_torque.last.resolution = sensor.resolution
+        self.safe_torque.longest_step = config.sample_time
         self.held = HeldTorque(config, self.controller, self.estimates)
         self.safe_stop = SafeStop(
             config, self.controller, self.estimates, self.safe_torque, self.held
@@ -225,14 +228,29 @@ class InCommand:
             self.supervisor.add(swings)
         return torque
 
-    def safe_at(self, stamp: int, measurement: Vector) -> Vector | None:
-        """Return the safe torque for a state that the law has not used."""
-        limit = self.config.safety.velocity_limit
-        T = self.config.sample_time
-        self.safe_torque.last.take_usable(stamp, measurement, limit, T)
-        self._observe_speed()
+    def doubt(self, stamp: int, measurement: Vector) -> Doubt | None:
+        """Return why a state is not trusted; None: it is."""
+        limit, T = self.config.safety.velocity_limit, self.config.sample_time
+        return self.safe_torque.last.doubt(stamp, measurement, limit, T)
+
+    def safe_at(
+        self, stamp: int, measurement: Vector, doubt: Doubt | None
+    ) -> Vector | None:
+        """Return the safe torque for a state that the law has not used.
+
+        A state in doubt shows no motion, and a copy or two of the last one change nothing.
+        """
+        last, T = self.safe_torque.last, self.config.sample_time
+        is_starting = self.supervisor.phase is Phase.STARTING
+        if doubt is None or (is_starting and doubt is not Doubt.NOT_FINITE):
+            limit = self.config.safety.velocity_limit
+            last.follow(stamp, measurement, limit, T, continues=doubt is None)
+            self._observe_speed()
+        else:
+            last.skip(T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
-        return self.safe(T * max(1, round(self.readings.gap / T)))
+        gap = self.readings.gap
+        return self.safe(gap if 0.0 < gap < T else T * max(1, round(gap / T)))
 
     def safe_without_state(self, dt: float) -> Vector | None:
         """Return the safe torque, `dt` [s] later, by the last state."""

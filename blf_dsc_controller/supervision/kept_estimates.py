@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.start import Start
 from blf_dsc_controller.law.torque_sensors import is_fading
 
 Vector = NDArray[np.float64]
@@ -59,8 +60,8 @@ class KeptEstimates:
         self._past.kept[:] = self._past.moved
 
     def restore(self) -> None:
-        """Reset the law, but set its estimates to the kept ones."""
-        self._controller.reset()
+        """Let the law begin with the kept ones."""
         state = self._controller.state
         state.estimate[:] = self.estimate
         state.disturbance[:] = self.disturbance
+        self._controller.begin(Start.AFTER_STOP)

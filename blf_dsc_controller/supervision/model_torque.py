@@ -29,17 +29,26 @@ def model_torque(
     return np.asarray((H * estimate[: settings.p]).sum(axis=1))
 
 
-def friction_torque(settings: Settings, estimate: Vector, dq: Vector) -> Vector:
-    """Return the friction (n,) [N m] of the estimate at dq (n,) [rad/s], zero without columns."""
-    n = settings.n
-    at = settings.p + settings.n * settings.columns.bias
+def friction_torque(
+    settings: Settings, estimate: Vector, dq: Vector, tau: Vector
+) -> Vector:
+    """Return the friction (n,) [N m] of the estimate, zero without columns.
+
+    It is that at dq (n,) [rad/s], of gears that carry tau (n,) [N m].
+    """
+    of, n = settings.columns, settings.n
+    signs = np.array([sliding(v, of.coulomb_velocity) for v in dq])
+    shapes = (
+        (of.viscous, dq),
+        (of.coulomb, signs),
+        (of.load_friction, np.abs(tau) * signs),
+    )
+    at = settings.p + n * of.bias
     torque = np.zeros(n)
-    if settings.columns.viscous:
-        torque += estimate[at : at + n] * dq
-        at += n
-    if settings.columns.coulomb:
-        smoothing = settings.columns.coulomb_velocity
-        torque += estimate[at : at + n] * [sliding(v, smoothing) for v in dq]
+    for has_columns, shape in shapes:
+        if has_columns:
+            torque += estimate[at : at + n] * shape
+            at += n
     return torque
 
 
@@ -49,6 +58,6 @@ def needed_torque(
     """Return the command (n,) [N m] behind a motion, by model and friction of the estimate."""
     with np.errstate(over='ignore', invalid='ignore'):  # the caller checks it
         needed = model_torque(settings, estimate, q, dq, ddq)
-        needed += friction_torque(settings, estimate, dq)
+        needed += friction_torque(settings, estimate, dq, needed)
     needed -= added_torque(settings.torque, q)
     return needed

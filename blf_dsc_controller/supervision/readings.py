@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.sensor import restart
+from blf_dsc_controller.law.sensor import FILTER, restart
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.supervisor import Fault
@@ -20,6 +20,8 @@ from blf_dsc_controller.supervision.velocity import Velocity
 from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
+
+_SHOWN = 0.1  # rad/s: a slower motion, or half of it, does no harm if it is none
 
 
 class Readings:
@@ -42,15 +44,23 @@ class Readings:
         self._wraps = Wraps(config)
         is_estimated = config.safety.velocity == 'estimated'
         self._velocity = Velocity(self._n) if is_estimated else None
-        self._seen = 0  # stamp of the last state
+        self._seen = self._before = 0  # stamps of the last state, and of the one before
 
     def take_stamp(self, stamp: int) -> None:
         """Begin a state; velocities are compared anew unless it follows the one before."""
         self.gap = (stamp - self._seen) * NANOSECOND
         self.is_after_gap = is_gap(self.gap, self._sample_time)
-        self._seen = stamp
+        self._before, self._seen = self._seen, stamp
         if self.gap < 0.0 or self.is_after_gap:
-            restart(self._controller.checks.sensor)
+            self.compare_anew()
+
+    def compare_anew(self) -> None:
+        """Compare velocities with positions from the next state on."""
+        restart(self._controller.checks.sensor)
+
+    def skip(self) -> None:
+        """Let the next state follow the one before this one, which is not trusted."""
+        self._seen = self._before
 
     def count_turns(
         self, measurement: Vector, fastest: float
@@ -73,6 +83,19 @@ class Readings:
             return False
         return self._controller.compare_velocities(self.gap, measurement)
 
+    def have_shown(self, measurement: Vector) -> bool:
+        """Whether positions have shown the velocities of a measurement, which begins a motion.
+
+        Those of an arm that rests need no time to show.
+        """
+        dq = measurement[self._n : -self._n]
+        sensor = self._controller.checks.sensor
+        if np.abs(dq).max() < _SHOWN:
+            return True
+        off = np.abs(dq - self.velocity)
+        has_settled = sensor.readings[0] * self._sample_time >= FILTER
+        return bool(has_settled and (off <= np.maximum(_SHOWN, 0.5 * np.abs(dq))).all())
+
     def distrust_velocities(self, stamp: int, measurement: Vector) -> None:
         """Difference all velocities from the positions, from this measurement on."""
         sensor = self._controller.checks.sensor
@@ -91,7 +114,7 @@ class Readings:
         if not self._wraps.restart():
             return
         # to positions that differ from those before
-        restart(self._controller.checks.sensor)
+        self.compare_anew()
         if self._velocity is not None:
             self._velocity = Velocity(self._n)
 

@@ -12,7 +12,7 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.model_torque import gravity_torque
-from blf_dsc_controller.supervision.safe_torque import SafeTorque
+from blf_dsc_controller.supervision.safe_torque import Load, SafeTorque
 from blf_dsc_controller.supervision.stop_speed import StopSpeed
 from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.supervision.swing_names import SwingNames
@@ -89,15 +89,15 @@ class SafeStop:
         ramp = safety.deactivation_ramp
         if safety.torque == 'hold_gravity' and fastest * ramp > 2.0 * _FASTER:
             ramp = 2.0 * _FASTER / fastest
-        self._torque.begin_ramp(ramp, self._held.load())
+        self._torque.begin_ramp(ramp, self._held.load(), source=Load.UNTIL_MOVED)
 
     def begin_anew(self, safety: Safety, load: Vector) -> None:
         """Begin the ramp of a law that forgets what it has learned, with this load (n,) [N m]."""
         self._swings.begin()
         self._torque.begin_ramp(safety.stop_ramp, load)
 
-    def carried(self, safety: Safety) -> Vector | None:
-        """Return the load (n,) [N m] besides the initial estimate that the safe torque carries.
+    def carried(self, safety: Safety, estimate: Vector) -> Vector | None:
+        """Return the load (n,) [N m] besides an estimate (m,) that the safe torque carries.
 
         None: it holds none, or the arm has not shown that it does.
         """
@@ -105,7 +105,7 @@ class SafeStop:
             return None
         settings, q = self._controller.settings, self._torque.last.q
         held = gravity_torque(settings, self._estimates.estimate, q) + self._torque.load
-        return held - gravity_torque(settings, settings.initial_estimate, q)
+        return held - gravity_torque(settings, estimate, q)
 
     def advance(self, safety: Safety, dt: float) -> Vector | None:
         """Return the torque (n,) [N m] `dt` [s] later; None before a usable state."""

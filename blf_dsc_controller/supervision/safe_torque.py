@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import Enum
 from math import inf
 
 import numpy as np
@@ -28,9 +29,20 @@ OBSERVER = 60.0, 30.0
 FADE_TIME = 0.5
 """Time [s] in which the torque fades while no usable state arrives."""
 
+_RESTED = 10.0 / OBSERVER[1]  # s at rest, in which the observed load settles
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
 # of the damping: an elastic joint that oscillates passes for a light one
 _LIGHTEST = 0.5
+
+
+class Load(Enum):
+    """Where the load besides the model comes from."""
+
+    OBSERVED = 'from the motion, since the commands act on the arm'
+    UNTIL_MOVED = 'from the motion until the arm has rested and moves again'
+    KEPT = 'as the arm rested: another moves it'
+    REFUTED = 'as the ramp began: the arm has sped up since'
+    YIELDS = 'as the ramp began, to give way to a contact'
 
 
 def safe_torque(
@@ -80,11 +92,13 @@ class SafeTorque:
     Above its first resonance, an elastic joint accelerates other than a rigid one, and shows
     a wrong load.  An observer with one pole of 30 1/s lets an oscillation go on at up to
     20 rad/s.  Two poles of 10 1/s do not feed an oscillation, but let a load sink further: an
-    arm that oscillates at the stop has these, and so has each joint that swings during it.
+    arm that oscillates at the stop has these, and so has each joint that swings during it, and
+    one that has left command and rests.
 
     If commands do not reach the arm, the observed load would grow for ever.  After a stop that
     may have this cause, the load is kept until the arm accelerates, as it does if commands act
-    on it (`CommandEffect`).  Once the arm has sped up the load is kept for good.
+    on it (`CommandEffect`).  So it is while another node may command the arm, and once the
+    arm has sped up (`Load`).
 
     A joint that swings under its damping gets the share of it that it bears (`Swing`).
 
@@ -121,8 +135,8 @@ class SafeTorque:
         self._effect = CommandEffect(n)
         self._swing = Swing(n)
         self._reached = True
-        self._observes = True
-        self._yields = False
+        self._source = Load.OBSERVED
+        self._rested = 0.0  # s, in a row
 
     @property
     def has_swung(self) -> NDArray[np.bool_]:
@@ -132,13 +146,18 @@ class SafeTorque:
     @property
     def carries(self) -> bool:
         """Whether `load` is what the arm has shown that its commands carry."""
-        return self._observes and self._reached
+        return (self._observes or self._source is Load.KEPT) and self._reached
+
+    @property
+    def _observes(self) -> bool:
+        return self._source in (Load.OBSERVED, Load.UNTIL_MOVED)
 
     def begin_ramp(
         self,
         duration: float,
         load: Vector,
         *,
+        source: Load = Load.OBSERVED,
         reached: bool = True,
         oscillates: bool = False,
     ) -> None:
@@ -153,8 +172,8 @@ class SafeTorque:
         self._reached = reached
         self._oscillates = oscillates
         self._swing.begin()
-        self._observes = True
-        self._yields = False
+        self._source = source
+        self._rested = 0.0
         self._start[:] = self.commanded
         self._duration = duration
         self._elapsed = 0.0
@@ -162,7 +181,7 @@ class SafeTorque:
     def yield_to_contact(self) -> None:
         """Give way, with gravity and damping, until the next ramp; observe no load."""
         self.stop_observing()
-        self._yields = True
+        self._source = Load.YIELDS
 
     def start_observing(self) -> None:
         """Observe the load from now on: it is known that commands reach the arm."""
@@ -175,7 +194,7 @@ class SafeTorque:
     def stop_observing(self) -> None:
         """Return to the load that was known at the stop, until the next ramp."""
         self.load[:] = self._known_load
-        self._observes = False
+        self._source = Load.REFUTED
 
     @property
     def is_settled(self) -> bool:
@@ -206,8 +225,9 @@ class SafeTorque:
         if self.last.age == inf:
             return None
         self.missed_change = None
-        if self._yields:
+        if self._source is Load.YIELDS:
             safety = replace(safety, torque='hold_gravity')
+        self._keep_load_once_moved(dt)
         if safety.torque == 'hold_gravity' and self._observes:
             needed = self._needed(settings, estimate)
             if needed is not None:
@@ -228,6 +248,16 @@ class SafeTorque:
         limit = settings.torque.limit
         self.commanded[:] = np.clip(goal, -limit, limit)
         return self.commanded
+
+    def _keep_load_once_moved(self, dt: float) -> None:
+        """Observe the load of an arm that has left command until it has rested, and moves again."""
+        if self._source is not Load.UNTIL_MOVED or self.last.age > 0.0:
+            return
+        moves = float(np.abs(self.last.slow).max()) > AT_REST
+        if moves and self._rested > _RESTED:
+            self._source = Load.KEPT
+        is_over = self._elapsed >= self._duration
+        self._rested = self._rested + dt if is_over and not moves else 0.0
 
     def observe(self, settings: Settings, estimate: Vector, dt: float) -> None:
         """Update the load by the motion of the last `dt` [s] and its torque, of another."""
@@ -264,7 +294,7 @@ class SafeTorque:
         lacking = self.commanded - needed
         for each in (self._usual, self._calm):
             each.update(lacking, limit, dt)
-        is_calm = self._oscillates | self._swing.has_swung
+        is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
 
     def _begin_observing(self, load: Vector | float) -> None:

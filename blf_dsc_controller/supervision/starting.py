@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.errors import BlfDscError, StartError
 from blf_dsc_controller.law.checks import is_valid_state
+from blf_dsc_controller.law.start import Start
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import MotionError
@@ -41,14 +42,23 @@ class Starting:
         self._takeover = Takeover(command.controller, command.reference, command.held)
 
     def activate(self) -> None:
-        """Take command with the next state, and what was learned before a fault."""
+        """Take command with the next state, and what was learned before a fault.
+
+        After one, the law carries on what the safe torque carries besides the model.
+        """
         command = self._command
         command.note(EventType.ACTIVATE)
+        load = None
+        law = command.controller
+        if law.samples:
+            self._takeover.left_at = law.signals.q.copy()
         if command.clean:
-            command.controller.state.samples[0] = 0.0
+            law.begin(Start.AGAIN)
         else:
+            load = self._held(command.estimates.estimate)
             command.estimates.restore()
         self._start_over()
+        self._takeover.carried = load
         command.watchdog.restart()
 
     def reset(self) -> None:
@@ -85,20 +95,20 @@ class Starting:
             return command.held.load_before_learning()
         if command.supervisor.phase is Phase.STARTING:
             return self._takeover.carried  # of a reset just before
+        load = self._held(command.controller.settings.initial_estimate)
+        return None if load is None else load - forgotten
+
+    def _held(self, estimate: Vector) -> Vector | None:
+        """Return the load (n,) [N m] of the safe torque besides an estimate (m,), if it has one."""
+        command = self._command
         if not command.commanding or command.silenced:
             return None
-        load = command.safe_stop.carried(command.config.safety)
-        return None if load is None else load - forgotten
+        return command.safe_stop.carried(command.config.safety, estimate)
 
     def forget_load_after_gap(self, stamp: int, measurement: Vector) -> None:
         """Drop the carried load after a gap, in which another controller may hold the arm."""
         command = self._command
-        fastest, period = (
-            command.config.safety.velocity_limit,
-            command.config.sample_time,
-        )
-        q = measurement[: len(command.config.joints)]
-        if not command.safe_torque.last.leads_to(stamp, q, fastest, period):
+        if command.readings.is_after_gap or command.doubt(stamp, measurement):
             self._takeover.carried = None
 
     def prepare(self, positions: Vector) -> None:

@@ -111,10 +111,17 @@ class StateCheck:
         """States missing between two that came, on average since the start."""
         return self.missed / max(self._taken - 1, 1)
 
-    def _check_repeats(self) -> Fault:
+    def ignores(self, *, is_copy: bool) -> bool:
+        """Whether a state is one of a few with the stamp of the one before."""
+        if not is_copy:
+            self._repeats = 0
+            return False
         self.repeated += 1
         self._repeats += 1
-        if self._repeats <= _REPEATS:
+        return self._repeats <= _REPEATS
+
+    def _check_repeats(self) -> Fault:
+        if self.ignores(is_copy=True):
             return SKIP
         text = (
             f'{self._repeats} joint states in a row repeat the stamp of the one before them: the '
@@ -136,6 +143,29 @@ class StateCheck:
             f'{self._sample_time:g} s (sample_time)'
         )
         return Fault(Reason.OVERRUN, text)
+
+    def jumped(self, gap: float, before: Vector, measurement: Vector) -> Fault:
+        """Return the fault of positions that no arm reaches from `before` (n,) in `gap` [s]."""
+        step = measurement[: before.size] - before
+        worst = int(np.argmax(np.abs(step)))
+        unit = self._units[worst].position
+        text = (
+            f'the position of joint {self._joints[worst]!r} jumps by {step[worst]:+.3g} {unit} in '
+            f'{gap:.3g} s, which no arm does: two nodes publish joint states, or a sensor is faulty'
+        )
+        return Fault(Reason.VELOCITY, text)
+
+    def hangs(self, measurement: Vector) -> Fault:
+        """Return the fault of a reading that is repeated, with new stamps, of an arm in motion."""
+        dq = measurement.reshape(3, -1)[1]
+        worst = int(np.argmax(np.abs(dq)))
+        unit = self._units[worst].of('rad/s')
+        text = (
+            'joint states repeat the same positions and velocities, although joint '
+            f'{self._joints[worst]!r} moves at {dq[worst]:+.3g} {unit}: the driver does not read '
+            'its arm any more, or reads it less often than it stamps states'
+        )
+        return Fault(Reason.STAMP_REPEATED, text)
 
     def contradicted(self, derived: Vector, measured: Vector) -> Fault:
         """Return the fault of velocities (n,) [rad/s] that contradict the positions."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.start import Start
 from blf_dsc_controller.reference.approach import BlendedReference
 from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.held_torque import HeldTorque
@@ -23,6 +24,7 @@ class Takeover:
         acting: torque (n,) [N m] by which another node holds the arm; None: none does.
         carried: load (n,) [N m] that acts at a reset, which the law goes on to carry; None: it
             begins with its estimates.
+        left_at: positions (n,) [rad] at which the law left command; None: it has had none.
     """
 
     def __init__(
@@ -30,6 +32,7 @@ class Takeover:
     ) -> None:
         self.acting: Vector | None = None
         self.carried: Vector | None = None
+        self.left_at: Vector | None = None
         self._controller = controller
         self._reference = reference
         self._held = held
@@ -60,6 +63,7 @@ class Takeover:
             again = commanded is not None
             motion = reference.plan_start(config, q, dq, again=again)
         self._controller.reference_vector = motion.vector
+        self._begin_elsewhere(q)
         self._begin_at_acting(q)
         if self.carried is not None:
             self._begin_with_load(self.carried)
@@ -89,9 +93,19 @@ class Takeover:
         motion = way(config, stamp, q, dq)
         if motion is None:
             return False
-        self._controller.state.samples[0] = 0.0
+        self._controller.begin(Start.AFTER_GAP)
         self._follow(motion, q, commanded)
         return True
+
+    def _begin_elsewhere(self, q: Vector) -> None:
+        """Keep nothing of the posture that the arm was left in, if it is elsewhere.
+
+        That is farther away than the bound on its error.
+        """
+        left_at, self.left_at = self.left_at, None
+        law = self._controller
+        if left_at is not None and (np.abs(q - left_at) > law.bound_at(0.0)).any():
+            law.begin(Start.ELSEWHERE)
 
     def _begin_at_acting(self, q: Vector) -> None:
         """Let the law begin with the torque that another node holds the arm by, if any."""

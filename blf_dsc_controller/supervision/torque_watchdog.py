@@ -63,6 +63,7 @@ class TorqueWatchdog:
         self._sensor = SensorNoise(len(config.joints))
         self._safe.noise = self._sensor.noise
         self._safe.resolution = self._sensor.resolution
+        self._safe.last.resolution = self._sensor.resolution
         self._swings = SwingNames(config.joints)
         self.config = config
         self._wraps = Wraps(config)
@@ -96,7 +97,7 @@ class TorqueWatchdog:
         T = self.config.sample_time_ns
         for k in (1, 2):  # the second one shows an acceleration
             limit = holding.velocity_limit
-            safe.last.take_usable(k * T, rest, limit, self.config.sample_time)
+            safe.last.follow(k * T, rest, limit, self.config.sample_time)
             safe.advance(holding, self._settings, self._estimate, 0.0)
 
     @property
@@ -134,12 +135,14 @@ class TorqueWatchdog:
 
     def take_state(self, stamp: int, measurement: Vector, now: float) -> None:
         """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
-        limit = self.config.safety.velocity_limit
+        limit, period = self.config.safety.velocity_limit, self.config.sample_time
         gap = (stamp - self.stamp) * 1e-9
         measurement, _ = self._wraps.count(measurement, gap, limit)
-        q = measurement[: self._settings.n]
-        self._sensor.take(q, gap, self.config.sample_time)
-        self._safe.last.take_usable(stamp, measurement, limit, self.config.sample_time)
+        last = self._safe.last
+        if last.doubt(stamp, measurement, limit, period):
+            return  # `poll` counts the time without a state
+        self._sensor.take(measurement[: self._settings.n], gap, period)
+        last.follow(stamp, measurement, limit, period)
         if now - self._seen_at > LONG_SILENCE:
             self._forget_controller()
         if stamp > self.stamp:
@@ -151,8 +154,13 @@ class TorqueWatchdog:
             self._commanded_stamp = stamp
 
     def take_torque(self, torque: Vector, now: float) -> None:
-        """Take a torque (n,) [N m] of the controller, and hand over to it."""
-        self._safe.commanded[:] = np.nan_to_num(torque)
+        """Take a torque (n,) [N m] of the controller, and hand over to it.
+
+        One that is not finite or beyond its limit is not of a controller in order.
+        """
+        if not (np.abs(torque) <= self._settings.torque.limit).all():
+            return
+        self._safe.commanded[:] = torque
         self._knows_torque = True
         self._commanded_at = now
         self._commanded_stamp = self.stamp
