@@ -74,7 +74,6 @@ def whole(a_study):
 
 
 FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
-MASS = 'uniform(0.3, 0.7)'
 
 
 @pytest.mark.parametrize(
@@ -109,84 +108,6 @@ def test_values_are_as_frequent_as_stated():
     assert 0.0 in maybe.extremes
     assert parse('uniform(0.5, 0.5)', float).at(0.9) == 0.5
     assert parse('choice(brake)', str).at(0.9) == 'brake'
-
-
-@pytest.mark.parametrize(
-    ('before', 'after', 'expected'),
-    [
-        (
-            'arm.m2',
-            'arm.m3',
-            r'line 15: vary.arm.m3: unknown parameter.* mean vary.arm.m[12]\?',
-        ),
-        ('arm.m2', 'initial.position', r'vary.initial.position: unknown parameter'),
-        (
-            'uniform(0.3',
-            'unifrm(0.3',
-            r"line 15: vary.arm.m2: got 'unifrm\(0.3, 0.7\)', but",
-        ),
-        (MASS, 'uniform(0.3)', r'with 1 values, but uniform\(low, high\) is'),
-        (MASS, 'uniform(a, 0.7)', r'but a number is expected between commas'),
-        (MASS, 'uniform(nan, 0.7)', r'must not be above the second'),
-        (
-            MASS,
-            'choice(inf)',
-            r'can give values that are not allowed: got .inf, but a fin',
-        ),
-        (MASS, 'uniform(0.7, 0.3)', r'must not be above the second'),
-        (MASS, 'maybe(1.3, 0.3, 0.7)', r'but a probability is from 0 to 1'),
-        (MASS, 'maybe(0.3, 0.4, 0.7)', r'not allowed: got 0.0, .* above 0'),
-        ('runs: 24', 'base: nothing', r'nothing does not exist: give a parameter file'),
-        (
-            'loguniform(1.0e-6',
-            'loguniform(0.0',
-            r'loguniform distribution begins above 0',
-        ),
-        (
-            'uniform(-0.9, 0.9)',
-            'uniform(-1.0, 0.9)',
-            r'initial.error: .* above -1 and below 1',
-        ),
-        (
-            'uniform(-0.9, 0.9)',
-            'uniform(-0.9, 1.0)',
-            r'initial.error: .* above -1 and below 1',
-        ),
-        (
-            'integers(0, 3)',
-            'uniform(0.0, 3.0)',
-            r'delay: got .*: integers\(low, high\), choice',
-        ),
-        (
-            'choice(measured,',
-            'choice(guessed,',
-            r'velocity: .* got "guessed", but it must be one',
-        ),
-        (
-            'uniform(-0.2, 0.2)',
-            '["uniform(0, 1)"]',
-            r'got 1 distributions, .* 2 entries \(joint1',
-        ),
-        ('runs: 24', 'runs: 0', r'line 11: runs: got 0, but it must be at least 1'),
-        (
-            'after: 0.2',
-            'after: 0.75',
-            r'settled_after: got 0.75 s, but a run ends at 0.75 s',
-        ),
-        (
-            'duration: 0.75',
-            'duration: 0.0',
-            r'sim_plant.duration: got 0 s, but every run must end',
-        ),
-        ('monte_carlo:', 'monte:', r'there is no section monte_carlo'),
-    ],
-)
-def test_problems_are_named(tmp_path, before, after, expected):
-    text = LOOP + STUDY
-    assert before in text
-    with pytest.raises(ConfigurationError, match=expected) as error:
-        study(tmp_path, text.replace(before, after, 1))
-    assert str(tmp_path / 'study.yaml') in str(error.value)
 
 
 def test_all_problems_are_named_at_once(tmp_path):
