@@ -122,6 +122,30 @@ def test_joint_bounds_follow_from_the_bound_at_the_tool(name):
         assert 0.99 * angle / 2.0 < turned[1] <= angle / 2.0 + ROUNDING
 
 
+def test_bounds_of_joints_that_slide_add_up_at_the_tool(tmp_path):
+    """Of a gantry, whose axes are at right angles."""
+    links = ('base', 'bridge', 'tip')
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    body = f'<inertial><mass value="2"/>{inertia}</inertial>'
+    text = ''.join(f'<link name="{name}">{body}</link>' for name in links)
+    for parent, child, axis in (
+        ('base', 'bridge', '1 0 0'),
+        ('bridge', 'tip', '0 1 0'),
+    ):
+        text += (
+            f'<joint name="to_{child}" type="prismatic"><parent link="{parent}"/>'
+            f'<child link="{child}"/><axis xyz="{axis}"/>'
+            '<limit lower="-1" upper="1" effort="40" velocity="1"/></joint>'
+        )
+    (tmp_path / 'gantry.urdf').write_text(f'<robot name="gantry">{text}</robot>')
+    (tmp_path / 'my.yaml').write_text(
+        '/**: {ros__parameters: {robot: {urdf: gantry.urdf, tip: tip}}}\n'
+        '/**/blf_dsc_controller: {ros__parameters: {barrier: {tool_bound: 0.003}}}\n'
+    )
+    bounds = blf.load_loop(tmp_path / 'my.yaml').controller.barrier.bound
+    assert 0.7 * 0.003 < np.hypot(*bounds) <= 0.003
+
+
 def test_page_shows_the_warning_of_the_preset_that_it_names():
     """A bound as many times as wide as the warning says has none."""
     page = Path(__file__).resolve().parents[1] / 'doc' / 'tool_bound.md'
