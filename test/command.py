@@ -14,12 +14,10 @@ COMPILED = 300.0  # s, likewise with kernels, which a first run compiles in two 
 # For real time on a machine too slow for it, where a controller would rightly stop.
 PATIENT = """blf_dsc_controller:
   ros__parameters:
-    insist: [safety.velocity_limit]
     safety:
       oscillation: ignore
       state_timeout: 1000.0
       watchdog: 'off'
-      velocity_limit: 1.0e+9
       error_ratio: 0.0
       saturation_time: 1000.0
       overrun_fraction: 1.0

@@ -189,7 +189,7 @@ def test_offline_run_needs_no_ros(tmp_path):
 
 
 def test_exit_code_shows_that_the_controller_stopped(tmp_path, capsys):
-    path = write_params(tmp_path, controller='safety.velocity_limit: 0.0001')
+    path = write_params(tmp_path, controller='safety.velocity_limit: [0.0001, 0.0001]')
     out = tmp_path / 'out'
     run = here(capsys, '--config', path, '--offline', '--duration', 0.1, '--out', out)
     assert run.returncode == 5, run.stderr

@@ -51,7 +51,8 @@ def test_urdf_and_tip_are_enough_to_configure_an_arm():
     assert config.torque.limit == (87.0,) * 4 + (12.0,) * 3
     assert config.limits.position_upper[3] == pytest.approx(-0.0698)
     assert config.safety.torque == 'hold_gravity'
-    assert config.safety.velocity_limit == pytest.approx(3.0 * 2.61)
+    speeds = [1.2 * 2.175] * 4 + [1.2 * 2.61] * 3
+    assert config.safety.velocity_limit == pytest.approx(speeds)
     names = estimate_names(config)
     assert len(names) == 48 + 14
     assert {'m*cx7', 'rotor7', 'viscous panda_joint1', 'coulomb panda_joint7'} <= set(

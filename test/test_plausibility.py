@@ -33,8 +33,14 @@ def each(value):
 CASES = {
     'torque twice': (UR5E, 'torque.limit', list(2.0 * EFFORTS), '150 N m', EFFORTS),
     'torque in mN m': (UR5E, 'torque.limit', list(1e3 * EFFORTS), '150 N m', EFFORTS),
-    'velocity': (UR5E, 'safety.velocity_limit', 180.0, 'Give 3.14', 30.0),
-    'velocity of two links': ({}, 'safety.velocity_limit', 180.0, 'Give 3.14', 100.0),
+    'velocity': (UR5E, 'safety.velocity_limit', each(180.0), 'Give 3.14', each(30.0)),
+    'velocity of two links': (
+        {},
+        'safety.velocity_limit',
+        [180.0] * 2,
+        'Give 3.14',
+        [100.0] * 2,
+    ),
     'motion': (UR5E, 'limits.velocity', each(90.0), 'Give 1.57', each(3.1)),
     'upper': (UR5E, 'limits.position_upper', each(180.0), 'Give 3.14', each(3.2)),
     'lower': (UR5E, 'limits.position_lower', each(-180.0), 'Give -3.14', each(-3.2)),

@@ -29,7 +29,7 @@ NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed'
 WEAK = {'torque.limit': [9.0, 3.2]}  # gravity alone takes 9.7 N m
 CASES = {
     'error past the bound': WEAK | HELD,
-    'velocity not plausible': {'safety.velocity_limit': 0.25},
+    'velocity not plausible': {'safety.velocity_limit': [0.25, 0.25]},
 }
 SATURATED = {'torque.limit': [10.5, 20.0]}  # for some samples, but tracking continues
 

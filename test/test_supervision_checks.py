@@ -192,7 +192,7 @@ def test_missing_and_implausible_velocities_are_differenced_from_the_positions(g
 
 def test_joint_that_is_really_too_fast_is_damped_most():
     """At its velocity limit: D is 2 and 1 N m s/rad."""
-    given = {'safety.torque': 'damping', 'safety.velocity_limit': 1.0}
+    given = {'safety.torque': 'damping', 'safety.velocity_limit': [1.0, 1.0]}
     arm = Scenario('recommended', given)
     start = arm.run(0.02).q[-1]
     q, dq = start, np.array([3.0, 0.1])

@@ -353,7 +353,7 @@ def test_retuning_leaves_a_joint_without_integrator_without_a_disturbance():
 def test_velocity_limit_changed_at_run_time_holds_from_the_next_state_on():
     arm = arm_of()
     speed = arm.run(0.1).speed[-1].max()
-    arm.change({'safety.velocity_limit': 0.5 * float(speed)})
+    arm.change({'safety.velocity_limit': [0.5 * float(speed)] * 2})
     arm.run(arm.T)
     assert arm.reason == 'velocity not plausible'
 

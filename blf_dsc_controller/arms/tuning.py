@@ -66,6 +66,8 @@ _FEW = 3  # postures, without and with payload, of known gears
 _ADAPTATION = 0.5  # Gamma, in units of the prior's covariance
 _FREE = 2.0 * math.pi  # rad, position limit of a joint without one
 _SLOW = 0.5  # fraction of the rated velocity
+_FASTEST = 1.2  # times the rated velocity, at which the arm stops ...
+_UNKNOWN = 3.0  # ... and times that of motions where it is not known
 
 
 def loop_delay(sample_time: float, lag: float) -> float:
@@ -233,6 +235,7 @@ def _limits_of(arm: Design) -> dict[str, Value]:
     joints = arm.chain.joints
     effort = _finite([joint.effort for joint in joints], UNKNOWN_EFFORT)
     velocity = _finite([joint.velocity for joint in joints], 2.0)
+    known = np.array([math.isfinite(joint.velocity) for joint in joints])
     acceleration = np.array([joint.acceleration for joint in joints])
     lower, upper = arm.limits
     fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
@@ -255,7 +258,9 @@ def _limits_of(arm: Design) -> dict[str, Value]:
         'safety.damping': _listed(
             _BRAKING * arm.over_postures().free_inertia * fastest
         ),
-        'safety.velocity_limit': 3.0 * float(velocity.max()),
+        'safety.velocity_limit': _listed(
+            np.where(known, _FASTEST, _UNKNOWN) * velocity
+        ),
     }
 
 

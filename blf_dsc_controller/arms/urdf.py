@@ -10,7 +10,8 @@ rules:
 - A link without `<inertial>` has no mass, but each body must have one.
 - Continuous joints, and joints without `<limit>`, have infinite limits; an effort or a
   velocity of 0 means no limit, and so does an acceleration.  Position limits are the
-  narrower ones of `<limit>` and `<safety_controller>`.
+  narrower ones of `<limit>` and `<safety_controller>`, whose k_position and k_velocity count,
+  too, unless they are 0.
 
 Not supported: `floating`, `planar` and `mimic` joints in the chain, and loops of joints.
 """
@@ -76,6 +77,8 @@ class Joint(NamedTuple):
     fixed: tuple[str, ...]  # links that are fixed to its link
     held: np.ndarray  # (4, 4) pseudo-inertia of what joints held at position 0 carry
     acceleration: float = inf  # limit, also of deceleration, rad/s^2 or m/s^2
+    # k_position, 1/s, and k_velocity, N m s/rad or N s/m, of <safety_controller>
+    soft_limits: tuple[float, float] = (inf, inf)
 
     @property
     def length(self) -> float:
@@ -527,6 +530,7 @@ def _joint(element: ET.Element, placement: np.ndarray, body: _Body) -> Joint:
         fixed=body.fixed,
         held=body.held,
         acceleration=min(_number(limit, key) or inf for key in _ACCELERATIONS),
+        soft_limits=_soft_limits(element),
     )
 
 
@@ -553,6 +557,15 @@ def _range(element: ET.Element) -> tuple[float, float]:
             '<safety_controller>'
         )
     return soft_lower, soft_upper
+
+
+def _soft_limits(element: ET.Element) -> tuple[float, float]:
+    """Return k_position and k_velocity of the <safety_controller>; infinite: none."""
+    soft = element.find('safety_controller')
+    k_position, k_velocity = (
+        abs(_number(soft, key)) or inf for key in ('k_position', 'k_velocity')
+    )
+    return k_position, k_velocity
 
 
 def _link_inertia(link: ET.Element) -> np.ndarray:

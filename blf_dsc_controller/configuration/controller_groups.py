@@ -39,6 +39,7 @@ _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
+_BROKEN = 2.5  # times the speed at which the arm stops
 _SLOW = 0.5  # s: sample times from here on are no control loop; they may be ms
 
 
@@ -67,12 +68,16 @@ class Safety:
         'velocity as measured, or estimated from position differences, starting at rest',
         read_only='the filters hold data that depend on it',
     )
-    velocity_limit: float = positive(
-        50.0, 'velocity above which a measurement counts as broken', 'rad/s'
+    velocity_limit: PerJoint = positive(
+        (50.0, 50.0),
+        'speed at which the controller stops; torques of the law are braked from 0.9 of it '
+        'on (default: 1.2 times the velocity limit of the URDF)',
+        'rad/s',
     )
     error_ratio: float = non_negative(
         1.0,
-        'tracking error to stop at, relative to the bound, for laws with a barrier; 0: never',
+        'tracking error to stop at, relative to the bound; laws without a barrier are braked '
+        'before it, relative to how far a joint gets in 0.06 s at velocity_limit; 0: never',
     )
     saturation_time: float = positive(
         0.5,
@@ -103,6 +108,11 @@ class Safety:
     deactivation_ramp: float = non_negative(
         0.5, 'the same ramp when the node is deactivated', 's'
     )
+
+    @property
+    def fastest(self) -> float:
+        """Speed [rad/s] that no joint has: a reading of it is broken."""
+        return _BROKEN * max(self.velocity_limit)
 
 
 @dataclass(frozen=True)

@@ -137,8 +137,8 @@ def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
 
 
 def _of_velocity(config: Checked, chain: Chain | None) -> Iterator[_Doubt]:
-    """Check the velocity of a broken measurement against the speed of the joints."""
-    limit = config.safety.velocity_limit
+    """Check the speeds to stop at against those of the joints."""
+    limit = max(config.safety.velocity_limit)
     motions = config.limits.velocity
     unlimited = [math.inf] * len(motions)
     speeds = [joint.velocity for joint in chain.joints] if chain else unlimited

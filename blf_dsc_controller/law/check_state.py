@@ -34,7 +34,7 @@ NOT_SENSORS = 64
 class Checks(NamedTuple):
     """Limits of the checks, and the values that they keep from past samples."""
 
-    velocity_limit: Cell  # rad/s, of each joint; 0 disables all checks
+    velocity_limit: Annotated[Array, 'n']  # rad/s; 0 disables all checks
     error_ratio: Cell  # |xi1| / k from which an error is suspect; 0: never
     sample_time: Cell  # s, for the checks over several samples; 0: none
     ratio: Annotated[Array, 'n']  # largest |xi1| / k so far

@@ -33,7 +33,7 @@ def is_valid_state(checks: Checks, measurement: Array) -> bool:
     for i in range(n):
         if not (
             isfinite(measurement[i])
-            and abs(measurement[n + i]) <= checks.velocity_limit[0]
+            and abs(measurement[n + i]) <= checks.velocity_limit[i]
         ):
             return False
     return True

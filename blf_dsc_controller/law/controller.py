@@ -207,6 +207,11 @@ class Controller:
         self.state.saturation.held_back[:] = 0.0
         self.state.saturation.takes_over[0] = 1.0
 
+    def replace_torque(self, torque: Array) -> None:
+        """Let another torque (n,) [N m] leave than the one of the last update."""
+        self.sample.torque[:] = torque
+        self.state.torque[:] = torque
+
     def trial(self, t: float, dt: float, measurement: Array) -> Array:
         """Return the torque of an unchecked update that only changes `signals` and `sample`."""
         saved = self.save()

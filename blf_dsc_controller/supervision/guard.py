@@ -37,6 +37,8 @@ from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision import retuning
 from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
 from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.supervision.envelope import LONGEST, Motion, limited
+from blf_dsc_controller.supervision.envelope_limits import limits_of
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.last_state import Doubt
@@ -137,7 +139,7 @@ class Guard(InCommand):
 
         Before the start, positions after such a wrap count as they are.
         """
-        fastest = self.config.safety.velocity_limit
+        fastest = self.config.safety.fastest
         counted, wrapped = self.readings.count_turns(measurement, fastest)
         if wrapped is not None and self.supervisor.phase is Phase.STARTING:
             self.readings.believe_positions()
@@ -179,7 +181,11 @@ class Guard(InCommand):
         self._take(stamp, measurement)
         self._advance_to(stamp)
         self.findings.check_efforts()
-        fault = self.samples.check(dt) or self.findings.check_oscillation()
+        fault = (
+            self.samples.check(dt)
+            or self.findings.check_oscillation()
+            or self._keep_within_envelope(torque)
+        )
         if fault is not None:
             self.stop(*fault)
             return self.safe(self.config.sample_time)
@@ -203,6 +209,27 @@ class Guard(InCommand):
         torque = self.controller.update(self.reference.time_of(stamp), dt, measurement)
         self.compute_time = perf_counter() - before
         return torque
+
+    def _keep_within_envelope(self, torque: Vector) -> Fault | None:
+        """Let only what the arm may be asked for leave of the law's torque (n,) [N m].
+
+        Return the fault of a law that has asked for more for too long.
+        """
+        controller, envelope = self.controller, self.envelope
+        signals, added = controller.signals, controller.signals.saturation.added
+        now = Motion(signals.q, signals.dq, signals.xi1, signals.dqr)
+        whole = torque + added
+        estimate = self.estimates.estimate[: controller.settings.p]
+        last = self.safe_torque.commanded if controller.samples > 1 else None
+        braked = envelope.brake(now, whole, estimate)
+        leaves = torque if braked is whole else braked - added
+        leaves = limited(leaves, last, envelope.limits.torque, envelope.limits.step)
+        if (leaves != torque).any():
+            controller.replace_torque(leaves)
+        asking = envelope.asking * self.config.sample_time
+        if asking <= LONGEST:
+            return None
+        return self.states.braked(asking, envelope.joint, now, envelope.speeds(now))
 
     def perceive(self) -> None:
         """Weigh what the tip holds, and detect contact, by the last state.
@@ -317,6 +344,7 @@ class Guard(InCommand):
         self.config = config
         self.oscillation.configure(config)
         self.samples.set_limits(config.safety)
+        self.envelope.configure(*limits_of(config, self.controller.settings))
 
     def problems(self, config: ControllerConfig) -> list[str]:
         """Return why a configuration cannot be applied now; empty if it can."""

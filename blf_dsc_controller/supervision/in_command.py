@@ -22,6 +22,7 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.messages.journal import EventType, Journal
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.retargeting import TrajectoryError
+from blf_dsc_controller.supervision.envelope_limits import envelope_of
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.last_state import Doubt
@@ -54,6 +55,7 @@ class InCommand:
         readings: stamps, turns and velocities of the joint states.
         reference: the reference in force, and the time of the law.
         safe_torque: the ramp to the safe torque, and the last usable joint state.
+        envelope: what no law may ask of the arm.
         held: the torque that holds the arm, by its last motion.
         safe_stop: computes the torque while the law is not in command.
         has_sample: whether the law used the last message, so that there is new telemetry.
@@ -91,6 +93,7 @@ class InCommand:
         self.safe_torque.resolution = sensor.resolution
         self.safe_torque.last.resolution = sensor.resolution
         self.safe_torque.longest_step = config.sample_time
+        self.envelope = envelope_of(config, self.controller.settings)
         self.held = HeldTorque(config, self.controller, self.estimates)
         self.safe_stop = SafeStop(
             config, self.controller, self.estimates, self.safe_torque, self.held
@@ -115,7 +118,7 @@ class InCommand:
     @property
     def slow(self) -> Vector:
         """Velocities (n,) [rad/s] to be damped in a stop."""
-        return self.readings.slow(self.config.safety.velocity_limit)
+        return self.readings.slow(self.config.safety.fastest)
 
     @property
     def is_at_rest(self) -> bool:
@@ -151,6 +154,7 @@ class InCommand:
         """Wait for a state to start from, without the faults so far."""
         self.supervisor.enter(Phase.STARTING)
         self.oscillation.restart()
+        self.envelope.restart()
         self.states.restart()
         self.samples.restart()
         self.silenced = self.has_sample = False
@@ -230,7 +234,7 @@ class InCommand:
 
     def doubt(self, stamp: int, measurement: Vector) -> Doubt | None:
         """Return why a state is not trusted; None: it is."""
-        limit, T = self.config.safety.velocity_limit, self.config.sample_time
+        limit, T = self.config.safety.fastest, self.config.sample_time
         return self.safe_torque.last.doubt(stamp, measurement, limit, T)
 
     def safe_at(
@@ -243,7 +247,7 @@ class InCommand:
         last, T = self.safe_torque.last, self.config.sample_time
         is_starting = self.supervisor.phase is Phase.STARTING
         if doubt is None or (is_starting and doubt is not Doubt.NOT_FINITE):
-            limit = self.config.safety.velocity_limit
+            limit = self.config.safety.fastest
             last.follow(stamp, measurement, limit, T, continues=doubt is None)
             self._observe_speed()
         else:

@@ -16,6 +16,7 @@ from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
 from blf_dsc_controller.supervision.command_effect import CommandEffect
+from blf_dsc_controller.supervision.envelope import limited
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import gravity_torque, needed_torque
 from blf_dsc_controller.supervision.observed_load import ObservedLoad
@@ -73,10 +74,8 @@ def safe_torque(
             torque -= braking_matrix(settings, damping, last.q, last.gap) @ last.slow
             torque += gravity_torque(settings, estimate, last.q) + load
             torque -= added_torque(settings.torque, last.q)
-    if not np.isfinite(torque).all():
-        return np.zeros(settings.n)
-    limited = np.clip(torque, -settings.torque.limit, settings.torque.limit)
-    return limited * (1.0 - last.age / FADE_TIME)
+    torque = limited(torque, None, settings.torque.limit, settings.torque.limit)
+    return torque * (1.0 - last.age / FADE_TIME)
 
 
 class SafeTorque:
@@ -241,12 +240,10 @@ class SafeTorque:
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
-        if dt > 0.0:  # drives that stop when commands jump would brake
-            step = settings.torque.rate_limit * min(dt, self.longest_step)
-            step = np.where(settings.torque.rate_limit > 0.0, step, inf)
-            goal = np.clip(goal, self.commanded - step, self.commanded + step)
-        limit = settings.torque.limit
-        self.commanded[:] = np.clip(goal, -limit, limit)
+        last = self.commanded if dt > 0.0 else None
+        step = settings.torque.rate_limit * min(dt, self.longest_step)
+        step = np.where(settings.torque.rate_limit > 0.0, step, inf)
+        self.commanded[:] = limited(goal, last, settings.torque.limit, step)
         return self.commanded
 
     def _keep_load_once_moved(self, dt: float) -> None:

@@ -66,7 +66,7 @@ class SampleCheck:
         """Apply these limits to the next samples."""
         self._safety = safety
         checks = self._controller.checks
-        checks.velocity_limit[0] = safety.velocity_limit
+        checks.velocity_limit[:] = safety.velocity_limit
         checks.error_ratio[0] = safety.error_ratio
 
     def restart(self) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.sensor import LONG_GAP
 from blf_dsc_controller.run import NANOSECOND, JointUnits
+from blf_dsc_controller.supervision.envelope import Motion
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
@@ -200,6 +201,24 @@ class StateCheck:
         )
         return Fault(Reason.STAMP_JUMP, text)
 
+    def braked(self, asked: float, joint: int, now: Motion, speeds: Vector) -> Fault:
+        """Return the fault of a law that has asked for too much for so long [s].
+
+        `joint` was braked most; `speeds` (2, n) [rad/s] are the highest that are allowed
+        downwards and upwards.
+        """
+        unit = self._units[joint].of('rad/s')
+        down, up = speeds[:, joint]
+        text = (
+            f'joint {self._joints[joint]!r} moves at {now.dq[joint]:+.3g} {unit}, '
+            f'{now.error[joint]:+.3g} {self._units[joint].position} from its reference, where '
+            f'{-down:+.3g} to {up:+.3g} {unit} are allowed by safety.velocity_limit, the end of '
+            'its range and, without a barrier, safety.error_ratio; for '
+            f'{asked:.2g} s the law has asked for torques that make it faster: correct the law '
+            'or its gains, or ask for a slower motion'
+        )
+        return Fault(Reason.VELOCITY, text)
+
     def invalid(self, safety: Safety, measurement: Vector) -> Fault:
         """Return the fault of an invalid measurement [q, dq, effort] (3n,)."""
         q, dq, _ = measurement.reshape(3, -1)
@@ -208,10 +227,11 @@ class StateCheck:
         if not np.isfinite(dq).all():
             text = f'velocities are missing or not finite: {dq}'
             return Fault(Reason.NOT_FINITE, f'{text}; {_NO_VELOCITY}')
-        worst = int(np.argmax(np.abs(dq)))
+        limit = safety.velocity_limit
+        worst = int(np.argmax(np.abs(dq) / limit))
         unit = self._units[worst].of('rad/s')
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {dq[worst]:+.6g} {unit}: more '
-            f'than safety.velocity_limit, {safety.velocity_limit:g} {unit}'
+            f'than safety.velocity_limit, {limit[worst]:g} {unit}'
         )
         return Fault(Reason.VELOCITY, text)
