@@ -46,12 +46,13 @@ def energies(run: Run) -> Series | None:
     P = truth.select(names)[true]
     off = P - monitor.select(names)[shown]
     missed = truth.select(disturbances)[true] - monitor.select(disturbances)[shown]
-    terms = (
-        _potential(run, np.abs(error[rows]), bound[rows]),
-        _kinetic(P, run.position[rows], xi2[rows]),
-        _weighted(off, given['two_link.adaptation_gain'] if learns else 0.0),
-        _weighted(missed, given['disturbance.gain']),
-    )
+    with np.errstate(over='ignore', invalid='ignore'):  # of a run that diverges
+        terms = (
+            _potential(run, np.abs(error[rows]), bound[rows]),
+            _kinetic(P, run.position[rows], xi2[rows]),
+            _weighted(off, given['two_link.adaptation_gain'] if learns else 0.0),
+            _weighted(missed, given['disturbance.gain']),
+        )
     return Series(TERMS, stamps, np.stack(terms, axis=1))
 
 

@@ -100,7 +100,10 @@ class Safety:
         'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'
     )
     damping: PerJoint = non_negative(
-        (2.0, 1.0), 'damping in the safe torque', 'N m s/rad', 'D'
+        (2.0, 1.0),
+        'damping in the safe torque, at most the inertia of the joint over 0.03 s',
+        'N m s/rad',
+        'D',
     )
     stop_ramp: float = non_negative(
         0.0, 'ramp to the safe torque after a fault; 0: at once', 's'

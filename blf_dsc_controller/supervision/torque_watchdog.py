@@ -156,12 +156,11 @@ class TorqueWatchdog:
     def take_torque(self, torque: Vector, now: float) -> None:
         """Take a torque (n,) [N m] of the controller, and hand over to it.
 
-        One that is not finite or beyond its limit is not of a controller in order.
+        Of one that is not finite or beyond its limit, it is not known what the drive holds.
         """
-        if not (np.abs(torque) <= self._settings.torque.limit).all():
-            return
-        self._safe.commanded[:] = torque
-        self._knows_torque = True
+        if (np.abs(torque) <= self._settings.torque.limit).all():
+            self._safe.commanded[:] = torque
+            self._knows_torque = True
         self._commanded_at = now
         self._commanded_stamp = self.stamp
         self.active = False
