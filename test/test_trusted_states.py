@@ -145,6 +145,20 @@ def test_arm_whose_velocities_are_not_its_own_gets_no_first_torque():
     assert np.isnan(record.torque).all()
 
 
+@pytest.mark.parametrize('torque', ['zero', 'hold_gravity'])
+def test_clock_that_is_set_by_an_hour_leaves_the_rate_limit_of_a_torque(torque):
+    """The torque jumped by 4.3 to 9.8 N m in a sample, of 1 allowed."""
+    given = {'torque.rate_limit': [1000.0] * 2, 'safety.torque': torque}
+    arm = Scenario('recommended', given)
+    before = arm.run(1.5)
+    after = arm.run(
+        0.05, spoil=lambda state: [replace(state, stamp=state.stamp + 3600.0)]
+    )
+    assert arm.reason == 'stamp jump'
+    torques = np.vstack((before.torque[-1:], after.torque))
+    assert np.abs(np.diff(torques, axis=0)).max() < 1.0 + 1e-9
+
+
 @pytest.mark.parametrize('bad', [np.inf, np.nan, 1e300])
 def test_watchdog_holds_a_resting_arm_after_a_command_that_is_none(bad):
     """It commanded 87 N m for 0.1 s after one `inf`."""
