@@ -172,6 +172,14 @@ def test_inertia_and_lags_are_found():
     assert findings.jitter < 1e-12  # s, of rounding
 
 
+def test_lag_of_the_drives_is_written():
+    """Of 5 samples of delay and half of one, beside the 1.5 ms that every loop has."""
+    late = change(ARM, {'actuator.delay': 5})
+    result = result_of(CONFIG, simulated.measured(planned(), late))
+    assert result.parameters_but_bounds()['robot.lag'] == pytest.approx(4e-3, abs=1e-3)
+    assert found().parameters()['robot.lag'] < 1e-3
+
+
 def test_chosen_gains_have_the_margin_of_the_true_loop_and_twice_of_them_do_not():
     choice = found().choice
     assert choice.margin.value >= 0.5
@@ -362,12 +370,18 @@ def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
 def rubbing():
     """Return a commissioning of an arm with friction of which its file knows nothing."""
     commissioning = blf.Commissioning(moving(), [POSTURE])
-    (motion,) = commissioning.motions
-    run, _ = simulated.measured(motion, STUCK)
+    motion, run = strongest(commissioning, STUCK)
+    return commissioning.result([(run, motion.config)])
+
+
+def strongest(commissioning, arm):
+    """Return the last motion that measures a simulated arm, and its run."""
+    motion = commissioning.motion(POSTURE)
+    run, _ = simulated.measured(motion, arm)
     while again := commissioning.plan_repeat(motion, run):
         motion = again
-        run, _ = simulated.measured(motion, STUCK)
-    return commissioning.result([(run, motion.config)])
+        run, _ = simulated.measured(motion, arm)
+    return motion, run
 
 
 STUCK = change(
@@ -411,10 +425,32 @@ def test_friction_is_measured():
     assert (share > 0.6).all()
     assert (share < 1.5).all()
     assert found().findings.friction.max() < 0.2  # viscous, of 1 to 2 N m s/rad
+    # with the longest lag alone the fit made 0.8 of 1.8 + 1.5 kg m^2
+    assert np.isnan(seen.findings.inertia[0])
+    assert seen.parameters()['robot.lag'] == CONFIG.robot.lag
+    assert seen.unseen[0] > STUCK.truth.rotor_inertia[0] - ROTORS[0]
     written = seen.parameters()['commissioning.friction']
     creep = seen.findings.damping > seen.start.damping  # their friction is not all seen
     assert creep.all()
     np.testing.assert_allclose(written, 1.5 * seen.findings.friction, rtol=0.01)
+
+
+def test_unknown_arm_is_measured_again_with_gains_twice_as_stiff_at_most_where_it_sticks():
+    """The file of the arm has motors that are too light, and no friction."""
+    given = {**GIVEN, 'robot.rotor_inertia': [0.05, 0.02]}
+    first = blf.Commissioning(build(ControllerConfig, given), [POSTURE])
+    friction = {'disturbance.coulomb': [1.0, 0.5], 'disturbance.stribeck': 0.5}
+    arm = change(ARM, {**friction, 'truth.rotor_inertia': [0.6, 0.2]})
+    motion, run = strongest(first, arm)
+    shown = first.result([(run, motion.config)])
+    hidden = np.isnan(shown.findings.inertia)
+    assert hidden.any()
+    used = first.better_known(motion, run).measured_with
+    np.testing.assert_allclose(used.robot.coulomb, shown.findings.friction)
+    stiffer = np.array(used.feedback.joint_damping) / shown.start.damping
+    assert (stiffer >= 1.0).all()
+    assert stiffer.max() > 1.5
+    assert (stiffer[hidden] < 2.0 * (1.0 + 1e-9)).all()
 
 
 def at_the_tool(**given):
