@@ -139,7 +139,8 @@ class Envelope:
             -limit, whole + product(M, change[:, np.newaxis])[:, 0], limit
         )
         self.braked += 1
-        self.joint = int((np.abs(change) / most.sum(axis=0)).argmax())
+        beyond = np.abs(change) * self.limits.braking_time / self.limits.velocity
+        self.joint = int(beyond.argmax())
         if (np.abs(allowed - whole) > _NOTABLE * limit).any():
             self._asking += 1 + _RELIEF
         return allowed
