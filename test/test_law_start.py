@@ -72,3 +72,17 @@ def test_arm_that_is_elsewhere_by_the_next_activation_gets_no_torque_of_its_old_
     found = arm.run(1.0, spoil=lambda state: [replace(state, stamp=state.stamp + 20.0)])
     np.testing.assert_allclose(found.torque[0], expected.torque[0], atol=1.0)
     assert found.speed.max() < expected.speed.max() + 0.1
+
+
+def test_load_that_came_during_a_stop_is_carried_by_the_law_that_is_activated_again():
+    """The stop has found it, and d^3 from before the fault has not."""
+    arm = Scenario('panda', {'reference.type': 'hold'}, plant=carrying(2.0, 2.0, 0.5))
+    arm.run(1.0)
+    arm.controller.fail('by hand')
+    resting = arm.run(4.0)
+    assert resting.speed[-1].max() < 0.01
+    arm.controller.start()
+    after = arm.run(0.5)
+    assert arm.is_running, arm.text
+    np.testing.assert_allclose(after.torque[0], resting.torque[-1], atol=0.5)
+    assert np.abs(after.q - resting.q[-1]).max() < 0.01
