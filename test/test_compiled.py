@@ -759,8 +759,8 @@ def digests():
             controller.state_vector,
         )
         q, dq, ddq = random.normal(size=(3, settings.n))
-        safe = model_torque(settings, P, q, dq, ddq), friction_torque(settings, P, dq)
-        show('safe torque', *safe)
+        tau = model_torque(settings, P, q, dq, ddq)
+        show('safe torque', tau, friction_torque(settings, P, dq, tau))
     return lines
 
 
