@@ -156,9 +156,8 @@ def test_wrong_positions_are_rejected_with_the_reason(ros, reason):
     ros.run(arm, 50)
     inputs(law).take_positions(positions(WRONG[reason]))
     assert reason in inputs(law).reason
-    inputs(law).take_positions(
-        positions((9.0, 9.0))
-    )  # past the limits: as near as it may
+    past = 1.05 * np.array(law.config.limits.position_upper)
+    inputs(law).take_positions(positions(past))  # as near as it may
     ros.run(arm, 50)
     assert inputs(law).targets == 1
 

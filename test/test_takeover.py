@@ -113,8 +113,7 @@ def test_a_reset_begins_without_a_load_that_nothing_shows(torque, change, is_sto
     if change == 'gap':
         arm.run(0.1, spoil=lambda _: [])
     far = 0.02 if change == 'jump' else 0.0  # rad, four times what a fast arm moves
-    elsewhere = changed(slice(3), q=lambda q: q + far)
-    arm.run(0.05, spoil=elsewhere, until=lambda: arm.is_running)
+    arm.run(arm.T, spoil=changed(slice(3), q=lambda q: q + far))
     assert arm.is_running, arm.text
     # a law in command knows by its own last motion what it carries
     is_shown = change == 'none' or (change == 'other program' and not is_stopped)

@@ -39,7 +39,6 @@ _FOLLOWED = 'the other gains follow from it when they are read: change those'
 _from_urdf = partial(non_negative, (), read_only=_FOLLOWED, omittable=True)
 # per window: fewer do not determine P, more need over 100 MB
 _SAMPLES = (10, 1_000_000)
-_BROKEN = 2.5  # times the speed at which the arm stops
 _SLOW = 0.5  # s: sample times from here on are no control loop; they may be ms
 
 
@@ -70,8 +69,8 @@ class Safety:
     )
     velocity_limit: PerJoint = positive(
         (50.0, 50.0),
-        'speed at which the controller stops; torques of the law are braked from 0.9 of it '
-        'on (default: 1.2 times the velocity limit of the URDF)',
+        'speed at which the controller stops; laws without a barrier are braked from 0.9 of '
+        'it on (default: 1.2 times the velocity limit of the URDF)',
         'rad/s',
     )
     error_ratio: float = non_negative(
@@ -111,11 +110,6 @@ class Safety:
     deactivation_ramp: float = non_negative(
         0.5, 'the same ramp when the node is deactivated', 's'
     )
-
-    @property
-    def fastest(self) -> float:
-        """Speed [rad/s] that no joint has: a reading of it is broken."""
-        return _BROKEN * max(self.velocity_limit)
 
 
 @dataclass(frozen=True)

@@ -2,21 +2,22 @@
 """The last function before a torque leaves: what no law may ask of an arm.
 
 Whatever has computed a torque, it leaves finite, within its level and within a step from the
-last one (`limited`).  Torques of a law are also braked (`Envelope.brake`) where a joint would
-become faster than it may be.  The form is that of a URDF's `<safety_controller>`, as ros2_control
-applies it, for joints that are coupled: the speed that is allowed falls towards the end of the
-range, and the torque that is allowed falls as the speed nears it.
+last one (`limited`).  Torques of a law without a barrier are also braked (`Envelope.brake`) where
+a joint would become faster than it may be.  The form is that of a URDF's `<safety_controller>`,
+as ros2_control applies it, for joints that are coupled: the speed that is allowed falls towards
+the end of the range, and the torque that is allowed falls as the speed nears it.
 
     speed         v <= v_max,   v T_q + v^2 / (2 a_stop) <= distance to the end of the range
     for laws without a barrier, likewise with v - qr' and the distance to the largest error
     acceleration  a <= a_max,   a T_v + a^2 / (2 j)      <= v_allowed - v
 
-with a = M^-1 (tau - C dq - G) from the model.  Where a joint asks for more, a becomes what is
-allowed, and the torques become tau + M (a_allowed - a), so that gravity and the other joints
-are accounted for.  T_v is the time constant of the braking, M / k_velocity, and T_q that of the
-approach to the end, 1 / k_position; both are as long as the delay of the loop asks for.  a_stop
-is the deceleration that a joint has left beside gravity, j the change of its acceleration that
-the rate limit of its torque allows.
+with a = M^-1 (tau - C dq - G - load) from the model, and the load that the arm has shown to carry
+besides (`ObservedLoad`): a payload, or a hand that holds it.  Where a joint asks for more, a
+becomes what is allowed, and the torques become tau + M (a_allowed - a), so that gravity and the
+other joints are accounted for.  T_v is the time constant of the braking, M / k_velocity, and T_q
+that of the approach to the end, 1 / k_position; both are as long as the delay of the loop asks
+for.  a_stop is the deceleration that a joint has left beside gravity, j the change of its
+acceleration that the rate limit of its torque allows.
 
 A torque that asks for nothing else is not changed in any bit.
 """
@@ -30,10 +31,12 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import ArmModel, inertia_matrices, regressors_at
 from blf_dsc_controller.numerics.algebra import inverse, product
+from blf_dsc_controller.supervision.observed_load import ObservedLoad
 
 Array = NDArray[np.float64]
 
 _FAR = 1e3  # rad, rad/s: farther away no limit acts
+_OBSERVER = 60.0, 30.0  # rad/s, of the load, as in a stop
 _RELIEF = 4  # samples that make up for one in which a law asks for too much
 _TOWARDS = np.array([[-1.0], [1.0]])  # the lower and the upper end
 _NOTABLE = 0.01  # of the torque limit: cutting less counts as nothing
@@ -61,8 +64,7 @@ class Body(NamedTuple):
 
     model: ArmModel
     parameters: Array  # (p,) of the inertia matrix
-    # (n, n) largest |M^-1| over the postures, 1 / (kg m^2); None: the inertia is not known
-    mobility: Array | None
+    brakes: bool  # whether the inertia is known, and the law keeps no bound itself
 
 
 class Motion(NamedTuple):
@@ -108,41 +110,45 @@ class Envelope:
         """Begin with the next torque, of a law that has asked for nothing yet."""
         self.braked = self.joint = 0
         self._asking = 0
+        self._load = ObservedLoad(self.limits.torque.size, _OBSERVER)
+        self._last: tuple[Array, Array] | None = None  # whole torque, and dq before it
 
     @property
     def asking(self) -> float:
         """Samples in which too much was asked for, less a quarter of those in which it was not."""
         return self._asking / _RELIEF
 
-    def brake(self, now: Motion, whole: Array, estimate: Array) -> Array:
+    def brake(self, now: Motion, whole: Array, estimate: Array, dt: float) -> Array:
         """Return the whole torque (n,) [N m] that is allowed now; itself if it is.
 
-        `estimate` (p,) is of the parameters of the model.
+        `estimate` (p,) is of the parameters of the model, `dt` [s] the time since the last one.
         """
         self._asking = max(0, self._asking - 1)
-        if self.body.mobility is None:
+        if not self.body.brakes:
             return whole
+        still = self._at_rest_or_moving(now.q, now.dq, estimate)
+        (M,) = inertia_matrices(
+            self.body.model, self.body.parameters, now.q[np.newaxis]
+        )
+        limit = self.limits.torque
+        if self._last is not None:
+            sent, before = self._last
+            accelerating = product(M, (now.dq - before)[:, np.newaxis])[:, 0] / dt
+            self._load.update(sent - still - accelerating, limit, dt)
+        force = whole - still - self._load.load
         most = self._accelerations(now)
-        force = whole - self._at_rest_or_moving(now.q, now.dq, estimate)
-        asked = (np.abs(force) * self.body.mobility).sum(axis=1)
-        if (asked <= most).all():
-            return whole  # in any posture
-        M = inertia_matrices(self.body.model, self.body.parameters, now.q[np.newaxis])[
-            0
-        ]
         asked = product(inverse(M), force[:, np.newaxis])[:, 0]
         change = _between(-most[0], asked, most[1]) - asked
-        if not change.any():
-            return whole
-        limit = self.limits.torque
-        allowed = _between(
-            -limit, whole + product(M, change[:, np.newaxis])[:, 0], limit
-        )
-        self.braked += 1
-        beyond = np.abs(change) * self.limits.braking_time / self.limits.velocity
-        self.joint = int(beyond.argmax())
-        if (np.abs(allowed - whole) > _NOTABLE * limit).any():
-            self._asking += 1 + _RELIEF
+        allowed = whole
+        if change.any():
+            allowed = whole + product(M, change[:, np.newaxis])[:, 0]
+            allowed = _between(-limit, allowed, limit)
+            self.braked += 1
+            beyond = np.abs(change) * self.limits.braking_time / self.limits.velocity
+            self.joint = int(beyond.argmax())
+            if (np.abs(allowed - whole) > _NOTABLE * limit).any():
+                self._asking += 1 + _RELIEF
+        self._last = allowed, now.dq.copy()
         return allowed
 
     def speeds(self, now: Motion) -> Array:

@@ -10,7 +10,6 @@ from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.tuning import loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.state import Settings
-from blf_dsc_controller.numerics.algebra import inverse
 from blf_dsc_controller.supervision.envelope import Body, Envelope, Limits
 
 Array = NDArray[np.float64]
@@ -71,8 +70,7 @@ def limits_of(config: ControllerConfig, settings: Settings) -> tuple[Limits, Bod
         deceleration=_USED * left / inertia,
         jerk=rate / inertia,
     )
-    mobility = np.abs(inverse(M)).max(axis=0) if is_known else None
-    return limits, Body(model, P, mobility)
+    return limits, Body(model, P, is_known and settings.has_barrier != 1)
 
 
 def _soft_limits(config: ControllerConfig) -> Array:

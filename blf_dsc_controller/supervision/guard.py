@@ -139,7 +139,7 @@ class Guard(InCommand):
 
         Before the start, positions after such a wrap count as they are.
         """
-        fastest = self.config.safety.fastest
+        fastest = np.array(self.config.safety.velocity_limit)
         counted, wrapped = self.readings.count_turns(measurement, fastest)
         if wrapped is not None and self.supervisor.phase is Phase.STARTING:
             self.readings.believe_positions()
@@ -162,8 +162,8 @@ class Guard(InCommand):
     ) -> Vector | None:
         """Return the law's torque for a state, or the safe torque if it cannot be used."""
         if self.supervisor.phase is Phase.STARTING:
-            if problem := self._problem_to_start(measurement):
-                self.starting.wait(problem)
+            if not is_valid_state(self.controller.checks, measurement):
+                self._wait_for_valid(measurement)
                 return self._safe_at(stamp, measurement, doubt)
             self.starting.forget_load_after_gap(stamp, measurement)
             self._take(stamp, measurement)
@@ -195,13 +195,10 @@ class Guard(InCommand):
         self.journal.commands += 1
         return torque
 
-    def _problem_to_start(self, measurement: Vector) -> str:
-        """Return why the law does not start from a state; empty if it does."""
-        if not is_valid_state(self.controller.checks, measurement):
-            return self.states.invalid(self.config.safety, measurement).text
-        if not self.readings.have_shown(measurement):
-            return 'its positions have not shown its velocities yet'
-        return ''
+    def _wait_for_valid(self, measurement: Vector) -> None:
+        """Wait for another state to start from, since the law finds this one invalid."""
+        invalid = self.states.invalid(self.config.safety, measurement)
+        self.starting.wait(invalid.text)
 
     def _update_law(self, stamp: int, dt: float, measurement: Vector) -> Vector:
         """Return the law's torque (n,) [N m], `dt` [s] after its last sample."""
@@ -221,7 +218,7 @@ class Guard(InCommand):
         whole = torque + added
         estimate = self.estimates.estimate[: controller.settings.p]
         last = self.safe_torque.commanded if controller.samples > 1 else None
-        braked = envelope.brake(now, whole, estimate)
+        braked = envelope.brake(now, whole, estimate, self.config.sample_time)
         leaves = torque if braked is whole else braked - added
         leaves = limited(leaves, last, envelope.limits.torque, envelope.limits.step)
         if (leaves != torque).any():

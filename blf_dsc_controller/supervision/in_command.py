@@ -118,7 +118,7 @@ class InCommand:
     @property
     def slow(self) -> Vector:
         """Velocities (n,) [rad/s] to be damped in a stop."""
-        return self.readings.slow(self.config.safety.fastest)
+        return self.readings.slow(np.array(self.config.safety.velocity_limit))
 
     @property
     def is_at_rest(self) -> bool:
@@ -234,7 +234,8 @@ class InCommand:
 
     def doubt(self, stamp: int, measurement: Vector) -> Doubt | None:
         """Return why a state is not trusted; None: it is."""
-        limit, T = self.config.safety.fastest, self.config.sample_time
+        limit = np.array(self.config.safety.velocity_limit)
+        T = self.config.sample_time
         return self.safe_torque.last.doubt(stamp, measurement, limit, T)
 
     def safe_at(
@@ -247,7 +248,7 @@ class InCommand:
         last, T = self.safe_torque.last, self.config.sample_time
         is_starting = self.supervisor.phase is Phase.STARTING
         if doubt is None or (is_starting and doubt is not Doubt.NOT_FINITE):
-            limit = self.config.safety.fastest
+            limit = np.array(self.config.safety.velocity_limit)
             last.follow(stamp, measurement, limit, T, continues=doubt is None)
             self._observe_speed()
         else:

@@ -70,7 +70,7 @@ class LastState:
         self._stamp = -1
         self._read = np.full(2 * n, nan)  # q and dq as last read
         self._new_at = -1  # ns, stamp of the first state with these
-        self._speed = 0.0  # rad/s, the fastest joint's, as the last positions showed it
+        self._speed = np.zeros(n)  # rad/s, as the last positions showed it
 
     def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
         """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
@@ -85,14 +85,14 @@ class LastState:
         self,
         stamp: int,
         measurement: Vector,
-        fastest: float,
+        fastest: Vector,
         period: float,
         *,
         continues: bool = True,
     ) -> None:
         """Store a trusted state beside the law, `period` [s] after the last as a rule.
 
-        A velocity that is not finite or beyond `fastest` [rad/s] is replaced with the one
+        A velocity that is not finite or beyond `fastest` (n,) [rad/s] is replaced with the one
         that the positions show, within it.  After a silence, whose positions show only its mean
         velocity, and where it does not continue the last one, `slow` begins with the measured.
         """
@@ -105,7 +105,7 @@ class LastState:
         differenced = np.zeros_like(q)
         if is_next:
             differenced = (q - self.q) / elapsed
-            self._speed = float(np.abs(differenced).max())
+            self._speed = np.abs(differenced)
             differenced = np.clip(differenced, -fastest, fastest)
             self.slow += min(1.0, elapsed / FILTER) * (differenced - self.slow)
         usable = np.where(np.abs(dq) <= fastest, dq, differenced)
@@ -118,11 +118,11 @@ class LastState:
         self._stamp = stamp
 
     def doubt(
-        self, stamp: int, measurement: Vector, fastest: float, period: float
+        self, stamp: int, measurement: Vector, fastest: Vector, period: float
     ) -> Doubt | None:
         """Return why a state is not trusted; None: it comes from this one.
 
-        `fastest` [rad/s] is the largest speed of a joint in order; a joint may be twice as fast,
+        `fastest` (n,) [rad/s] is the largest speed of each joint in order; it may be twice as fast,
         or twice as fast as before.  Stamps jitter, and clocks are set back: a `period` [s] counts
         as one at least.
         """
@@ -138,7 +138,7 @@ class LastState:
         if self._is_repeated(stamp, measurement, period):
             return Doubt.REPEATED
         reach = 2.0 * (fastest + self._speed) * max(elapsed, period)
-        if np.abs(q - self.q).max() > reach:
+        if (np.abs(q - self.q) > reach).any():
             return Doubt.OUT_OF_REACH
         return None
 

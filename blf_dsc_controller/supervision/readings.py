@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.sensor import FILTER, restart
+from blf_dsc_controller.law.sensor import restart
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.supervisor import Fault
@@ -20,8 +20,6 @@ from blf_dsc_controller.supervision.velocity import Velocity
 from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
-
-_SHOWN = 0.1  # rad/s: a slower motion, or half of it, does no harm if it is none
 
 
 class Readings:
@@ -63,11 +61,11 @@ class Readings:
         self._seen = self._before
 
     def count_turns(
-        self, measurement: Vector, fastest: float
+        self, measurement: Vector, fastest: Vector
     ) -> tuple[Vector, Fault | None]:
         """Return a measurement with turns counted on, and a wrap that cannot be one.
 
-        `fastest` [rad/s] is the largest speed of a joint.
+        `fastest` (n,) [rad/s] is the largest speed of each joint.
         """
         return self._wraps.count(measurement, self.gap, fastest)
 
@@ -82,19 +80,6 @@ class Readings:
         if not is_next or not np.isfinite(measurement[: -self._n]).all():
             return False
         return self._controller.compare_velocities(self.gap, measurement)
-
-    def have_shown(self, measurement: Vector) -> bool:
-        """Whether positions have shown the velocities of a measurement, which begins a motion.
-
-        Those of an arm that rests need no time to show.
-        """
-        dq = measurement[self._n : -self._n]
-        sensor = self._controller.checks.sensor
-        if np.abs(dq).max() < _SHOWN:
-            return True
-        off = np.abs(dq - self.velocity)
-        has_settled = sensor.readings[0] * self._sample_time >= FILTER
-        return bool(has_settled and (off <= np.maximum(_SHOWN, 0.5 * np.abs(dq))).all())
 
     def distrust_velocities(self, stamp: int, measurement: Vector) -> None:
         """Difference all velocities from the positions, from this measurement on."""
@@ -128,9 +113,9 @@ class Readings:
         """Largest speed of a joint [rad/s], as the positions show it."""
         return float(np.abs(self.velocity).max())
 
-    def slow(self, limit: float) -> Vector:
+    def slow(self, limit: Vector) -> Vector:
         """Return velocities (n,) to be damped in a stop, as the positions show them.
 
-        `limit` [rad/s] is the largest.
+        `limit` (n,) [rad/s] is the largest.
         """
         return np.minimum(np.maximum(self.velocity, -limit), limit)  # faster than clip

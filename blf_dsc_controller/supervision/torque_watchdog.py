@@ -96,7 +96,7 @@ class TorqueWatchdog:
         rest = np.zeros(3 * n)
         T = self.config.sample_time_ns
         for k in (1, 2):  # the second one shows an acceleration
-            limit = holding.fastest
+            limit = np.array(holding.velocity_limit)
             safe.last.follow(k * T, rest, limit, self.config.sample_time)
             safe.advance(holding, self._settings, self._estimate, 0.0)
 
@@ -135,7 +135,8 @@ class TorqueWatchdog:
 
     def take_state(self, stamp: int, measurement: Vector, now: float) -> None:
         """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
-        limit, period = self.config.safety.fastest, self.config.sample_time
+        limit = np.array(self.config.safety.velocity_limit)
+        period = self.config.sample_time
         gap = (stamp - self.stamp) * 1e-9
         measurement, _ = self._wraps.count(measurement, gap, limit)
         last = self._safe.last

@@ -39,12 +39,12 @@ class Wraps:
         self._counted = np.zeros(3 * n)
 
     def count(
-        self, measurement: Vector, gap: float, fastest: float
+        self, measurement: Vector, gap: float, fastest: Vector
     ) -> tuple[Vector, Fault | None]:
         """Count turns on in a measurement [q, dq, effort] (3n,); return it, and its fault.
 
         It is the given one unless a turn has been counted.  `gap` [s] is the time since
-        the state before, `fastest` [rad/s] the largest speed of a joint.
+        the state before, `fastest` (n,) [rad/s] the largest speed of each joint.
         """
         n = self._last.size
         q = measurement[:n] + self._offset if self._is_off else measurement[:n]
@@ -61,7 +61,7 @@ class Wraps:
         return self._counted, fault
 
     def _counted_on(
-        self, measurement: Vector, step: Vector, gap: float, fastest: float
+        self, measurement: Vector, step: Vector, gap: float, fastest: Vector
     ) -> tuple[Vector, Fault | None]:
         """Count turns in a large or not finite `step` (n,) [rad]; return q and the fault."""
         fault = None
