@@ -50,7 +50,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
-from blf_dsc_controller.supervision.safe_torque import OBSERVER
+from blf_dsc_controller.supervision.observed_load import OBSERVER
 from blf_dsc_controller.tool.tip_wrench import TipWrench
 
 CONTROLLER = '/blf_dsc_controller'

@@ -31,12 +31,11 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import ArmModel, inertia_matrices, regressors_at
 from blf_dsc_controller.numerics.algebra import inverse, product
-from blf_dsc_controller.supervision.observed_load import ObservedLoad
+from blf_dsc_controller.supervision.observed_load import OBSERVER, ObservedLoad
 
 Array = NDArray[np.float64]
 
 _FAR = 1e3  # rad, rad/s: farther away no limit acts
-_OBSERVER = 60.0, 30.0  # rad/s, of the load, as in a stop
 _RELIEF = 4  # samples that make up for one in which a law asks for too much
 _TOWARDS = np.array([[-1.0], [1.0]])  # the lower and the upper end
 _NOTABLE = 0.01  # of the torque limit: cutting less counts as nothing
@@ -110,7 +109,7 @@ class Envelope:
         """Begin with the next torque, of a law that has asked for nothing yet."""
         self.braked = self.joint = 0
         self._asking = 0
-        self._load = ObservedLoad(self.limits.torque.size, _OBSERVER)
+        self._load = ObservedLoad(self.limits.torque.size, OBSERVER)
         self._last: tuple[Array, Array] | None = None  # whole torque, and dq before it
 
     @property

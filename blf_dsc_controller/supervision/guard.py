@@ -184,7 +184,7 @@ class Guard(InCommand):
         fault = (
             self.samples.check(dt)
             or self.findings.check_oscillation()
-            or self._keep_within_envelope(torque)
+            or self._keep_within_envelope(torque, dt)
         )
         if fault is not None:
             self.stop(*fault)
@@ -207,9 +207,10 @@ class Guard(InCommand):
         self.compute_time = perf_counter() - before
         return torque
 
-    def _keep_within_envelope(self, torque: Vector) -> Fault | None:
+    def _keep_within_envelope(self, torque: Vector, dt: float) -> Fault | None:
         """Let only what the arm may be asked for leave of the law's torque (n,) [N m].
 
+        It comes `dt` [s] after the last one.
         Return the fault of a law that has asked for more for too long.
         """
         controller, envelope = self.controller, self.envelope
@@ -218,7 +219,7 @@ class Guard(InCommand):
         whole = torque + added
         estimate = self.estimates.estimate[: controller.settings.p]
         last = self.safe_torque.commanded if controller.samples > 1 else None
-        braked = envelope.brake(now, whole, estimate, self.config.sample_time)
+        braked = envelope.brake(now, whole, estimate, dt)
         leaves = torque if braked is whole else braked - added
         leaves = limited(leaves, last, envelope.limits.torque, envelope.limits.step)
         if (leaves != torque).any():

@@ -159,13 +159,11 @@ class LastState:
             self._read[:] = measurement[: self._read.size]
             self._new_at = stamp
 
-    def skip(self, period: float) -> bool:
-        """Account for a state that is not trusted; return whether the motion is unknown now."""
+    def skip(self, period: float) -> None:
+        """Account for a state that is not trusted: after some, the motion is unknown."""
         self.age += period
-        is_unknown = self.age > LONG_GAP * period
-        if is_unknown:
+        if self.age > LONG_GAP * period:
             self._forget_motion()
-        return is_unknown
 
     def miss(self, period: float) -> None:
         """Account for `period` [s] without a state."""

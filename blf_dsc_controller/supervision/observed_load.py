@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
+OBSERVER = 60.0, 30.0
+"""L1 and L2 [rad/s] of the load: slow against the lag of velocities and torques."""
+
 _LARGEST_LOAD = 0.5  # of the torque limit
 
 

@@ -19,13 +19,10 @@ from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.envelope import limited
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import gravity_torque, needed_torque
-from blf_dsc_controller.supervision.observed_load import ObservedLoad
+from blf_dsc_controller.supervision.observed_load import OBSERVER, ObservedLoad
 from blf_dsc_controller.supervision.swing import Swing
 
 Vector = NDArray[np.float64]
-
-OBSERVER = 60.0, 30.0
-"""L1 and L2 [rad/s] of the load: slow against the lag of velocities and torques."""
 
 FADE_TIME = 0.5
 """Time [s] in which the torque fades while no usable state arrives."""

@@ -79,10 +79,6 @@ class Wraps:
         np.copyto(self._last, q, where=np.isfinite(q))
         return q, fault
 
-    def follow(self, measurement: Vector) -> None:
-        """Take a measurement that has been counted on."""
-        self._last = measurement[: self._last.size].copy()
-
     def restart(self) -> bool:
         """Take positions of joints that have a range as measured; return whether they change."""
         wrong = self._has_range & (self._offset != 0.0)
