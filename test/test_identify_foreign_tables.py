@@ -15,7 +15,7 @@ from scipy.io import savemat
 from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.identification.from_table import read_table
+from blf_dsc_controller.identification.reading import read_recording
 
 PERIOD = 0.01  # s
 TIME = np.arange(300) * PERIOD
@@ -46,7 +46,7 @@ def is_read(path, *entries, time=TIME, urdf=UR5E_TEXT):
     """Whether the motion is read as it is, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        recording = read_table(path, urdf, names=NameMap.parse(entries))
+        recording = read_recording(path, urdf, names=NameMap.parse(entries))
     assert recording.joints == UR5E
     assert recording.period == pytest.approx(PERIOD, rel=1e-4)
     samples = len(recording.q)
@@ -59,7 +59,7 @@ def is_read(path, *entries, time=TIME, urdf=UR5E_TEXT):
 
 def refused(path, *entries):
     with pytest.raises(BlfDscError) as error:
-        read_table(path, UR5E_TEXT, names=NameMap.parse(entries))
+        read_recording(path, UR5E_TEXT, names=NameMap.parse(entries))
     message = str(error.value)
     assert '\n' not in message
     return message
@@ -130,7 +130,7 @@ def test_table_that_was_cut_off_and_one_with_empty_cells_are_read(tmp_path):
     lines = path.read_text().splitlines()
     lines[50] = lines[50].replace(lines[50].split(',')[3], '')
     path.write_text('\n'.join(lines))
-    assert not read_table(path, UR5E_TEXT).gap[:5].any()
+    assert not read_recording(path, UR5E_TEXT).gap[:5].any()
     lines[60] = ','.join(lines[60].split(',')[:4])
     path.write_text('\n'.join(lines))
     assert 'line 61: got 4 cells' in refused(path)
@@ -143,7 +143,7 @@ def test_table_that_was_cut_off_and_one_with_empty_cells_are_read(tmp_path):
 def test_percentages_and_currents_need_gains(tmp_path, unit):
     names = ['t', *numbered('q'), *numbered('tau', unit)]
     path = written(tmp_path / 'a.csv', names, (TIME, Q, TAU))
-    recording = read_table(path, UR5E_TEXT)
+    recording = read_recording(path, UR5E_TEXT)
     assert recording.currents
     factor = 1e-3 if unit == '_mA' else 1.0
     np.testing.assert_allclose(recording.torque[:9], factor * TAU[:9], atol=1e-5)
@@ -157,11 +157,11 @@ def test_degrees_of_small_or_endless_turns_are_told_by_their_speed(tmp_path, kin
     names = ['t', *numbered('q'), *numbered('tau')]
     path = written(tmp_path / 'a.csv', names, (TIME, np.degrees(q), TAU))
     with pytest.raises(BlfDscError, match='so it is with most joints') as error:
-        read_table(path, text)
+        read_recording(path, text)
     assert "If it is in degrees: --map 'q=q_*[deg]'" in str(error.value)
-    recording = read_table(path, text, names=NameMap.parse(['q=q_*[deg]']))
+    recording = read_recording(path, text, names=NameMap.parse(['q=q_*[deg]']))
     np.testing.assert_allclose(recording.q[:290], q[:290], atol=1e-6)
-    kept = read_table(path, text, names=NameMap.parse(['q=q_*[rad]']))
+    kept = read_recording(path, text, names=NameMap.parse(['q=q_*[rad]']))
     # the slowest one: others seem to wrap
     np.testing.assert_allclose(kept.q[:290][:, 0], np.degrees(q[:290, 0]), atol=1e-6)
 
@@ -174,7 +174,7 @@ def test_two_runs_in_one_table_are_two_runs(tmp_path):
     names = ['t', *numbered('q'), *numbered('tau')]
     columns = [np.concatenate((values, values)) for values in (TIME, Q, TAU)]
     path = written(tmp_path / 'a.csv', names, columns)
-    recording = read_table(path, UR5E_TEXT)
+    recording = read_recording(path, UR5E_TEXT)
     assert 'starts again 1 times: read as 2 runs' in recording.source
     assert recording.duration == pytest.approx(2 * TIME[-1] + 1.0, abs=0.03)
     second = round((TIME[-1] + 1.0) / PERIOD)
@@ -185,7 +185,7 @@ def test_two_runs_in_one_table_are_two_runs(tmp_path):
     lines = path.read_text().splitlines()
     half = 1 + len(TIME)
     path.write_text('\n'.join([*lines[:half], *lines[:half]]))  # with its header
-    assert 'read as 2 runs' in read_table(path, UR5E_TEXT).source
+    assert 'read as 2 runs' in read_recording(path, UR5E_TEXT).source
 
 
 def test_wrapped_positions_are_unwrapped_and_said(tmp_path):
@@ -193,7 +193,7 @@ def test_wrapped_positions_are_unwrapped_and_said(tmp_path):
     wrapped = turning.copy()
     wrapped[:, 5] = np.angle(np.exp(1j * turning[:, 5]))
     names = ['t', *numbered('q'), *numbered('tau')]
-    recording = read_table(
+    recording = read_recording(
         written(tmp_path / 'a.csv', names, (TIME, wrapped, TAU)), UR5E_TEXT
     )
     np.testing.assert_allclose(recording.q[:280], turning[:280], atol=1e-6)
@@ -220,7 +220,7 @@ def test_stand_ins_for_missing_values_are_missing_and_said(
     table[rows, column] = stand_in
     names = ['t', *numbered('q'), *numbered('tau')]
     path = written(tmp_path / 'a.csv', names, [table])
-    recording = read_table(path, UR5E_TEXT)
+    recording = read_recording(path, UR5E_TEXT)
     said = f'{names[column]!r} is {stand_in:g} in {len(rows)} row(s), read as missing'
     assert said in recording.source
     begin = 1 if rows[0] == 0 else 0
@@ -245,7 +245,7 @@ def test_rows_in_which_torques_are_exactly_zero_for_long_are_missing(tmp_path):
         torque = TAU.copy()
         torque[np.ix_(rows, column)] = 0.0
         path = written(tmp_path / 'a.csv', names, (TIME, Q, torque))
-        recording = read_table(path, UR5E_TEXT)
+        recording = read_recording(path, UR5E_TEXT)
         said = f'torques are exactly 0 in {len(rows)} row(s), read as missing'
         assert said in recording.source
         offset = len(rows) if rows[0] == 0 else 0
@@ -268,7 +268,7 @@ def test_missing_cells_are_gaps(tmp_path):
     tau = TAU.copy()
     tau[100:150, 3] = np.nan
     np.savez(tmp_path / 'a.npz', t=TIME, q=Q, tau=tau)
-    gap = read_table(tmp_path / 'a.npz', UR5E_TEXT).gap
+    gap = read_recording(tmp_path / 'a.npz', UR5E_TEXT).gap
     assert gap[105:145].all()
     assert not gap[:95].any()
 
@@ -333,7 +333,7 @@ def test_damaged_arrays_are_refused_in_one_line(tmp_path, suffix):
         raw[at] ^= 1 << int(random.integers(8))
         path.write_bytes(raw[:at] if k % 3 == 0 else raw)
         try:
-            read_table(path, UR5E_TEXT)
+            read_recording(path, UR5E_TEXT)
         except BlfDscError as error:
             messages.append(str(error))
     assert len(messages) > 30

@@ -1,25 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of one topic of a bag, decoded block by block while it is read.
-
-Their numbers are in a temporary file, of which only what is asked for comes into
-memory.
-"""
+"""Messages of one topic of a bag: their numbers are on disk, and read when asked for."""
 
 from __future__ import annotations
 
-import os
-import tempfile
+from array import array
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterator, Sequence
+from struct import Struct
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.bags.on_disk import OnDisk
 from blf_dsc_controller.bags.sources import BagError, BagMessage
 from blf_dsc_controller.messages.codecs import (
-    JOINT_STATE_FIELDS,
     NANOSECONDS,
     ORIGIN,
     STAMP_OFFSET,
@@ -31,20 +26,20 @@ from blf_dsc_controller.messages.errors import MessageError, MissingJointError
 from blf_dsc_controller.messages.topics import FLOAT64_MULTI_ARRAY, JOINT_STATE
 from blf_dsc_controller.run import Floats, Stamps
 
-_BLOCK = 512  # messages decoded at once, which then are in the cache
 # layouts that a message is compared with: more only where no two messages are alike
 _RECENT = 100
 _LAYOUTS = {JOINT_STATE: joint_state_layout, FLOAT64_MULTI_ARRAY: array_layout}
 _UNREADABLE = -1  # instead of a layout
-# columns, the last with all others
-_LAYOUT, _RECEIVED, _SEQUENCE, _STAMP, _VALUES = range(5)
+_HEAD = Struct('<4q')  # words before each message:
+_RECEIVED, _SEQUENCE, _STAMP, _LAYOUT = range(4)  # the last is the size of texts
+_WORD = 8  # bytes
+_TIME = Struct('<iI')
 _MOST_NAMES = 20_000  # and fields, of a topic
 _MOST_PLACES = 500_000  # in all layouts of a topic
 _MOST_TEXT = 1 << 24  # bytes of a message that is kept as it is
 _TWINS = 1000  # messages back, among which those that were recorded twice are found
 _MOST_PUBLISHERS = 10  # of a topic, one after the other or at once
-_NAN = np.float64(np.nan).view(np.int64)
-_TIME = np.dtype([('s', '<i4'), ('ns', '<u4')])
+_NAN = int(np.float64(np.nan).view(np.int64))
 _ALL = slice(None)
 Rows = slice | NDArray[np.intp]
 
@@ -81,14 +76,7 @@ class Values:
 
     def __getitem__(self, key: Any) -> Floats:
         rows, columns = key if isinstance(key, tuple) else (key, _ALL)
-        states = self._states.select(rows)
-        joints = np.arange(len(states.names))[columns]
-        values = np.empty((joints.size, states.size))
-        for row, j in zip(
-            values, states.places[self._field, joints.ravel()].tolist(), strict=True
-        ):
-            row[:] = states.messages.column(j, states.number).view(float)
-        values = values.T if joints.ndim else values[0]
+        values = self._states.select(rows).read(self._field, columns)
         if self._difference is not None and np.isnan(values).any():
             first, second = (each[key] for each in self._difference)
             values = np.where(np.isnan(values), first - second, values)
@@ -107,46 +95,58 @@ class JointStates:
         messages: TopicMessages,
         names: Sequence[str],
         places: NDArray[np.intp],
+        kinds: NDArray[np.intp],
         number: NDArray[np.int32],
     ) -> None:
         """Take messages by their `number` (N,) in the topic; -1 is an unknown one.
 
-        Their positions, velocities and efforts are in the columns `places` (3, n), -1
-        if unknown.
+        Their positions, velocities and efforts are the words `places` (kinds, 3, n) in a
+        message, -1 if unknown; `kinds` are those of the layouts of the topic.
         """
         self.names = tuple(names)
         self.size = number.size
         self.messages = messages
-        self.places = places
         self.number = number
+        self._places = places
+        self._kinds = kinds
 
     @property
     def received(self) -> Stamps:
         """When each was received (N,) [ns]."""
-        return self.messages.column(_RECEIVED, self.number)
+        return self.messages.words(_RECEIVED, self.number)
 
     @property
     def sequence(self) -> Stamps:
         """Number given by the publisher (N,); 0 if unknown."""
-        return self.messages.column(_SEQUENCE, self.number)
+        return self.messages.words(_SEQUENCE, self.number)
 
     @property
     def stamp(self) -> Stamps:
         """Stamps (N,) [ns]."""
-        return self.messages.column(
-            _STAMP if self.messages.is_stamped else _RECEIVED, self.number
-        )
+        word = _STAMP if self.messages.is_stamped else _RECEIVED
+        return self.messages.words(word, self.number)
 
     def field(self, k: int) -> Any:
         """Return positions (0), velocities (1) or efforts (2) as `Values` (N, n)."""
         return Values(self, k)
+
+    def read(self, field: int, columns: Any = _ALL) -> Floats:
+        """Return some columns of a field (N, k), or one (N,); NaN where it is unknown."""
+        places = self._places[:, field, columns]
+        found = np.full((self.size, *places.shape[1:]), np.nan)
+        known = self.number >= 0
+        if known.any():
+            number = self.number[known]
+            places = places[self._kinds[self.messages.words(_LAYOUT, number)]]
+            found[known] = self.messages.words(places.T, number).view(float).T
+        return found
 
     def select(self, rows: Rows) -> JointStates:
         """Return the states of these rows; -1 is an unknown one."""
         chosen = self.number[rows]
         if not isinstance(rows, slice):
             chosen[rows < 0] = -1
-        return JointStates(self.messages, self.names, self.places, chosen)
+        return JointStates(self.messages, self.names, self._places, self._kinds, chosen)
 
     def by_stamp(self) -> JointStates:
         """Return the states ordered by stamp, one per stamp."""
@@ -169,19 +169,30 @@ class JointStates:
         )
 
 
-class _Block(NamedTuple):
-    """Messages one after the other in the file, column by column."""
+class _Kind(NamedTuple):
+    """Messages of one layout, and the part of them that has all numbers."""
 
-    offset: int  # bytes
-    size: int  # messages
-    rows: Mapping[int, int]  # where each column is that the block has
+    layout: Layout
+    part: slice  # bytes
+
+    @classmethod
+    def of(cls, layout: Layout) -> _Kind:
+        """Return the kind of a layout."""
+        words = layout.places.values()
+        begin = ORIGIN + _WORD * min(words, default=0)
+        return cls(layout, slice(begin, ORIGIN + _WORD * (max(words, default=-1) + 1)))
+
+    def places_of(
+        self, names: Sequence[str], required: Collection[str]
+    ) -> NDArray[np.intp]:
+        """Return `Layout.places_of`, in words from the head of a message on."""
+        places = self.layout.places_of(names, required)
+        first = (self.part.start - ORIGIN) // _WORD
+        return np.where(places < 0, -1, places - first + _HEAD.size // _WORD)
 
 
 class TopicMessages:
-    """All messages of one topic: the numbers of known types in a file, others as bytes.
-
-    The file has blocks of messages, with a column for each name and field of its own
-    messages.
+    """All messages of one topic: numbers of the known types, others as bytes.
 
     Attributes:
         name, type: of the topic.
@@ -192,60 +203,64 @@ class TopicMessages:
     def __init__(self, name: str, type_name: str) -> None:
         self.name = name
         self.type = type_name
-        self.size = 0
         self.is_stamped = True
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
-        self._blocks: list[_Block] = []
-        # with the number of the layout
-        self._waiting: list[tuple[int, BagMessage]] = []
-        self._layouts: list[Layout] = []
-        self._columns: dict[tuple[str, str], int] = {}  # by field and name
+        self._store = OnDisk()
+        self._begins = array('q')  # word at which each message begins
+        # words and begins, as arrays
+        self._read = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._kinds: list[_Kind] = []
+        self._names: set[tuple[str, str]] = set()  # and fields
+        self._places = 0
         self._last = _UNREADABLE  # layout of the last message
         self._unreadable: dict[int, MessageError] = {}
-        self._places = 0
-        # received [ns], offset, size [bytes]
-        self._kept: list[tuple[int, int, int]] = []
         # sequence number of each publisher, that of the last one last
         self._next: list[int] = []
         # of the last messages: sequence number and hash
         self._recent: deque[tuple[int, int]] = deque(maxlen=_TWINS)
         self._missed = self._before = 0
 
-    def __del__(self) -> None:
-        if '_file' in vars(self):  # not if Ctrl-C came while it was opened
-            with suppress(OSError):  # of a full disk, which has been told
-                self._file.close()
+    @property
+    def size(self) -> int:
+        """Number of messages."""
+        return len(self._begins)
 
     def add(self, message: BagMessage) -> None:
-        """Add a message; none may be added once a column was read."""
+        """Add a message."""
+        raw = message.raw
         if message.sequence:
-            self._count(message.sequence, hash(message.raw))
-        if self.type not in _LAYOUTS:
-            self._keep(message)
+            self._count(message.sequence, hash(raw))
+        stamp = _NAN
+        if self.type in _LAYOUTS:
+            last = self._last
+            if last < 0 or not self._kinds[last].layout.fits(raw):
+                last = self._last = self._layout_of(raw)
+            content = raw[self._kinds[last].part] if last >= 0 else b''
+            if last >= 0 and self.type == JOINT_STATE:
+                seconds, nanoseconds = _TIME.unpack_from(raw, STAMP_OFFSET)
+                stamp = seconds * NANOSECONDS + nanoseconds
         else:
-            if self._last < 0 or not self._layouts[self._last].fits(message.raw):
-                self._last = self._layout_of(message.raw)
-            self._waiting.append((self._last, message))
-            if len(self._waiting) == _BLOCK:
-                self._flush()
-        self.size += 1
+            last = len(raw)
+            self._check_text(last)
+            content = raw.ljust(-(-last // _WORD) * _WORD, b'\0')
+        self._begins.append(self._store.size // _WORD)
+        head = _HEAD.pack(message.received, message.sequence, stamp, last)
+        self._store.append(head + content)
 
-    def _keep(self, message: BagMessage) -> None:
-        """Keep a message as it is."""
-        size = len(message.raw)
+    def _check_text(self, size: int) -> None:
+        """Raise BagError if a message that is kept as it is has too many bytes."""
         if size > _MOST_TEXT:
             raise BagError(
                 f'a message of {self.name} has {size / 1e6:.0f} MB, more than '
                 f'{_MOST_TEXT / 1e6:.0f}: the bag is damaged or was not recorded from this topic'
             )
-        self._kept.append((message.received, self._file.tell(), size))
-        self._file.write(message.raw)
 
     def raw(self) -> Iterator[tuple[int, bytes]]:
         """Yield reception time [ns] and content of each message of another type."""
-        self._file.flush()
-        for received, offset, size in self._kept:
-            yield received, os.pread(self._file.fileno(), size, offset)
+        words, begins = self._arrays()
+        for begin in begins.tolist():
+            received, _, _, size = words[begin : begin + 4].tolist()
+            content = words[begin + 4 : begin + 4 - (-size // _WORD)]
+            yield received, content.tobytes()[:size]
 
     def _count(self, sequence: int, content: int) -> None:
         """Count the messages that are missing before the one with this number.
@@ -281,8 +296,8 @@ class TopicMessages:
         return f'{self._missed} missed{earlier}'
 
     def _layout_of(self, raw: bytes) -> int:
-        for k in range(max(0, len(self._layouts) - _RECENT), len(self._layouts)):
-            if self._layouts[k].fits(raw):
+        for k in range(max(0, len(self._kinds) - _RECENT), len(self._kinds)):
+            if self._kinds[k].layout.fits(raw):
                 return k
         try:
             layout = _LAYOUTS[self.type](raw)
@@ -290,82 +305,27 @@ class TopicMessages:
             self._unreadable[self.size] = error
             return _UNREADABLE
         self._places += len(layout.places)
-        names = self._columns.keys() | layout.places.keys()
-        if len(names) > _MOST_NAMES or self._places > _MOST_PLACES:
+        self._names.update(layout.places)
+        if len(self._names) > _MOST_NAMES or self._places > _MOST_PLACES:
             raise BagError(
-                f'{self.name} has {len(names)} names and fields in {len(self._layouts) + 1} lists: '
-                'these are no states of one robot'
+                f'{self.name} has {len(self._names)} names and fields in {len(self._kinds) + 1} '
+                'lists: these are no states of one robot'
             )
-        for key in layout.places:
-            self._columns.setdefault(key, _VALUES + len(self._columns))
-        self._layouts.append(layout)
-        return len(self._layouts) - 1
+        self._kinds.append(_Kind.of(layout))
+        return len(self._kinds) - 1
 
-    def _flush(self) -> None:
-        """Decode the messages added last, and write their block."""
-        waiting = self._waiting
-        self._waiting = []
-        if not waiting:
-            return
-        used = {k for k, _ in waiting} - {_UNREADABLE}
-        rows = self._rows_of(used)
-        block = np.full((len(rows), len(waiting)), _NAN)
-        block[_LAYOUT] = [k for k, _ in waiting]
-        block[_RECEIVED] = [message.received for _, message in waiting]
-        block[_SEQUENCE] = [message.sequence for _, message in waiting]
-        for k in used:
-            raw = [message.raw for of, message in waiting if of == k]
-            where = np.flatnonzero(block[_LAYOUT] == k)
-            self._decode(self._layouts[k], b''.join(raw), block, rows, where)
-        self._blocks.append(_Block(self._file.tell(), len(waiting), rows))
-        self._file.write(block.tobytes())
-        self._file.flush()
+    def _arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return all words that were written, and those at which messages begin."""
+        if self._read[1].size != self.size:
+            self._read = self._store.array('<i8'), np.array(self._begins)
+        return self._read
 
-    def _rows_of(self, layouts: Collection[int]) -> Mapping[int, int]:
-        """Return the row in a block of each column of these layouts."""
-        columns = set(range(_VALUES))
-        for k in layouts:
-            columns.update(self._columns[key] for key in self._layouts[k].places)
-        rows = {column: row for row, column in enumerate(sorted(columns))}
-        if self._blocks and self._blocks[-1].rows == rows:
-            return self._blocks[-1].rows
-        return rows
-
-    def _decode(
-        self,
-        layout: Layout,
-        joined: bytes,
-        block: NDArray[np.int64],
-        rows: Mapping[int, int],
-        where: NDArray[np.intp],
-    ) -> None:
-        """Decode the joined messages of one layout into places (k,) of a block."""
-        if self.type == JOINT_STATE:
-            strides = (layout.size,)
-            stamp = np.ndarray(where.shape, _TIME, joined, STAMP_OFFSET, strides)
-            seconds = stamp['s'].astype(np.int64)
-            block[_STAMP, where] = seconds * NANOSECONDS + stamp['ns']
-        shape = (where.size, (layout.size - ORIGIN) // 8)
-        values = np.ndarray(shape, '<i8', joined, ORIGIN, (layout.size, 8))
-        for key, place in layout.places.items():
-            block[rows[self._columns[key]], where] = values[:, place]
-
-    def column(self, j: int, number: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return a column of messages by number, NaN where it is unknown."""
-        self._flush()
-        found = np.full(number.size, _NAN)
-        known = number >= 0
-        if j < 0 or not known.any():
-            return found
-        first = number[known].min() // _BLOCK
-        last = number.max() // _BLOCK + 1
-        values = np.full((last - first, _BLOCK), _NAN)
-        for row, block in zip(values, self._blocks[first:last], strict=True):
-            if j in block.rows:
-                at = block.offset + 8 * block.size * block.rows[j]
-                os.preadv(self._file.fileno(), [row[: block.size].data], at)
-        found[known] = values.ravel()[number[known] - first * _BLOCK]
-        return found
+    def words(self, place: Any, number: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the words (..., N) at places in messages by number; NaN: unknown."""
+        words, begins = self._arrays()
+        is_known = (number >= 0) & (np.asarray(place) >= 0)
+        at = np.where(is_known, begins[number] + place, 0)
+        return np.where(is_known, words[at], _NAN)
 
     def joint_states(
         self,
@@ -396,17 +356,18 @@ class TopicMessages:
             UnreadableMessageError: there are messages, and none can be decoded.
         """
         problems: dict[int, MessageError] = {}
-        for k, layout in enumerate(self._layouts):
+        last = len(self._kinds)  # of what has no layout
+        places: dict[int, NDArray[np.intp]] = {}
+        for k, kind in enumerate(self._kinds):
             try:
-                layout.places_of(names, required)
+                places[k] = kind.places_of(names, required)
             except MessageError as error:
                 problems[k] = error
-        last = len(self._layouts)  # of what has no layout
-        is_read = np.array([k not in problems for k in range(last)] + [False])
+        is_read = np.array([k in places for k in range(last)] + [False])
         is_bad = np.array(
             [not _is_foreign(problems.get(k), names) for k in range(last)] + [True]
         )
-        layouts = self.column(_LAYOUT, np.arange(self.size, dtype=np.int32))
+        layouts = self.words(_LAYOUT, np.arange(self.size, dtype=np.int32))
         number = np.flatnonzero(is_read[layouts]).astype(np.int32)
         bad = (
             np.flatnonzero((is_bad & ~is_read)[layouts])
@@ -418,18 +379,15 @@ class TopicMessages:
         }
         if errors and not number.size:
             raise UnreadableMessageError(self.name, *min(errors.items()))
-        places = [
-            [self._columns.get((field, name), -1) for name in names]
-            for field in JOINT_STATE_FIELDS
-        ]
-        states = JointStates(self, names, np.array(places, np.intp), number)
-        return states, errors
+        kinds = np.cumsum(is_read) - 1
+        table = np.array([*places.values()], np.intp).reshape(-1, 3, len(names))
+        return JointStates(self, names, table, kinds, number), errors
 
     def name_lists(self) -> list[tuple[str, ...]]:
         """Return the different lists of names; raise UnreadableMessageError if none."""
-        if not self._layouts:
+        if not self._kinds:
             raise UnreadableMessageError(self.name, *min(self._unreadable.items()))
-        return list(dict.fromkeys(layout.names for layout in self._layouts))
+        return list(dict.fromkeys(kind.layout.names for kind in self._kinds))
 
     def joint_names(self) -> tuple[str, ...]:
         """Return the longest list of names; raise UnreadableMessageError if empty."""

@@ -4,9 +4,6 @@
 A stand-in, such as -9999 or 1e10, is far from all other values of its column.  A torque
 of a moving arm is not the same in all rows, nor exactly zero for long between values
 that are not small, nor zero in all joints at once.
-
-Values are those of a table, or of a bag, which are on disk: they are read in blocks,
-and whole columns of them only where one may have a stand-in.
 """
 
 from __future__ import annotations
@@ -17,8 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.topic_messages import Values
-from blf_dsc_controller.identification.on_disk import blocks_of
 from blf_dsc_controller.run import Floats
 
 _FAR = 500.0  # as a file has it: those in use begin with 999
@@ -27,9 +22,6 @@ _MOST = 8  # different ones in a column
 _LONG = 5  # rows of zeros
 _NOT_SMALL = 0.1  # of a joint's largest torque, beside such zeros ...
 _STEPS = 5.0  # ... and times its least one, which may be a step
-
-Column = Floats | Values
-"""Values (N, n), in memory or on disk."""
 
 
 class Extremes(NamedTuple):
@@ -43,35 +35,28 @@ class Extremes(NamedTuple):
         """The largest distance from zero."""
         return np.maximum(-self.least, self.most)
 
-    @property
-    def are_same(self) -> NDArray[np.bool_]:
-        """Which columns have one value only."""
-        return np.asarray(self.least == self.most)
 
-
-def extremes(values: Column, rows: NDArray[np.bool_]) -> Extremes:
-    """Return the extremes of values (N, n) in some rows (N,)."""
-    least: list[Floats] = []
-    most: list[Floats] = []
-    for at in blocks_of(rows.size):
-        block = values[at]
-        known = np.isfinite(block) & rows[at, None]
-        least.append(np.min(block, axis=0, initial=np.inf, where=known))
-        most.append(np.max(block, axis=0, initial=-np.inf, where=known))
-    return Extremes(np.min(least, axis=0), np.max(most, axis=0))
+def extremes(values: Floats) -> Extremes:
+    """Return the extremes of values (N, n)."""
+    known = np.isfinite(values)
+    return Extremes(
+        np.min(values, axis=0, initial=np.inf, where=known),
+        np.max(values, axis=0, initial=-np.inf, where=known),
+    )
 
 
 def stand_ins(
-    values: Column, size: int, names: Sequence[str]
+    values: Floats, names: Sequence[str]
 ) -> tuple[NDArray[np.bool_], list[str]]:
     """Return the rows (N,) of values (N, k) of one kind that have stand-ins, and what to say."""
-    rows = np.zeros(size, dtype=bool)
+    rows = np.zeros(len(values), dtype=bool)
     said: list[str] = []
-    found = extremes(values, ~rows)
+    found = extremes(values)
     with np.errstate(over='ignore'):  # of values such as 1e308
         spread = np.maximum(found.most - found.least, 0.0)
-    columns = {k: np.array(values[:, k]) for k in _where(spread >= _FAR)}
-    spread[list(columns)] = 0.0
+    doubtful = np.flatnonzero(spread >= _FAR).tolist()
+    columns = {k: np.array(values[:, k]) for k in doubtful}
+    spread[doubtful] = 0.0
     for _ in range(_MOST if columns else 0):
         with np.errstate(over='ignore'):
             apart = _stand_ins(columns, spread.max())
@@ -83,10 +68,6 @@ def stand_ins(
         if not apart:
             break
     return rows, said
-
-
-def _where(which: NDArray[np.bool_]) -> list[int]:
-    return [int(k) for k in np.flatnonzero(which)]
 
 
 def _stand_ins(columns: dict[int, Floats], spread: float) -> dict[int, float]:
@@ -135,51 +116,29 @@ def _middle(values: Floats) -> float:
     return float(np.partition(values, half)[half])
 
 
-def unrecorded(torque: Column, size: int) -> NDArray[np.bool_]:
+def unrecorded(torque: Floats) -> NDArray[np.bool_]:
     """Return the rows (N,) in which all torques (N, n) are zero, or one is for long.
 
     Few of the former at the begin and the end stay: arms may have no torque there.
     """
-    is_zero: NDArray[np.bool_] = np.concatenate(
-        [torque[at] == 0.0 for at in blocks_of(size)]
-    )
+    size, n = torque.shape
+    sizes = np.abs(torque)
     found = np.zeros(size, dtype=bool)
-    for begin, end in _runs(np.all(is_zero, axis=1)):
+    for begin, end in _runs((sizes == 0.0).all(axis=1)):
         is_inside = begin > 0 and end < size  # the first state may be before any torque
-        if is_zero.shape[1] > 1 and (is_inside or end - begin >= _LONG):
+        if n > 1 and (is_inside or end - begin >= _LONG):
             found[begin:end] = True
-    least, most = _sizes(torque, size)
-    not_small = np.maximum(_NOT_SMALL * most, _STEPS * least)
-    for k, zeros in enumerate(is_zero.T):
-        runs = [run for run in _runs(zeros) if run[1] - run[0] >= _LONG]
-        for (begin, end), beside in zip(
-            runs, _beside(torque, k, runs, size), strict=True
-        ):
-            if not (beside <= not_small[k]).any():
+    for own in sizes.T:
+        least = np.min(own, initial=np.inf, where=own > 0.0)
+        most = np.max(own, initial=0.0, where=own > 0.0)
+        not_small = max(_NOT_SMALL * most, _STEPS * least)
+        for begin, end in _runs(own == 0.0):
+            before = own[begin - 1] if begin else np.inf
+            after = own[end] if end < size else np.inf
+            is_beside_small = before <= not_small or after <= not_small
+            if end - begin >= _LONG and not is_beside_small:
                 found[begin:end] = True
     return found
-
-
-def _beside(
-    torque: Column, k: int, runs: Sequence[tuple[int, int]], size: int
-) -> Floats:
-    """Return the torque (r, 2) of a joint before and after each run; inf where there is none."""
-    at = np.array([(begin - 1, end) for begin, end in runs], dtype=np.intp)
-    at = at.reshape(-1, 2)
-    values = torque[np.clip(at, 0, size - 1).ravel(), k]
-    outside = (at < 0) | (at >= size)
-    return np.where(outside, np.inf, np.abs(values).reshape(-1, 2))
-
-
-def _sizes(torque: Column, size: int) -> tuple[Floats, Floats]:
-    """Return the least and the largest torque (n,) of each joint besides zero."""
-    least: list[Floats] = []
-    most: list[Floats] = []
-    for at in blocks_of(size):
-        block = np.abs(torque[at])
-        least.append(np.min(block, axis=0, initial=np.inf, where=block > 0.0))
-        most.append(np.max(block, axis=0, initial=0.0, where=block > 0.0))
-    return np.min(least, axis=0), np.max(most, axis=0)
 
 
 def _runs(which: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -7,11 +7,8 @@ steps, not much longer than the step next to it.  A clipped one stays there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from blf_dsc_controller.identification.on_disk import blocks_of
 from blf_dsc_controller.identification.windows import STILL, Rows
 from blf_dsc_controller.run import Floats
 
@@ -41,33 +38,12 @@ def _limits(rows: Rows, sign: float) -> Floats:
 
     Infinity where it is not.
     """
-    largest, next_to_it = _two_largest(rows, sign)
-    at_largest = np.zeros(largest.size)
-    at_next = np.zeros(largest.size)
-    moving = 0
-    for torque in _in_motion(rows, sign):
-        at_largest += np.sum(torque == largest, axis=0)
-        at_next += np.sum(torque == next_to_it, axis=0)
-        moving += len(torque)
-    often = np.maximum(_FEWEST, _LEAST * moving)
+    is_moving = (np.abs(rows.dq) > STILL).any(axis=1)
+    torque = sign * rows.torque[is_moving]
+    largest = torque.max(axis=0, initial=-np.inf)
+    below = torque.max(axis=0, initial=-np.inf, where=torque < largest)
+    at_largest = np.sum(torque == largest, axis=0)
+    at_next = np.sum(torque == below, axis=0)
+    often = np.maximum(_FEWEST, _LEAST * len(torque))
     is_clipped = (at_largest >= often) & (at_largest >= _TIMES * at_next)
-    return np.where(is_clipped & (largest > next_to_it), largest, np.inf)
-
-
-def _two_largest(rows: Rows, sign: float) -> tuple[Floats, Floats]:
-    """Return the largest value of sign times each joint's torque (n,), and the next below."""
-    largest = np.full(rows.speed.size, -np.inf)
-    for torque in _in_motion(rows, sign):
-        largest = np.maximum(largest, torque.max(axis=0, initial=-np.inf))
-    next_to_it = np.full(rows.speed.size, -np.inf)
-    for torque in _in_motion(rows, sign):
-        below = np.where(torque < largest, torque, -np.inf)
-        next_to_it = np.maximum(next_to_it, below.max(axis=0, initial=-np.inf))
-    return largest, next_to_it
-
-
-def _in_motion(rows: Rows, sign: float) -> Iterator[Floats]:
-    """Yield sign times the torques (k, n) of the samples in which a joint moves."""
-    for at in blocks_of(len(rows.q)):
-        is_moving = (np.abs(rows.dq[at]) > STILL).any(axis=1)
-        yield sign * np.asarray(rows.torque[at])[is_moving]
+    return np.where(is_clipped & (largest > below), largest, np.inf)

@@ -24,9 +24,7 @@ from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.mounting import gravity_columns
-from blf_dsc_controller.identification.on_disk import Samples, mapped
-from blf_dsc_controller.identification.recording import Recording
-from blf_dsc_controller.identification.turns import TURN
+from blf_dsc_controller.identification.recording import TURN, Recording
 from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.run import Floats
 
@@ -71,15 +69,11 @@ class Convention(NamedTuple):
 def converted(recording: Recording, convention: Convention) -> Recording:
     """Return the recording as if it had been counted as the URDF does."""
     signs, offsets = convention
-
-    def negated(values: Samples) -> Samples:
-        return mapped(recording.gap.size, lambda rows: signs * values[rows])
-
-    q = recording.q
+    twist = recording.twist
     return recording._replace(
-        q=mapped(recording.gap.size, lambda rows: signs * q[rows] + offsets),
-        torque=negated(recording.torque),
-        twist=None if recording.twist is None else negated(recording.twist),
+        q=signs * recording.q + offsets,
+        torque=signs * recording.torque,
+        twist=None if twist is None else signs * twist,
     )
 
 

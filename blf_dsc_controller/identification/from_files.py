@@ -18,7 +18,6 @@ from blf_dsc_controller.identification.identify import (
     identify_arm,
     tell_nobody,
 )
-from blf_dsc_controller.identification.on_disk import mapped
 from blf_dsc_controller.identification.problem import Effort
 from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.recording import Recording, joined
@@ -105,9 +104,7 @@ def _not_torques(recording: Recording) -> BlfDscError:
 def _with_gains(recording: Recording, gains: Sequence[float]) -> Recording:
     """Return the recording with torques that are its efforts times the gains."""
     factors = _checked_gains(gains, recording.joints)
-    efforts = recording.torque
-    torque = mapped(recording.gap.size, lambda rows: efforts[rows] * factors)
-    return recording._replace(torque=torque)
+    return recording._replace(torque=recording.torque * factors)
 
 
 def _checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:

@@ -10,16 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.urdf import Tree
-from blf_dsc_controller.bags.content import NO_NAMES, NameMap
+from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.bad_values import stand_ins
-from blf_dsc_controller.identification.checks import Group, Motion, checked
 from blf_dsc_controller.identification.columns import (
     KINDS,
     Column,
@@ -27,11 +24,8 @@ from blf_dsc_controller.identification.columns import (
     choose_columns,
     pattern_of,
 )
-from blf_dsc_controller.identification.recording import (
-    LONGEST_PERIOD,
-    Recording,
-    resampled,
-)
+from blf_dsc_controller.identification.motion import Group, Motion
+from blf_dsc_controller.identification.recording import LONGEST_PERIOD
 from blf_dsc_controller.identification.table_files import Table, open_table
 from blf_dsc_controller.identification.units import split_unit
 from blf_dsc_controller.run import Floats, Stamps
@@ -45,13 +39,10 @@ _EPOCH = (1e9, 4e9)
 _SMALLER = {'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
-def read_table(
-    path: Path,
-    text: str,
-    joints: Sequence[str] = (),
-    names: NameMap = NO_NAMES,
-) -> Recording:
-    """Read a recording of the arm of a URDF (its text) from a table.
+def motion_of_table(
+    path: Path, tree: Tree, joints: Sequence[str], names: NameMap
+) -> Motion:
+    """Read the motion of the arm of a URDF from a table.
 
     `joints` are the arm's, by default all from the root to where it branches, or as
     many of them as the table has.  `names.joints` may have `time`, `q`, `tau` and
@@ -61,7 +52,6 @@ def read_table(
         BlfDscError: the file cannot be read, or its columns are not found.
     """
     table = open_table(path)
-    tree = Tree.of(text)
     others = dict(names.joints)
     given = {kind: others.pop(kind, '') for kind in KINDS}
     trunk = tuple(joints) or tree.trunk() or tree.only_chain()
@@ -70,38 +60,26 @@ def read_table(
     if joints:
         _check_count(path, columns, trunk)
     groups = _groups(path, table, columns)
-    clock = _clock(path, columns, groups)
-    has_unit = bool(split_unit(given['q'], 'q').unit)
+    time, said = _seconds(path, columns, groups['time'])
+    _check_rows(path, time, groups['q'].values)
+    stamp, runs = _one_clock(path, time)
+    if runs > 1:
+        said.append(f'the time starts again {runs - 1} times: read as {runs} runs')
+    pattern = pattern_of(table.names, [column.name for column in columns.q])
     motion = Motion(
         path=path,
         joints=trunk[: len(columns.q)],
-        stamp=clock.stamp,
+        stamp=stamp,
         q=groups['q'],
         tau=groups['tau'],
         theta=groups['theta'] if columns.theta else None,
-        unit='' if has_unit else f'q={_pattern(table, columns)}',
+        unit='' if split_unit(given['q'], 'q').unit else f'q={pattern}',
         others='choose the columns that have it, as in --map tau=effort_*',
+        source=f'{path.name}: {columns.text}',
+        said=said,
+        currents=columns.has_currents,
     )
-    sound = checked(motion, tree)
-    source = '; '.join([f'{path.name}: {columns.text}', *clock.said, *sound.said])
-    recording = _resampled(motion, sound.rows & clock.known, tree, source)
-    return recording._replace(currents=columns.has_currents)
-
-
-def _resampled(
-    motion: Motion, rows: NDArray[np.bool_], tree: Tree, source: str
-) -> Recording:
-    """Return some rows (N,) of the motion of an arm as a recording."""
-    joints = tuple(motion.joints)
-    return resampled(
-        joints,
-        motion.stamp[rows],
-        _scaled(motion.q)[rows],
-        _scaled(motion.tau)[rows],
-        source,
-        tree.turning(joints),
-        None if motion.theta is None else _scaled(motion.theta)[rows],
-    )
+    return motion.select(np.isfinite(time))
 
 
 def _check_count(path: Path, columns: Columns, arm: Sequence[str]) -> None:
@@ -112,29 +90,6 @@ def _check_count(path: Path, columns: Columns, arm: Sequence[str]) -> None:
             f'{path} has the positions of {len(columns.q)} joints ({listed}), but from base to '
             f'tip there are {len(arm)}: {", ".join(arm)}'
         )
-
-
-class _Clock(NamedTuple):
-    """When the rows (N,) of a table were recorded."""
-
-    stamp: Stamps  # (N,) ns
-    known: NDArray[np.bool_]  # (N,)
-    said: list[str]  # of what is odd
-
-
-def _clock(path: Path, columns: Columns, groups: dict[str, Group]) -> _Clock:
-    """Return the times of all rows; raise BlfDscError if they are none."""
-    time, said = _seconds(path, columns, groups['time'])
-    _check_rows(path, time, np.asarray(groups['q'].values))
-    stamp, runs = _one_clock(path, time)
-    if runs > 1:
-        said.append(f'the time starts again {runs - 1} times: read as {runs} runs')
-    return _Clock(stamp, np.isfinite(time), said)
-
-
-def _pattern(table: Table, columns: Columns) -> str:
-    """Return what chooses the columns of the positions."""
-    return pattern_of(table.names, [column.name for column in columns.q])
 
 
 def _check_rows(path: Path, time: Floats, q: Floats) -> None:
@@ -173,11 +128,10 @@ def _groups(path: Path, table: Table, columns: Columns) -> dict[str, Group]:
 
 def _seconds(path: Path, columns: Columns, time: Group) -> tuple[Floats, list[str]]:
     """Return the time (N,) [s], NaN where it is unknown, and what to say of it."""
-    size = len(np.asarray(time.values))
     if columns.rate:
-        return np.arange(size) / columns.rate, []
-    missing, said = stand_ins(time.values, size, time.names)
-    scaled = _scaled(time)
+        return np.arange(len(time.values)) / columns.rate, []
+    missing, said = stand_ins(time.values, time.names)
+    scaled = time.scaled
     scaled[missing] = np.nan
     known = np.isfinite(scaled).all(axis=1)
     if not known.any():
@@ -188,10 +142,6 @@ def _seconds(path: Path, columns: Columns, time: Group) -> tuple[Floats, list[st
     seconds = np.sum(scaled - first, axis=1)
     seconds *= _unnamed_unit(path, columns.time, first, seconds)
     return seconds, [f'{each}, read as missing' for each in said]
-
-
-def _scaled(group: Group) -> Floats:
-    return np.asarray(group.values[:] * group.factors)
 
 
 def _unnamed_unit(

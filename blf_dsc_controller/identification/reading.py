@@ -6,10 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NO_NAMES, NameMap
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.from_bag import read_bag
-from blf_dsc_controller.identification.from_table import read_table
+from blf_dsc_controller.identification.from_bag import motion_of_bag
+from blf_dsc_controller.identification.from_table import motion_of_table
+from blf_dsc_controller.identification.motion import recording_of
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.table_files import TABLES
 
@@ -27,17 +29,19 @@ def read_recording(
 ) -> Recording:
     """Read a recording of the arm of a URDF (its text) from a bag or a table.
 
-    `joints` are the arm's, from its base to its tip; none: see `read_bag`,
-    `read_table`.  `names` are those that differ in the file.  `commanded`: commands of
+    `joints` are the arm's, from its base to its tip; none: see `motion_of_bag`,
+    `motion_of_table`.  `names` are those that differ in the file.  `commanded`: commands of
     a bag are read instead of efforts.
 
     Raises:
         BlfDscError: the file cannot be read, or does not hold positions and torques of the arm.
     """
+    tree = Tree.of(text)
     if path.suffix.lower() in TABLES:
-        return read_table(path, text, joints, names)
+        return recording_of(motion_of_table(path, tree, joints, names), tree)
     _check_file(path)
-    return read_bag(path, text, joints, namespace, names, commanded)
+    motion = motion_of_bag(path, tree, joints, namespace, names, commanded=commanded)
+    return recording_of(motion, tree)
 
 
 def _check_file(path: Path) -> None:

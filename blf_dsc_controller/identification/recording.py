@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.on_disk import (
-    Samples,
-    blocks_of,
-    mapped,
-)
-from blf_dsc_controller.identification.turns import TURN, Turns
 from blf_dsc_controller.run import Floats, Stamps
+
+TURN = 2.0 * np.pi
+"""A full turn [rad]."""
 
 LONGEST_PERIOD = 0.02
 """Longest time between states [s], but for jitter."""
@@ -29,26 +26,17 @@ GAP = 3.0
 """Intervals between two states from which something is missing."""
 
 
-class Rows(Protocol):
-    """Values (N, n) of which some rows are read, by a slice or by their numbers."""
-
-    def __getitem__(self, rows: Any, /) -> Any:
-        """Return some rows."""
-
-
 class Recording(NamedTuple):
-    """N samples of n joints, a period apart; of a long one, most is on disk."""
+    """N samples of n joints, a period apart."""
 
     joints: tuple[str, ...]
     period: float  # s
-    q: Samples  # (N, n) rad, or m
-    torque: Samples  # (N, n) N m, or N
+    q: Floats  # (N, n) rad, or m
+    torque: Floats  # (N, n) N m, or N
     gap: NDArray[np.bool_]  # (N,) whether nothing was recorded here
     source: str  # of the torques: a topic, or columns of a table
     currents: bool = False  # whether the columns of the torques are named so
-    twist: Samples | None = (
-        None  # (N, n) motors minus links, rad or m, if both are known
-    )
+    twist: Floats | None = None  # (N, n) motors minus links, rad or m, if known
 
     @property
     def duration(self) -> float:
@@ -59,8 +47,8 @@ class Recording(NamedTuple):
 def resampled(
     joints: tuple[str, ...],
     stamp: Stamps,
-    q: Rows,
-    torque: Rows,
+    q: Floats,
+    torque: Floats,
     source: str,
     turning: NDArray[np.bool_],
     motors: Floats | None = None,
@@ -74,32 +62,42 @@ def resampled(
     Raises:
         BlfDscError: there are too few states, or their stamps cannot be of one clock.
     """
-    groups = (q, torque) if motors is None else (q, torque, motors)
+    groups = [q, torque] if motors is None else [q, torque, motors]
     order = _order(stamp, groups)
     grid = _grid_of(stamp[order])
-    turns = Turns((q[order[rows]] for rows in blocks_of(order.size)), turning)
-    if turns.wrapped.any():
-        names = ', '.join(np.array(joints)[turns.wrapped])
+    q = q[order]
+    turns = _turns(q, turning)
+    if turns.any():
+        names = ', '.join(np.array(joints)[turns.any(axis=0)])
         source = f'{source} (positions of {names} are wrapped: full turns added)'
-    positions = grid.evenly(lambda rows: turns.added(rows, q[order[rows]]))
-    torques = grid.evenly(lambda rows: torque[order[rows]])
-    recording = Recording(joints, grid.period, positions, torques, grid.gap, source)
+    recording = Recording(
+        joints=joints,
+        period=grid.period,
+        q=grid.evenly(q + TURN * turns),
+        torque=grid.evenly(torque[order]),
+        gap=grid.gap,
+        source=source,
+    )
     if motors is None:
         return recording
-    twist = _twist(q[order], motors[order], turning)
-    return recording._replace(twist=grid.evenly(lambda rows: twist[rows]))
+    return recording._replace(twist=grid.evenly(_twist(q, motors[order], turning)))
 
 
-def _order(stamp: Stamps, groups: Sequence[Rows]) -> NDArray[np.intp]:
+def _order(stamp: Stamps, groups: Sequence[Floats]) -> NDArray[np.intp]:
     """Return the rows in which all values are known, each stamp once, in their order."""
-    known = [
-        np.isfinite(np.column_stack([each[rows] for each in groups])).all(axis=1)
-        for rows in blocks_of(stamp.size)
-    ]
-    order = np.flatnonzero(np.concatenate([np.zeros(0, dtype=bool), *known]))
-    if not (np.diff(stamp[order]) > 0).all():
-        order = order[np.unique(stamp[order], return_index=True)[1]]
-    return order
+    known = [np.isfinite(each).all(axis=1) for each in groups]
+    order = np.flatnonzero(np.all(known, axis=0))
+    return order[np.unique(stamp[order], return_index=True)[1]]
+
+
+def _turns(q: Floats, turning: NDArray[np.bool_]) -> Floats:
+    """Return the full turns (N, n) that the encoders of joints have left out.
+
+    From one state to the next, a joint turns by less than half a turn.  A larger step is
+    the end of the encoder's range.
+    """
+    steps = np.diff(q, axis=0, prepend=q[:1])
+    return np.asarray(np.cumsum(-np.round(steps / TURN) * turning, axis=0))
 
 
 class _Grid(NamedTuple):
@@ -110,15 +108,9 @@ class _Grid(NamedTuple):
     period: float  # s
     gap: NDArray[np.bool_]  # (M,) whether nothing was recorded here
 
-    def evenly(self, values: Callable[[slice], Floats]) -> Samples:
-        """Return at the even times what `values` returns of the states."""
-
-        def block(rows: slice) -> Floats:
-            at = self.even[rows]
-            near = _around(at, self.time)
-            return interpolated(at, self.time[near], values(near))
-
-        return mapped(self.even.size, block)
+    def evenly(self, values: Floats) -> Floats:
+        """Return values (N, n) of the states at the even times."""
+        return interpolated(self.even, self.time, values)
 
 
 def _grid_of(stamp: Stamps) -> _Grid:
@@ -175,13 +167,6 @@ def evenly_interpolated(at: np.ndarray, values: np.ndarray) -> Floats:
     return np.asarray(low + share[:, None] * (values[before + 1] - low))
 
 
-def _around(at: np.ndarray, time: np.ndarray) -> slice:
-    """Return which of the times are needed to interpolate at some others (k,); all increase."""
-    first = np.searchsorted(time, at[0], side='right') - 1
-    last = np.searchsorted(time, at[-1], side='left') + 1
-    return slice(max(int(first), 0), int(last))
-
-
 def joined(first: Recording, *others: Recording) -> tuple[Recording, list[float]]:
     """Return recordings with gaps between them as one, and the times [s] at which others begin.
 
@@ -197,26 +182,15 @@ def joined(first: Recording, *others: Recording) -> tuple[Recording, list[float]
         gap[0] = True
         twist = None
         if together.twist is not None and other.twist is not None:
-            size = together.gap.size
-            twist = _followed(together.twist, size, other.twist, grid, times)
+            twist = interpolated(grid, times, other.twist)
+            twist = np.concatenate([together.twist, twist])
+        q = interpolated(grid, times, other.q)
+        torque = interpolated(grid, times, other.torque)
         together = together._replace(
-            q=_followed(together.q, together.gap.size, other.q, grid, times),
-            torque=_followed(
-                together.torque, together.gap.size, other.torque, grid, times
-            ),
+            q=np.concatenate([together.q, q]),
+            torque=np.concatenate([together.torque, torque]),
             gap=np.append(together.gap, gap),
             twist=twist,
             source=f'{together.source}, {other.source}',
         )
     return together, begins
-
-
-def _followed(
-    first: Samples, size: int, other: Samples, grid: Floats, times: Floats
-) -> Samples:
-    """Return the first `size` rows, and those of the other times on a grid."""
-    found = mapped(size, lambda rows: np.asarray(first[rows]))
-    for rows in blocks_of(grid.size):
-        near = _around(grid[rows], times)
-        found.append(interpolated(grid[rows], times[near], other[near]))
-    return found

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.identification.on_disk import Samples
 from blf_dsc_controller.identification.regression import correlation_length
 from blf_dsc_controller.identification.windows import Indices, Rows
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
@@ -77,7 +76,7 @@ class Compliance(NamedTuple):
 
 
 def compliance_of(
-    rows: Rows, twist: Samples, windows: Indices, links: Floats, delay: float
+    rows: Rows, twist: Floats, windows: Indices, links: Floats, delay: float
 ) -> Compliance:
     """Return the compliances by the twist (N, n) in some windows.
 

@@ -29,15 +29,9 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fadings, slidings
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
+from blf_dsc_controller.bags.on_disk import BLOCK, blocks_of, mapped, on_disk
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.on_disk import (
-    BLOCK,
-    OnDisk,
-    Samples,
-    blocks_of,
-    mapped,
-)
 from blf_dsc_controller.identification.recording import (
     Recording,
     evenly_interpolated,
@@ -101,7 +95,7 @@ class Rows(NamedTuple):
     """
 
     time: Floats  # (R,) of their centres, s
-    inertial: OnDisk  # (R, n p) columns of P
+    inertial: Floats  # (R, n, p) columns of P
     # (R, n) by name, one for each of COLUMNS: of each joint, zero for the others
     columns: Mapping[str, Floats]
     coupling: Floats  # (R, 2, 3) columns of COUPLING for the last two joints
@@ -111,15 +105,15 @@ class Rows(NamedTuple):
     clipped: NDArray[np.bool_]  # (R, n) whether a torque in the window is clipped
     speeds: Floats  # (R, n) mean speed in each window, rad/s or m/s
     speed: Floats  # (n,) 95th percentile of each joint's speed, rad/s or m/s
-    q: OnDisk  # (N, n) smoothed positions at all samples
-    dq: OnDisk  # (N, n) their velocities
-    torque: Samples  # (N, n) likewise
+    q: Floats  # (N, n) smoothed positions at all samples
+    dq: Floats  # (N, n) their velocities
+    torque: Floats  # (N, n) likewise
     g: Floats  # (L,) with sum 1
     slope: Floats  # (L,) g' in 1/s, scaled likewise
     starts: np.ndarray  # (R,) first sample of each window
     period: float  # s
-    sliding: OnDisk  # (N, n) s
-    gravity: OnDisk  # (N / every, n p) regressor of the torque of gravity
+    sliding: Floats  # (N, n) s
+    gravity: Floats  # (N / every, n, p) regressor of the torque of gravity
     every: int  # samples between its positions
 
     @property
@@ -145,10 +139,7 @@ class Rows(NamedTuple):
         n = self.speed.size
         p = self.p
         X = np.zeros((windows.size, n, self.unknowns))
-        if not windows.size:
-            return X
-        read = self.inertial[int(windows[0]) : int(windows[-1]) + 1]
-        inertial = read[windows - windows[0]].reshape(-1, n, p)
+        inertial = self.inertial[windows]
         X[:, :, :p] = inertial
         joints = np.arange(n)
         for c, name in enumerate(COLUMNS):
@@ -181,10 +172,7 @@ class Rows(NamedTuple):
     @property
     def largest_torque(self) -> Floats:
         """Largest torque of each joint (n,) [N m or N]."""
-        largest = [
-            np.abs(self.torque[rows]).max(axis=0) for rows in blocks_of(len(self.q))
-        ]
-        return np.asarray(np.max(largest, axis=0))
+        return np.asarray(np.abs(self.torque).max(axis=0))
 
     def with_torque(self, torque: OfSamples) -> Rows:
         """Return the rows with other torques."""
@@ -194,7 +182,7 @@ class Rows(NamedTuple):
         """Return the torque of gravity (k, n) of the base parameters P (p,) at some samples."""
         first = samples.start // self.every
         knots = self.gravity[first : (samples.stop - 1) // self.every + 2]
-        torque = knots.reshape(len(knots), -1, self.p) @ P
+        torque = knots @ P
         at = np.arange(samples.start, samples.stop) / self.every - first
         return evenly_interpolated(at, torque)
 
@@ -211,13 +199,7 @@ class Rows(NamedTuple):
 
         They have no load friction: `with_load` adds it.
         """
-        sliding = OnDisk(self.speed.size)
-        last: Floats | None = None
-        for rows in blocks_of(len(self.q)):
-            before = slice(max(rows.start - 1, 0), rows.stop)
-            s = sliding_direction(self.q[before], self.dq[before], distances, last)
-            sliding.append(s[rows.start - before.start :])
-            last = s[-1]
+        sliding = on_disk(self._sliding(distances), self.speed.size)
         slid = self._replace(sliding=sliding)
         columns = {
             **self.columns,
@@ -226,6 +208,15 @@ class Rows(NamedTuple):
             'load': np.zeros((self.starts.size, self.speed.size)),
         }
         return slid._replace(columns=columns)
+
+    def _sliding(self, distances: Floats) -> Iterator[Floats]:
+        """Yield blocks of `sliding`."""
+        last: Floats | None = None
+        for rows in blocks_of(len(self.q)):
+            before = slice(max(rows.start - 1, 0), rows.stop)
+            s = sliding_direction(self.q[before], self.dq[before], distances, last)
+            yield s[rows.start - before.start :]
+            last = s[-1]
 
     def stribeck(self, speed: float, exponent: float) -> Floats:
         """Return the column (R, n) of the Stribeck friction, s exp(-|v / speed|^exponent).
@@ -301,14 +292,14 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         BlfDscError: there are too few.
     """
     rows = _empty_rows(recording, model)
-    _add_gravity(rows, model)
     return _filled(rows, model, np.zeros(len(recording.joints)))
 
 
 def _filled(rows: Rows, model: SerialChain, distances: Floats) -> Rows:
     """Return rows that have no columns yet with all but load friction."""
     dq = rows.dq
-    _add_inertial(rows, model)
+    inertial = on_disk(_inertial(rows, model), rows.speed.size, model.p)
+    rows = rows._replace(inertial=inertial)
     rows = rows.with_sliding(distances)
     rows = rows.with_column('viscous', lambda at: dq[at])
     rows = rows.with_column('offset', lambda at: np.ones_like(dq[at]))
@@ -347,7 +338,6 @@ def shortened(
     starts, first = np.unique(at, return_index=True)
     short = rows._replace(
         time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
-        inertial=OnDisk(rows.speed.size * rows.p),
         columns={},
         coupling=np.zeros((starts.size, *rows.coupling.shape[1:])),
         clipped=np.repeat(rows.clipped[windows], parts, axis=0)[first],
@@ -372,9 +362,10 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
             f'{needed * HOP:.3g} s without losses'
         )
     q, dq = _smoothed(recording)
+    every = max(1, round(_GRAVITY / h))
     return Rows(
         time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
-        inertial=OnDisk(n * model.p),
+        inertial=np.empty(0),
         columns={},  # those of `with_sliding` and `with_column`
         coupling=np.zeros((starts.size, min(n, 2), COUPLING)),
         load=np.zeros((model.p, LOAD)),
@@ -390,9 +381,9 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
         slope=slope,
         starts=starts,
         period=h,
-        sliding=OnDisk(n),
-        gravity=OnDisk(n * model.p),
-        every=max(1, round(_GRAVITY / h)),
+        sliding=np.empty(0),
+        gravity=on_disk(_at_rest(q[::every], model), n, model.p),
+        every=every,
     )
 
 
@@ -405,7 +396,7 @@ def _near_gap(recording: Recording) -> NDArray[np.bool_]:
     return np.asarray(found, dtype=bool)
 
 
-def _smoothed(recording: Recording) -> tuple[OnDisk, OnDisk]:
+def _smoothed(recording: Recording) -> tuple[Floats, Floats]:
     """Return smoothed positions and velocities (N, n)."""
     from scipy.signal import savgol_filter
 
@@ -429,19 +420,13 @@ def smoothing_width(h: float) -> int:
     return 2 * max(2, round(0.5 * SMOOTHING / h)) + 1
 
 
-def _fast(dq: OnDisk, chosen: NDArray[np.bool_]) -> Floats:
+def _fast(dq: Floats, chosen: NDArray[np.bool_]) -> Floats:
     """Return the 95th percentile of each joint's speed (n,) in the chosen samples."""
-    found = []
-    for i in range(dq.shape[1]):
-        speed = np.concatenate(
-            [np.abs(dq[rows][chosen[rows], i]) for rows in blocks_of(len(dq))]
-        )
-        found.append(np.percentile(speed, 95.0, overwrite_input=True))
-    return np.array(found)
+    return np.percentile(np.abs(dq[chosen]), 95.0, axis=0, overwrite_input=True)
 
 
-def _add_inertial(rows: Rows, model: SerialChain) -> None:
-    """Compute the columns of P."""
+def _inertial(rows: Rows, model: SerialChain) -> Iterator[Floats]:
+    """Yield blocks of the columns of P."""
     n = rows.speed.size
     regressors = np.zeros((2, n, model.p))
     for block, samples in rows.in_blocks():
@@ -450,16 +435,14 @@ def _add_inertial(rows: Rows, model: SerialChain) -> None:
         q = rows.q[samples]
         dq = rows.dq[samples]
         add_windows(model, q, dq, rows.g, rows.slope, starts, regressors, X)
-        rows.inertial.append(X.reshape(len(X), -1))
+        yield X
 
 
-def _add_gravity(rows: Rows, model: SerialChain) -> None:
-    """Compute the regressors at rest, of one in `every` samples: see `Rows.gravity_torque`."""
-    for block in blocks_of(len(rows.q)):
-        postures = rows.q[block][-block.start % rows.every :: rows.every]
-        zeros = np.zeros_like(postures)
-        H = regressors_at(model, postures, zeros, zeros, zeros)
-        rows.gravity.append(H.reshape(len(H), -1))
+def _at_rest(postures: Floats, model: SerialChain) -> Iterator[Floats]:
+    """Yield blocks of the regressors (., n, p) at rest in postures (., n)."""
+    for block in blocks_of(len(postures)):
+        zeros = np.zeros_like(postures[block])
+        yield regressors_at(model, postures[block], zeros, zeros, zeros)
 
 
 def weighting(h: float, window: float = WINDOW) -> tuple[Floats, Floats]:

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.bad_values import (
-    Column,
     extremes,
     stand_ins,
     unrecorded,
 )
-from blf_dsc_controller.identification.on_disk import blocks_of
-from blf_dsc_controller.identification.turns import TURN
+from blf_dsc_controller.identification.recording import TURN, Recording, resampled
 from blf_dsc_controller.run import Floats, Stamps
 
 _BEYOND = 2.0  # times what a joint reaches, and at least turns: no angle in rad
@@ -39,13 +37,18 @@ _SHORTEST = 1.0  # s, motion whose speeds are looked at
 class Group(NamedTuple):
     """Values (N, n) of one kind as a file has them, and how it names them."""
 
-    values: Column
+    values: Floats
     names: Sequence[str]
     factors: Floats  # (n,) to rad, N m, or m, N
 
+    @property
+    def scaled(self) -> Floats:
+        """The values in rad, N m, or m, N."""
+        return np.asarray(self.values * self.factors)
+
 
 class Motion(NamedTuple):
-    """N states of n joints as a file has them."""
+    """N states of n joints as a file has them; unknown values are NaN."""
 
     path: Path
     joints: Sequence[str]
@@ -55,44 +58,69 @@ class Motion(NamedTuple):
     theta: Group | None  # of the motors
     unit: str  # `q=` and the columns, to which a unit can be added; empty: it was given
     others: str  # what to do to get other torques
+    source: str  # of the torques: a topic, or columns of a table
+    said: Sequence[str] = ()  # of what is odd
+    currents: bool = False  # by the names or units of the torques
+
+    def select(self, rows: NDArray[np.bool_]) -> Motion:
+        """Return the states of some rows (N,)."""
+        theta = self.theta
+        return self._replace(
+            stamp=self.stamp[rows],
+            q=self.q._replace(values=self.q.values[rows]),
+            tau=self.tau._replace(values=self.tau.values[rows]),
+            theta=theta and theta._replace(values=theta.values[rows]),
+        )
 
 
-class Sound(NamedTuple):
-    """Which rows (N,) have all values, and what to say of the others."""
+def recording_of(motion: Motion, tree: Tree) -> Recording:
+    """Return the sound states of a motion as a recording, in rad and N m.
 
-    rows: NDArray[np.bool_]
-    said: list[str]
+    Raises:
+        BlfDscError: positions or torques cannot be what they are said to be, or there are
+            too few.
+    """
+    sound = checked(motion, tree)
+    joints = tuple(sound.joints)
+    return resampled(
+        joints,
+        sound.stamp,
+        sound.q.scaled,
+        sound.tau.scaled,
+        '; '.join([sound.source, *sound.said]),
+        tree.turning(joints),
+        sound.theta and sound.theta.scaled,
+    )._replace(currents=sound.currents)
 
 
-def checked(motion: Motion, tree: Tree) -> Sound:
-    """Return which rows of a motion are sound.
+def checked(motion: Motion, tree: Tree) -> Motion:
+    """Return the sound rows of a motion, with what to say of the others.
 
     Raises:
         BlfDscError: positions or torques cannot be what they are said to be.
     """
-    size = motion.stamp.size
-    missing = np.zeros(size, dtype=bool)
-    said = []
+    missing = np.zeros(motion.stamp.size, dtype=bool)
+    said = list(motion.said)
     for group in (motion.q, motion.tau, motion.theta):
         if group is not None:
             _check_known(motion, group)
-            rows, found = stand_ins(group.values, size, group.names)
+            rows, found = stand_ins(group.values, group.names)
             missing |= rows
             said += [f'{each}, read as missing' for each in found]
+    known = motion.select(~missing)
     if motion.unit:
-        _check_angles(motion, ~missing, tree)
-        _check_speeds(motion, ~missing, tree)
-    _check_torques(motion, motion.tau, ~missing)
-    zeros = unrecorded(motion.tau.values, size)
+        _check_angles(known, tree)
+        _check_speeds(known, tree)
+    _check_torques(known)
+    zeros = unrecorded(motion.tau.values)
     if zeros.any():
         said.append(f'torques are exactly 0 in {zeros.sum()} row(s), read as missing')
-    missing |= zeros
-    return Sound(~missing, said)
+    return motion.select(~(missing | zeros))._replace(said=said)
 
 
 def _check_known(motion: Motion, group: Group) -> None:
     """Raise BlfDscError if a column has no numbers."""
-    known = extremes(group.values, np.ones(motion.stamp.size, dtype=bool))
+    known = extremes(group.values)
     empty = np.flatnonzero(known.least > known.most)
     if empty.size:
         raise BlfDscError(
@@ -100,10 +128,10 @@ def _check_known(motion: Motion, group: Group) -> None:
         )
 
 
-def _check_angles(motion: Motion, rows: NDArray[np.bool_], tree: Tree) -> None:
+def _check_angles(motion: Motion, tree: Tree) -> None:
     """Raise BlfDscError if positions are far beyond what the joints can reach."""
     reach = np.where(tree.turning(motion.joints), tree.reaches(motion.joints), np.inf)
-    found = extremes(motion.q.values, rows).largest * motion.q.factors
+    found = extremes(motion.q.values).largest * motion.q.factors
     beyond = np.flatnonzero(found > _BEYOND * np.maximum(reach, TURN))
     if beyond.size:
         k = int(beyond[0])
@@ -113,9 +141,9 @@ def _check_angles(motion: Motion, rows: NDArray[np.bool_], tree: Tree) -> None:
         )
 
 
-def _check_speeds(motion: Motion, rows: NDArray[np.bool_], tree: Tree) -> None:
+def _check_speeds(motion: Motion, tree: Tree) -> None:
     """Raise BlfDscError if most joints that turn are far faster than they can be."""
-    speed = _speeds(motion, np.flatnonzero(rows))
+    speed = _speeds(motion)
     limit = np.minimum(tree.velocities(motion.joints), _FASTEST)
     moving = np.flatnonzero(tree.turning(motion.joints) & (speed > _STILL))
     ratio = speed[moving] / limit[moving]
@@ -135,9 +163,9 @@ def _units(motion: Motion) -> str:
     )
 
 
-def _speeds(motion: Motion, rows: NDArray[np.intp]) -> Floats:
+def _speeds(motion: Motion) -> Floats:
     """Return the speed (n,) that each joint exceeds in the rest of the time [rad/s, m/s]."""
-    rows = rows[np.argsort(motion.stamp[rows], kind='stable')]
+    rows = np.argsort(motion.stamp, kind='stable')
     time = (motion.stamp[rows] - motion.stamp[rows[:1]]) * 1e-9
     if time.size < 2 or time[-1] < _SHORTEST:
         return np.zeros(len(motion.joints))
@@ -152,35 +180,26 @@ def _speeds(motion: Motion, rows: NDArray[np.intp]) -> Floats:
     return np.asarray(np.quantile(known, _SHARE, axis=0))
 
 
-def _check_torques(motion: Motion, tau: Group, rows: NDArray[np.bool_]) -> None:
+def _check_torques(motion: Motion) -> None:
     """Raise BlfDscError if torques are the same in all rows, or the positions."""
-    if extremes(motion.q.values, rows).are_same.all():
+    q, tau = motion.q.values, motion.tau.values
+    least, most = extremes(q)
+    if (least == most).all():
         return  # so are the torques of an arm that does not move
-    found = extremes(tau.values, rows)
-    same = [int(k) for k in np.flatnonzero(found.are_same)]
+    least, most = extremes(tau)
+    same = np.flatnonzero(least == most).tolist()
     if same:
-        listed = ', '.join(tau.names[k] for k in same)
+        listed = ', '.join(motion.tau.names[k] for k in same)
         moved = ', '.join(motion.joints[k] for k in same)
         raise BlfDscError(
-            f'{motion.path}: {listed}: {found.least[same[0]]:g} in all rows, so the torque of '
+            f'{motion.path}: {listed}: {least[same[0]]:g} in all rows, so the torque of '
             f'{moved} was not recorded there: {motion.others}'
         )
-    copied = np.flatnonzero(_are_positions(motion, tau))
+    unknown = ~(np.isfinite(q) & np.isfinite(tau))
+    copied = np.flatnonzero(((q == tau) | unknown).all(axis=0))
     if copied.size:
         k = int(copied[0])
         raise BlfDscError(
-            f'{motion.path}: {tau.names[k]} is {motion.q.names[k]} in all rows, so it is no '
-            f'torque: {motion.others}'
+            f'{motion.path}: {motion.tau.names[k]} is {motion.q.names[k]} in all rows, so it is '
+            f'no torque: {motion.others}'
         )
-
-
-def _are_positions(motion: Motion, tau: Group) -> NDArray[np.bool_]:
-    """Return which torques (n,) are the positions of their joints in all rows."""
-    found = np.ones(len(motion.joints), dtype=bool)
-    for at in blocks_of(motion.stamp.size):
-        q, torque = motion.q.values[at], tau.values[at]
-        unknown = ~(np.isfinite(q) & np.isfinite(torque))
-        found &= ((q == torque) | unknown).all(axis=0)
-        if not found.any():
-            break
-    return found

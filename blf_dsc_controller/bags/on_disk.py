@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers in temporary files: appended, then mapped into memory and read as arrays."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.run import Floats
+
+BLOCK = 1 << 14
+"""Rows that are computed at once."""
+
+
+class OnDisk:
+    """A temporary file to which bytes or arrays are appended.
+
+    Attributes:
+        size: bytes that it has.
+    """
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
+
+    def __del__(self) -> None:
+        if '_file' in vars(self):  # not if Ctrl-C came while it was opened
+            with suppress(OSError):  # of a full disk, which has been reported
+                self._file.close()
+
+    def append(self, data: bytes | NDArray[Any]) -> None:
+        """Append bytes, or the content of an array."""
+        raw = data if isinstance(data, bytes) else data.tobytes()
+        self._file.write(raw)
+        self.size += len(raw)
+
+    def array(self, dtype: str) -> NDArray[Any]:
+        """Return what was appended as an array (N,), which may outlive the file."""
+        self._file.flush()
+        if not self.size:
+            return np.zeros(0, dtype)
+        return np.memmap(self._file, dtype, 'c').view(np.ndarray)
+
+
+def blocks_of(size: int) -> Iterator[slice]:
+    """Yield slices of so many rows, one after the other."""
+    for first in range(0, size, BLOCK):
+        yield slice(first, min(first + BLOCK, size))
+
+
+def on_disk(blocks: Iterator[Floats], *shape: int) -> Floats:
+    """Return blocks of rows (., *shape) as one array (N, *shape) that is not in memory."""
+    store = OnDisk()
+    for block in blocks:
+        store.append(np.asarray(block, dtype=np.float64))
+    return store.array('<f8').reshape(-1, *shape)
+
+
+def mapped(size: int, function: Callable[[slice], Floats]) -> Floats:
+    """Return the rows (`size`, k) that a function returns for the slices of `blocks_of`."""
+    width = function(slice(0, 1)).shape[1]
+    return on_disk((function(rows) for rows in blocks_of(size)), width)
