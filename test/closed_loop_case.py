@@ -13,7 +13,6 @@ from plain_law import R, dynamics
 from symbols import replaced
 
 from blf_dsc_controller import ControllerConfig
-from blf_dsc_controller.arms.two_link import TwoLink
 from blf_dsc_controller.configuration.law_file import load_law
 from blf_dsc_controller.configuration.law_traits import gains_of
 from blf_dsc_controller.configuration.schema import build
@@ -23,17 +22,9 @@ from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import (
     Settings,
-    Signals,
-    State,
-    signals_of,
-    signals_size,
-    state_of,
-    state_size,
 )
 from blf_dsc_controller.reference import terms as reference
-from sim_plant.sampled_plant import Plant
 
-MODEL = TwoLink(R)
 REFERENCE = reference.pack(
     2, [reference.sinusoids_term((1.9935, 1.3961), (0.3, 0.3), (1.0,), (0.0,))]
 )
@@ -104,7 +95,7 @@ def weighted(error: np.ndarray, gain: np.ndarray) -> float:
     return float(0.5 * np.sum(error[gain > 0.0] ** 2 / gain[gain > 0.0]))
 
 
-def plant(**changes: Any) -> Plant:
+def plant(**changes: Any) -> Any:
     """Return Section IV's arm at its start, with disturbance 0.1 + 0.1 sin t on each joint."""
     return plants.plant(**{'constant': (0.1, 0.1), 'amplitude': (0.1, 0.1)} | changes)
 
@@ -117,7 +108,7 @@ class Sample(NamedTuple):
     measurement: np.ndarray  # (6,) view
 
 
-def closed_loop(law: Controller, arm: Plant, duration: float) -> Iterator[Sample]:
+def closed_loop(law: Controller, arm: Any, duration: float) -> Iterator[Sample]:
     """Run the loop for `duration` [s], yielding each sample so that the test can inspect it."""
     dt = arm.period_ns * 1e-9
     for k in range(round(duration / dt)):
@@ -126,14 +117,3 @@ def closed_loop(law: Controller, arm: Plant, duration: float) -> Iterator[Sample
         law.update(t, dt, measurement)
         yield Sample(k, t, measurement)
         arm.step(law.signals.torque)
-
-
-def arbitrary(seed: int, **changes: Any) -> tuple[Settings, State, Signals]:
-    """Return settings with a window of eight rows, and standard normal state and signals."""
-    settings = recommended(
-        **{'window': 8, 'interval': 1, 'learning_start': 0.0} | changes
-    )
-    random = np.random.default_rng(seed)
-    state = state_of(random.normal(size=state_size(settings)), settings)
-    signals = signals_of(random.normal(size=signals_size(settings)), settings)
-    return settings, state, signals

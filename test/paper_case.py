@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller import change, load_loop, simulate
 from blf_dsc_controller.analysis.lyapunov import energies
-from blf_dsc_controller.configuration.nodes import LoopConfig
-from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.samples import sample_columns
 
 P = np.array([1.0, 0.32, 0.4])
@@ -26,7 +24,7 @@ def configured(
     duration: float,
     law: Mapping[str, object] | None = None,
     arm: Mapping[str, object] | None = None,
-) -> LoopConfig:
+) -> Any:
     """Return a preset with changes to the controller (`law`) and to the plant (`arm`)."""
     config = load_loop(preset, {'sim_plant': {'duration': duration}})
     return config._replace(
@@ -48,7 +46,7 @@ class Loop(NamedTuple):
     latched: np.ndarray  # (.,)
     changes: np.ndarray  # (.,) of the arm, detected so far
     P: np.ndarray  # (., 3) of the plant at that time
-    controller: Controller
+    controller: Any
 
     @property
     def parameter_error(self) -> np.ndarray:
@@ -65,7 +63,7 @@ class Loop(NamedTuple):
         return np.abs(self.xi1[self.t >= begin]).max(axis=0)
 
 
-def run(config: LoopConfig) -> Loop:
+def run(config: Any) -> Loop:
     """Run a configuration offline."""
     record = simulate(config.controller, config.plant, supervised=False)
     samples = sample_columns(record.samples, record.controller.settings)

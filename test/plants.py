@@ -73,13 +73,6 @@ def configuration(*, start=START, velocity=QUIET, **changes):
     return build(PlantConfig, given)
 
 
-def true_parameters(config, t=0.0):
-    """Return P (p,) of the simulated arm, with its payload at a time [s]."""
-    arm = plant_of(config)
-    arm.state[0] = round(t / config.sample_time)
-    return arm.truth()[: arm.arm.p]
-
-
 def commands(samples, seed=5):
     """Return torques (samples, 2) around those of gravity, so that the arm stays in place."""
     return np.random.default_rng(seed).normal([-6.0, -2.0], 3.0, (samples, 2))

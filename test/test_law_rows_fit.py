@@ -6,8 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from law_part import part
-from scipy.optimize import brentq
-from scipy.stats import multivariate_normal, multivariate_t
 
 from blf_dsc_controller.law import innovation, weighing
 from blf_dsc_controller.numerics.algebra import cholesky_factor
@@ -17,7 +15,6 @@ LOAD = weighing.LOAD
 SINCE = LOAD + N
 K = M + 2 * N  # theta, breakaway torques, shares of the torque that are lost
 PERIOD = 0.01  # s, of the rows
-MOST = 500.0  # rows of a window
 UNSURE = np.repeat(
     (0.3, 0.1), N
 )  # deviations of breakaway torques [N m], and of shares
@@ -85,14 +82,6 @@ def test_load_is_that_of_joint_least_squares_with_all_priors():
     np.testing.assert_allclose(state.load, [mass, *centre, *deviation], rtol=1e-5)
 
 
-def begun(rows=0.0, unmodelled=1.0):
-    """Statistics after some rows: s^2 is a tenth of what is unmodelled."""
-    state = innovation.State(*np.zeros((5, 1)))
-    innovation.begin(state, unmodelled)
-    state.rows[0] = rows
-    return state
-
-
 def test_square_of_an_innovation_is_that_of_its_covariance():
     """It is s^2 on average, whatever is known of theta."""
     noise = 0.5
@@ -111,41 +100,3 @@ def test_square_of_an_innovation_is_that_of_its_covariance():
         assert square == pytest.approx(expected, rel=1e-9)
         squares.append(square / noise)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.1)
-
-
-def as_improbable(rows, n=6):
-    """The F of n innovations, t by so many independent rows, as improbable as normal 8."""
-
-    def fall(distribution, square):
-        x = np.full(n, np.sqrt(square))
-        return distribution.logpdf(np.zeros(n)) - distribution.logpdf(x)
-
-    known = fall(multivariate_normal(np.zeros(n)), 8.0)
-    doubted = multivariate_t(np.zeros(n), df=n * rows)
-    return brentq(lambda F: fall(doubted, F) - known, 1.0, 100.0)
-
-
-@pytest.mark.parametrize('rows', [0.0, 50.0, 200.0, MOST])
-def test_change_by_a_noise_of_few_rows_is_as_improbable_as_by_that_of_a_window(rows):
-    """By scipy; a hundred assumed rows count, fewer as the window fills."""
-    counted = rows + 100.0 * (1.0 - rows / MOST)
-    few, window = (
-        as_improbable(each * PERIOD / innovation.CORRELATION)
-        for each in (counted, MOST)
-    )
-    found = innovation.alarm(begun(rows), PERIOD, MOST)
-    assert found == pytest.approx(8.0 * 0.1 * few / window)
-
-
-@pytest.mark.parametrize('share', [1.0, 0.25, 0.01])
-def test_noise_is_that_of_moving_rows_whatever_their_weight(share):
-    """Rows of a weight w have w^2 of the square; those at rest, of none, say nothing."""
-    state = begun()
-    for _ in range(round(600 / share)):
-        assert not innovation.update(state, 0.3 * share, share, 1.0, PERIOD, MOST)
-    assert state.noise[0] == pytest.approx(0.3, rel=0.01)
-    assert state.recent[0] == pytest.approx(0.3, rel=0.01)
-    before = [float(value[0]) for value in state]
-    for _ in range(1000):
-        assert not innovation.update(state, 0.0, 0.0, 1.0, PERIOD, MOST)
-    assert [float(value[0]) for value in state] == before

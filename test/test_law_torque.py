@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from math import exp, sin
+from math import exp
 
 import numpy as np
 import pytest
@@ -17,49 +17,14 @@ from closed_loop_case import (
     quick,
     recommended,
 )
-from law_part import part
 from paper_case import P
 from plain_law import PlainLaw, R, regressor
 from plants import QUIET
 from scipy.signal import cont2discrete
 
 from blf_dsc_controller.configuration.law_file import load_law
-from blf_dsc_controller.law import barrier, surface, torque
-from blf_dsc_controller.law.torque import LEVEL_CUT, RATE_CUT, find_applied, saturate
 
 BOUND = 0.002
-WEIGHT = 1000.0
-LIMIT = 2e4
-KNEE = barrier.knee(BOUND, WEIGHT, LIMIT)
-RECOMMENDED = (BOUND, WEIGHT, LIMIT, KNEE)
-
-
-def each(function, errors, *arguments):
-    """Values of a function of one error at many."""
-    return np.array([function(xi, *arguments) for xi in errors])
-
-
-def test_barrier_continues_past_the_knee_at_the_largest_slope():
-    for weight in (1.0, 1000.0, 2e4):
-        knee = barrier.knee(BOUND, weight, LIMIT)
-        assert 0.0 <= knee < BOUND
-        # rad: below the knee the slope changes by less than 1 N m/rad over it
-        h = 1e-11
-        below, above = each(
-            barrier.gradient, (knee - h, knee + h), BOUND, weight, LIMIT, knee
-        )
-        assert (above - below) / (2.0 * h) == pytest.approx(LIMIT, rel=1e-4)
-    # The potential is its integral: with h = 1e-8 rad the third derivative (below 1e11 N m/rad^3)
-    # adds 1e-6 N m to ~10.
-    h = 1e-8
-    errors = np.append(np.linspace(-3.0, 3.0, 51) * BOUND, [-KNEE, KNEE])
-    below, above = (
-        each(barrier.potential, errors + side, *RECOMMENDED) for side in (-h, h)
-    )
-    gradient = each(barrier.gradient, errors, *RECOMMENDED)
-    np.testing.assert_allclose(
-        (above - below) / (2.0 * h), gradient, rtol=1e-6, atol=1e-6
-    )
 
 
 K0 = 0.02
@@ -95,34 +60,6 @@ def test_lyapunov_function_decreases_while_the_bound_narrows():
     assert V[-1] < 1e-3 * V[0]
     assert ratios[0] == pytest.approx(0.75, rel=1e-3)  # 15 of 20 mrad
     assert max(ratios) < 0.8
-
-
-def test_virtual_control_has_no_singularity():
-    """Elsewhere inside the bound it is that of the plain law."""
-
-    def ours(xi1, dqr=0.0):
-        return surface.virtual_control(xi1, BOUND, 150.0, 20.0, dqr)
-
-    assert ours(0.0, -0.3) == -0.3
-    for xi1 in (1e-12, -1e-9, 1e-7):  # linear: the next term is 1e-17 at 1e-7 rad
-        assert ours(xi1) == pytest.approx(-95.0 * xi1, rel=1e-14)
-    for xi1 in (BOUND, -1.1 * BOUND, 10.0 * BOUND):  # only mu is left
-        assert ours(xi1) == -20.0 * xi1
-    for x in (1e-6, -5e-5, np.nextafter(1e-4, 0.0), 1e-4, 0.1, -2.0):
-        assert surface.sinc(x) == pytest.approx(sin(x) / x, abs=3e-16)
-
-
-@pytest.mark.parametrize('share', [-0.99, -0.6, 0.0, 0.01, 0.3, 0.9, 1.001, 4.0])
-def test_slope_of_the_virtual_control_is_its_derivative(share):
-    """By central differences; at the bound itself the slope jumps."""
-    error, h = share * BOUND, 1e-8  # rad
-
-    def beta2(xi1):
-        return surface.virtual_control(xi1, BOUND, 150.0, 20.0, 0.3)
-
-    difference = (beta2(error + h) - beta2(error - h)) / (2.0 * h)
-    slope = surface.virtual_slope(error, BOUND, 150.0, 20.0)
-    assert slope == pytest.approx(-difference, abs=1e-4)
 
 
 def drawn(seed):
@@ -230,152 +167,6 @@ def test_law_matches_the_plain_one_in_closed_loop():
         assert plain.latched is not None
         met |= {('window full', law.state.window.rows[0] == settings.window.length)}
     assert len(met) == 4 + 3 * 2
-
-
-DT = 2e-3  # s: with 500 N m/s, 1 N m from sample to sample
-
-
-def limits(level, rate):
-    """Limits of one joint, whose drive is described by no model."""
-    nothing = np.zeros(0)
-    return torque.Settings(
-        limit=np.full(1, level),
-        rate_limit=np.full(1, rate),
-        effort_is_whole=1,
-        drive=0,
-        drive_size=0,
-        drive_chain=nothing,
-        drive_inertias=nothing,
-    )
-
-
-def torque_state(held):
-    """State of the saturation of one joint, which holds a torque back."""
-    state = part(torque.State, n=1)
-    state.held_back[:] = held
-    return state
-
-
-def torque_work(n, added):
-    """Values of one sample, in which the drives add a torque."""
-    work = part(torque.Work, n=n, torque=limits(1.0, 0.0))
-    work.added[:] = added
-    return work
-
-
-def cut(
-    demand,
-    last,
-    *,
-    level=10.0,
-    rate=500.0,
-    has_last=True,
-    added=0.0,
-    held=0.0,
-):
-    """Torque and what cut it; the cuts are counted, and any is reported."""
-    state = torque_state(held)
-    one, command = np.ones(1), np.zeros(1)
-    work = torque_work(1, added)
-    saturated = saturate(
-        limits(level, rate),
-        state,
-        work,
-        demand * one,
-        last * one,
-        has_last,
-        DT,
-        command,
-    )
-    cuts = work.cuts
-    assert saturated == (cuts[0] > 0.0)
-    assert cuts == LEVEL_CUT * state.level_cuts + RATE_CUT * state.rate_cuts
-    return command[0], cuts[0]
-
-
-@pytest.mark.parametrize(
-    ('demand', 'last', 'command', 'cuts', 'given'),
-    [
-        (4.0, 3.0, 4.0, 0.0, {}),
-        (5.0, 3.0, 4.0, RATE_CUT, {}),
-        (12.0, 9.5, 10.0, LEVEL_CUT, {}),
-        (12.0, 5.0, 6.0, LEVEL_CUT + RATE_CUT, {}),
-        # the level was lowered below the last torque
-        (13.0, 14.0, 10.0, LEVEL_CUT + RATE_CUT, {}),
-        (9.0, -9.0, 9.0, 0.0, {'rate': 0.0}),  # no limit
-        (9.0, 0.0, 9.0, 0.0, {'has_last': False}),  # the first torque
-        # With 4 N m of the drive: limits hold for the command and for the whole torque.
-        (12.0, 6.0, 6.0, LEVEL_CUT, {'added': 4.0, 'rate': 1000.0}),
-        (-7.0, -10.0, -10.0, LEVEL_CUT, {'added': 4.0, 'rate': 1000.0}),
-        (9.0, 5.0, 5.0, 0.0, {'added': 4.0, 'rate': 1000.0}),
-        (7.5, 5.0, 4.0, RATE_CUT, {'added': 4.0}),  # the rate is that of the command
-        # Of 5 N m that were held back, half of 1 N m is released, as the demand moves ...
-        (8.0, 3.0, 3.5, RATE_CUT, {'held': 5.0}),  # ... not at all,
-        (8.25, 3.0, 3.75, RATE_CUT, {'held': 5.0}),  # ... away,
-        (7.25, 3.0, 2.75, RATE_CUT, {'held': 5.0}),  # ... or back
-        (3.75, 3.0, 3.75, 0.0, {'held': 0.25}),  # the last of it
-    ],
-)
-def test_torque_saturates_at_its_level_and_at_its_rate(
-    demand, last, command, cuts, given
-):
-    for sign in (1.0, -1.0):
-        signed = given | {
-            name: sign * given.get(name, 0.0) for name in ('added', 'held')
-        }
-        assert cut(sign * demand, sign * last, **signed) == (sign * command, cuts)
-
-
-def follow(demands, rate):
-    """Torques that follow demands (k,) from the first one on."""
-    of, state = limits(1e3, rate), torque_state(0.0)
-    last = np.full(1, demands[0])
-    for demand in demands:
-        command, now = np.zeros(1), np.full(1, demand)
-        work = torque_work(1, 0.0)
-        saturate(of, state, work, now, last, True, DT, command)  # noqa: FBT003
-        last = command
-        yield command[0]
-
-
-@pytest.mark.parametrize('amplitude', [3.0, 30.0, 300.0])
-def test_torque_at_its_rate_limit_turns_round_with_its_demand(amplitude):
-    """At most asin 0.5, 30 degrees late, which are 83 samples of a second's turn of 500.
-
-    At 20 N m/s, a plain limit is up to 90 degrees late: it climbs until it meets the
-    demand on its way down.
-    """
-    turn = round(1.0 / DT)
-    k = np.arange(4 * turn)
-    demands = amplitude * np.sin(2.0 * np.pi * k / turn)
-    torques = np.array([*follow(demands, 20.0)])[-turn:]
-    step = 20.0 * DT
-    assert np.abs(np.diff(torques)).max() <= step * (1.0 + 1e-9)
-    top = turn // 4  # of the demand
-    late = np.argmax(torques) - top
-    is_cut = amplitude > 20.0 / (2.0 * np.pi)
-    assert (-1 if is_cut else 0) <= late <= (turn / 12 if is_cut else 0)
-    assert (np.ptp(torques) < 0.5 * np.ptp(demands)) == (amplitude > 10.0)
-
-
-def test_torque_reaches_a_constant_demand_at_half_its_rate_limit():
-    """A step of 3 N m with 1 N m at once, and 0.5 N m in each sample from then on."""
-    torques = [*follow([0.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0], 500.0)]
-    assert torques == [0.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.0]
-
-
-@pytest.mark.parametrize('rate', [500.0, 0.0])
-def test_torque_that_is_not_a_number_does_not_turn_into_one_that_looks_valid(rate):
-    assert np.isnan(cut(np.nan, 3.0, rate=rate)[0])
-
-
-def test_applied_torque_has_the_mean_of_what_the_drive_adds_at_both_ends():
-    command, before, added, applied = np.random.default_rng(3).normal(size=(4, 2))
-    drives, work = part(torque.State, n=2), torque_work(2, added)
-    drives.added[:] = before
-    find_applied(drives, work, command, applied)
-    np.testing.assert_array_equal(applied, command + 0.5 * (before + added))
-    np.testing.assert_array_equal(drives.added, added)
 
 
 PAPER = sys.modules[load_law('paper').__module__]

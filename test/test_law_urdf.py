@@ -25,9 +25,7 @@ from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.estimate import (
     columns_of,
-    doubting_covariance,
     estimate_names,
-    prior_covariance,
 )
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.studies.monte_carlo import draw, plant_with
@@ -122,54 +120,6 @@ def test_problems_with_an_arm_are_reported(changes, message):
         build(ControllerConfig, ARM | changes)
 
 
-def test_prior_covers_the_deviations_of_links_drives_and_friction():
-    config = panda()
-    deviation = deviations(config)
-    covariance = prior_covariance(config)
-    assert np.linalg.eigvalsh(covariance)[0] > 0.0
-    assert deviation['rotor7'] >= 0.5 * 12.0 / 400.0
-    assert deviation['coulomb panda_joint1'] == pytest.approx(0.05 * 87.0)
-    known = deviations(panda(robot__coulomb=[0.7] * 7))
-    assert known['coulomb panda_joint1'] == pytest.approx(0.35)
-    information = settings_of_config(config).information
-    np.testing.assert_allclose(information @ covariance, np.eye(62), atol=1e-5)
-
-
-def test_rows_are_compared_with_a_prior_that_doubts_drives_which_nobody_told():
-    """As much as those published for an FR3 are off; learning, whose rate follows, does not."""
-    guessed, told = panda(), panda(robot__rotor_inertia=[0.3] * 7)
-    doubted, learned = (
-        deviations(guessed, each) for each in (doubting_covariance, prior_covariance)
-    )
-    guess = guessed.robot.rotors(guessed.robot.chain(guessed.joints))
-    alone = {f'rotor{i}': each for i, each in enumerate(guess, 1) if i > 2}
-    assert len(alone) == 5  # those of the first two joints are in other base parameters
-    for name, each in alone.items():
-        assert doubted[name] ** 2 - learned[name] ** 2 == pytest.approx(
-            (4.0**2 - 0.5**2) * each**2
-        )
-    np.testing.assert_array_equal(doubting_covariance(told), prior_covariance(told))
-    fr3 = load_loop('fr3')
-    robot = fr3.controller.robot
-    factors = fr3.plant.truth.rotor_inertia / robot.rotors(
-        robot.chain(fr3.controller.joints)
-    )
-    assert np.sqrt(np.mean((factors - 1.0) ** 2)) == pytest.approx(4.0, abs=0.05)
-    settings = settings_of_config(guessed)
-    for information, covariance in (
-        (settings.information, prior_covariance(guessed)),
-        (settings.row_information, doubting_covariance(guessed)),
-    ):
-        np.testing.assert_allclose(information @ covariance, np.eye(62), atol=1e-4)
-
-
-def deviations(config, of=prior_covariance):
-    """Standard deviation of a prior of each estimate."""
-    names = estimate_names(config)
-    covariance = of(config)
-    return dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
-
-
 def test_gravity_is_compensated_with_the_initial_estimate():
     """At rest on the reference the torque is G of the URDF, whatever the gains."""
     config = panda(robot__gravity=[0.0, -9.81, 0.0])
@@ -207,16 +157,6 @@ def test_bound_holds_from_the_start_with_an_undeclared_rated_load():
     assert np.all(np.abs(result.error) < 0.6 * result.bound)
     assert np.all(result.bound[-1] < 0.0051)
     assert not result.stops
-
-
-def test_drives_with_unknown_effort_limit_get_a_finite_prior():
-    text = PANDA_TEXT.replace('effort="12"', 'effort="0"')
-    config = panda(robot__urdf=text)
-    assert np.all(np.isfinite(settings_of_config(config).information))
-    # from the weight carried
-    rotor = config.robot.rotors(config.robot.chain(config.joints))[6]
-    assert deviations(config)['rotor7'] == pytest.approx(0.5 * rotor)
-    assert 0.005 < rotor < 0.03
 
 
 NOISY = {'sensor.velocity': 'measured', 'sensor.velocity_noise': 0.005}

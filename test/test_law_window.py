@@ -1,30 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sliding window, its excitation, latch and rejected columns; the ball of the estimates."""
+"""The sliding window, its excitation, and rejected columns."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from closed_loop_case import (
-    arbitrary,
     closed_loop,
     controller,
     plant,
     quick,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 from paper_case import configured, run
-from scipy.linalg import eigh
-from symbols import replaced
 
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law import (
-    adaptation,
     window,
 )
-from blf_dsc_controller.law.innovation import Prior
-from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 
 class Window:
@@ -45,12 +37,6 @@ class Window:
         """Sum over the rows in the window, in the order they came."""
         return sum(map(terms, self.history))
 
-    def newer_part(self):
-        """Sum over the newer part of the rows, and their number."""
-        newer = np.zeros_like(self.running)
-        rows = window.newer_part(self, newer)
-        return newer, rows
-
 
 def terms(row):
     """[X | u]^T [X | u] (m + 1, m + 1), of which the window keeps the upper triangle."""
@@ -63,32 +49,6 @@ def means(rows):
     return np.einsum('kia,kib->ab', X, X) / len(rows), np.einsum(
         'kia,ki->a', X, u
     ) / len(rows)
-
-
-@pytest.mark.parametrize('length', [2, 3, 12, 13])
-def test_window_is_split_into_exact_parts_and_goes_on_with_the_newer_one(length):
-    """At each position of the ring, full or not; what was removed never returns."""
-    for begin in range(length):
-        random = np.random.default_rng(begin)
-        sliding = Window(2, 3, length)
-        for _ in range(length + begin):
-            sliding.push(random.normal(size=(2, 4)))
-            np.testing.assert_allclose(sliding.running, sliding.direct(), atol=1e-12)
-        newer, rows = sliding.newer_part()
-        assert length // 4 <= rows <= length - length // 4
-        assert 0 < rows < length
-        sliding.history = sliding.history[-rows:]
-        sliding.rows[0] = rows
-        np.testing.assert_allclose(newer, sliding.direct(), atol=1e-12)
-
-        sliding.running[:] = newer
-        for _ in range(3 * length):
-            sliding.push(random.normal(size=(2, 4)))
-            np.testing.assert_allclose(sliding.running, sliding.direct(), atol=1e-12)
-        newer, rows = sliding.newer_part()
-        np.testing.assert_allclose(
-            newer, sum(map(terms, sliding.history[-rows:])), atol=1e-12
-        )
 
 
 def test_sum_does_not_drift():
@@ -104,37 +64,6 @@ def test_sum_does_not_drift():
             np.testing.assert_array_equal(sliding.running, sliding.direct())
             np.testing.assert_array_equal(sliding.fresh, 0.0)
     assert np.abs(sliding.naive - sliding.direct()).max() > 1.0
-
-
-@pytest.mark.parametrize(('m', 'rank'), [(1, 1), (13, 30), (5, 5), (5, 2), (6, 0)])
-@pytest.mark.parametrize('shift', [1e-5, 1.0])
-def test_factor_matches_numpy_and_solves(m, rank, shift):
-    """Singular matrices included: the factor is of Phi + rho I."""
-    random = np.random.default_rng(m)
-    rows = random.normal(size=(rank, m))
-    x = random.normal(size=m)
-    shifted = rows.T @ rows + shift * np.eye(m)
-    U, y = np.triu(shifted), x.copy()
-
-    assert cholesky_factor(U)
-    cholesky_solve(U, y)
-
-    np.fill_diagonal(U, 1.0 / np.diag(U))  # kept inverted
-    # Backward stable: the residual, and not the solution, is at the level of rounding.
-    rounding = 1e-14 * np.linalg.norm(shifted)
-    np.testing.assert_allclose(np.triu(U).T @ np.triu(U), shifted, atol=rounding)
-    np.testing.assert_allclose(shifted @ y, x, atol=rounding * np.linalg.norm(y))
-
-
-def sliding_of(case):
-    """The sliding window of settings, state and signals."""
-    settings, state, signals = case
-    return window.Window(settings.window, state.window, signals.scratch.window)
-
-
-def prior_of(settings):
-    """What is known of theta before any row."""
-    return Prior(settings.initial_estimate, settings.information)
 
 
 def test_warm_started_iteration_tracks_the_minimum_eigenvalue_in_a_loop():
@@ -206,56 +135,3 @@ def test_columns_are_not_checked_before_the_parameters_alone_are_excited():
         'recommended', 8.0, {'two_link.frequencies': [1.0], **still}, {}
     )
     assert all(active.values())
-
-
-@given(
-    st.integers(0, 2**32 - 1),
-    st.integers(1, 9),
-    st.sampled_from([1e-3, 1.0, 1e6]),
-    st.floats(0.1, 100.0),
-)
-def test_no_step_leaves_the_ball(seed, size, speed, radius):
-    random = np.random.default_rng(seed)
-    gain = 10.0 ** random.uniform(-3.0, 3.0, size)
-    estimate = random.normal(size=size) * radius
-    adaptation.retract(estimate, gain, radius)
-    for _ in range(20):
-        rate = random.normal(size=size) * speed
-        adaptation.project(estimate, rate, gain, radius)
-        estimate += 1e-2 * rate
-        adaptation.retract(estimate, gain, radius)
-        assert np.linalg.norm(estimate) <= radius * (1.0 + 1e-15)
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_excitation_is_relative_to_the_information_to_which_the_prior_pulls(seed):
-    """lambda_min of Phi x = lambda R x; Phi + a R and b + a R theta_0 with a prior of weight a."""
-    random = np.random.default_rng(seed)
-    scale = np.array([1e-3, 5.0, 30.0, 1.0, 1e-2])
-    A = random.normal(size=(5, 5))
-    R = (A @ A.T + np.eye(5)) / np.outer(scale, scale)
-    settings, state, signals = arbitrary(
-        seed, information=R, rho=1e-5, prior_weight=0.0
-    )
-    rows = random.normal(size=(16, 6)) / np.append(scale, 1.0)
-    state.window.running[:] = rows.T @ rows
-    state.window.rows[0] = 8.0
-    state.latch.active[:] = 1.0
-    Phi = state.window.running[:5, :5] / 8.0
-    b = state.window.running[:5, 5] / 8.0
-    case = settings, state, signals
-    active = state.latch.active
-    found = window.find_excitation(sliding_of(case), prior_of(settings), active, 200)
-    values, vectors = eigh(Phi, R)
-    assert found == pytest.approx(values[0], rel=1e-8)
-    direction = (
-        state.window.min_eigenvector / state.window.min_eigenvector[0] * vectors[0, 0]
-    )
-    np.testing.assert_allclose(direction, vectors[:, 0], rtol=1e-5)
-
-    pulled = replaced(settings, prior_weight=0.5), state, signals
-    window.find_excitation(sliding_of(pulled), prior_of(settings), active, 1)
-    np.testing.assert_allclose(signals.scratch.window.Phi, Phi + 0.5 * R, rtol=1e-12)
-    np.testing.assert_allclose(
-        signals.scratch.window.b, b + 0.5 * R @ settings.initial_estimate, rtol=1e-12
-    )
