@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import os
-import pickle
-import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, NamedTuple
 
 import numpy as np
 import pytest
 from command import closed_loop, finished
 from numba import config as numba_config
-from numba import typeof
 
 import blf_dsc_controller as blf
 from benchmark.studies import path_of
@@ -24,7 +21,6 @@ from blf_dsc_controller import (
     BlfDscError,
     ConfigurationError,
     ControllerConfig,
-    PlantConfig,
     StartError,
     change,
     controller_of,
@@ -33,49 +29,12 @@ from blf_dsc_controller import (
     run_chunk,
 )
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.cli.run import STOPPED
-from blf_dsc_controller.compiled.jit import SLOW, kernel
-from blf_dsc_controller.compiled.layout import Array, pack, view_of
-from blf_dsc_controller.configuration.law_file import digest, load_law
-from blf_dsc_controller.configuration.law_traits import LAWS, traits_of
+from blf_dsc_controller.compiled.jit import SLOW
 from blf_dsc_controller.configuration.nodes import locate
 from blf_dsc_controller.configuration.schema import build, flatten
-from blf_dsc_controller.factory.laws import law_of
-from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law.called_law import called
-from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
-from blf_dsc_controller.law.state import (
-    settings_of,
-    signals_of,
-    signals_size,
-    state_of,
-    state_size,
-)
-from blf_dsc_controller.law.step import update
-from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
-from blf_dsc_controller.studies.monte_carlo import UNSEEN, torque_rows
-from blf_dsc_controller.supervision.retuning import apply_bumpless
 
 LAW = COMPUTED_TORQUE
-GAINS = ('gains.position', 'gains.velocity', 'gains.integral')
-
-
-def loop_with(preset, duration, **gains):
-    given = {f'gains.{name}': value for name, value in gains.items()}
-    overrides = {
-        'blf_dsc_controller': {'law': LAW, **given},
-        'sim_plant': {'duration': duration},
-    }
-    return blf.load_loop(preset, overrides)
-
-
-def test_gains_are_parameters_with_their_declaration_and_defaults():
-    config = build(ControllerConfig, {'law': LAW, 'gains.velocity': 80.0})
-    assert [flatten(config)[name] for name in GAINS] == [900.0, 80.0, 4500.0]
-    assert law_of(config)[:] == (900.0, 80.0, 4500.0)
-    assert law_of(change(config, {'gains.position': 1.0})).position == 1.0
-    assert pickle.loads(pickle.dumps(config)) == config  # noqa: S301 - our own
 
 
 METHODS = """\
@@ -94,24 +53,21 @@ IMPORTS = (
 )
 
 
-def views(law=None):
-    """Return settings, state and signals of the default arm, for kernels."""
-    config = build(ControllerConfig, {'law': law} if law else {})
-    made = settings_of_config(config)
-    settings = settings_of(pack(made), made.model)
-    state = state_of(np.zeros(state_size(settings)), settings)
-    return settings, state, signals_of(np.zeros(signals_size(settings)), settings)
-
-
-def law_of_text(path, text):
-    """Return the type of the law in a file with the text."""
+def law_file(path, text):
+    """Write the file of a law with the text, and return its path."""
     path.write_text(IMPORTS + text + '    has_barrier = False\n', encoding='utf-8')
-    return load_law(str(path))
+    return str(path)
 
 
-def used(law, x):
-    """Run a method of a law, as a loop does."""
-    law.compute_demand(x, x, x, 0.0, 1e-3)
+def made(law, **gains):
+    """Return the controller of the default arm with the law of a file."""
+    given = {f'gains.{name}': value for name, value in gains.items()}
+    return controller_of(build(ControllerConfig, {'law': law} | given))
+
+
+def demanded(law, **gains):
+    """Return the first torque (2,) [N m] of the law of a file."""
+    return made(law, **gains).update(0.0, 1e-3, np.zeros(6)).tolist()
 
 
 compiling = pytest.mark.skipif(numba_config.DISABLE_JIT, reason='nothing is compiled')
@@ -156,9 +112,9 @@ def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tm
     helper += 'from blf_dsc_controller.compiled.layout import view_of\n'
     helper += 'memory_of = view_of(MEMORY)\n'
     mistaken = METHODS.replace('pass', f'signals.demand[0] += {line}', 1)
-    law = law_of_text(path, helper + mistaken)(1.0)
+    law = law_file(path, helper + mistaken)
     with pytest.raises(BlfDscError) as raised:
-        for_kernels(law, *views())
+        made(law)
     (told,) = str(raised.value).splitlines()
     number = (
         path.read_text(encoding='utf-8')
@@ -173,58 +129,22 @@ def test_mistake_that_cannot_be_compiled_is_told_with_its_line(line, problem, tm
 @pytest.mark.parametrize('line', ['self.k += t', 'signals.demand = signals.q'])
 def test_what_cannot_be_set_is_told_with_its_line(line, tmp_path):
     path = tmp_path / 'law.py'
-    law = law_of_text(path, METHODS.replace('pass', line, 1))(1.0)
+    law = law_file(path, METHODS.replace('pass', line, 1))
     with pytest.raises(BlfDscError, match=r'law\.py, line 7: \w+ cannot be set'):
-        for_kernels(law, *views())
-
-
-@compiling
-def test_mistake_in_a_law_that_is_compiled_into_the_loop_is_told_with_its_line(
-    tmp_path,
-):
-    """As all are where kernels have no addresses, and one with a gain that is no number."""
-    path = tmp_path / 'law.py'
-    mistaken = METHODS.replace('pass', 'signals[0] += self.kk', 1)
-    mistaken = mistaken.replace('float', 'str').replace("1.0, 'gain'", "'a', 'word'")
-    mistaken = mistaken.replace('positive', 'parameter')
-    law = law_of_text(path, mistaken)('a')
-    assert for_kernels(law, *views()) is law
-    with pytest.raises(BlfDscError) as raised:
-        for_law(used, law)(law, np.zeros(2))
-    assert 'LAW has no gain kk: did you mean self.k?' in str(raised.value)
+        made(law)
 
 
 COUNTING = """\
 class LAW(NamedTuple):
     gain: Annotated[float, parameter(0.5, 'gain')]
-    count: Annotated[int, parameter(2, 'additions')]
+    count: Annotated[int, parameter(2, 'joints')]
     inverted: Annotated[bool, parameter(True, 'sign')]
 
     def compute_demand(self, settings, state, signals, t, dt):
+        for i in range(settings.n):
+            signals.demand[i] = 0.0
         for k in range(self.count):
-            signals.values[self.count - 1 - k] += -self.gain if self.inverted else self.gain
-
-    def finish(self, settings, state, signals, dt, saturated):
-        if not saturated:
-            state.values[0] += dt * settings.count
-
-"""
-
-
-CHANGING = """\
-from blf_dsc_controller.compiled.jit import inner
-
-
-@inner
-def change(values, at):
-    values[at] += 1.0
-
-
-class LAW(NamedTuple):
-    at: Annotated[int, parameter(2, 'entry')]
-
-    def compute_demand(self, settings, state, signals, t, dt):
-        change(signals.values, self.at)
+            signals.demand[self.count - 1 - k] = -self.gain if self.inverted else self.gain
 
     def finish(self, settings, state, signals, dt, saturated):
         pass
@@ -232,123 +152,39 @@ class LAW(NamedTuple):
 """
 
 
-class Few(NamedTuple):
-    count: int
-    values: Annotated[Array, 'count']
-
-
-few_of = view_of(Few)
-
-
-@kernel
-def run_law(law, vectors, saturated):
-    settings, state, signals = (
-        few_of(vectors[0]),
-        few_of(vectors[1]),
-        few_of(vectors[2]),
-    )
-    law.compute_demand(settings, state, signals, 0.0, 1e-3)
-    law.finish(settings, state, signals, 1e-3, saturated)
-
-
-@checking
-def test_index_past_the_end_in_a_function_of_a_law_is_an_error(tmp_path):
-    law = law_of_text(tmp_path / 'law.py', CHANGING)
-    vectors = np.zeros((3, 4))
-    vectors[:, 0] = 3  # the last of four entries is values[2]
-    given = called(law(3), *[few_of(each) for each in vectors])
-    with pytest.raises(IndexError):
-        run_law(given, vectors, saturated=False)
-    run_law(given.with_gains(law(2)), vectors, saturated=False)
-    assert vectors[2].tolist() == [3.0, 0.0, 0.0, 1.0]
-
-
-@compiling
 def test_law_is_called_with_its_gains_as_they_are_declared(tmp_path):
-    """A count as an integer, a switch as that; its methods are compiled once for all gains."""
-    law = law_of_text(tmp_path / 'law.py', COUNTING)
-    vectors = np.zeros((3, 4))
-    vectors[:, 0] = 3
-    _, state, signals = views = [few_of(each) for each in vectors]
-    given = called(law(0.5, 2, inverted=True), *views)
-    run_law(given, vectors, saturated=False)
-    assert signals.values.tolist() == [-0.5, -0.5, 0.0]
-    run_law(with_gains(given, law(0.25, 1, inverted=False)), vectors, saturated=True)
-    assert signals.values.tolist() == [-0.25, -0.5, 0.0]
-    assert state.values.tolist() == [3e-3, 0.0, 0.0]
-    again = called(law(1.0, 3, inverted=False), *views)
-    assert again.computes.address == given.computes.address
+    """A count as an integer, a switch as that."""
+    law = law_file(tmp_path / 'law.py', COUNTING)
+    assert demanded(law) == [-0.5, -0.5]
+    assert demanded(law, gain=0.25, count=1, inverted=False) == [0.25, 0.0]
 
-
-ADDING = """\
-class LAW(NamedTuple):
-    gain: Annotated[float, parameter(0.5, 'gain')]
-
-    def compute_demand(self, settings, state, signals, t, dt):
-        signals.values[0] = {} * self.gain
-
-    def finish(self, settings, state, signals, dt, saturated):
-        pass
-
-"""
 
 RUN_LAWS = """\
 import sys
+from test_law_of_file import demanded
 
-import numpy as np
-from test_law_of_file import few_of, run_law
-
-from blf_dsc_controller.configuration.law_file import load_law
-from blf_dsc_controller.law.called_law import called
-
-vectors = np.zeros((3, 4))
-vectors[:, 0] = 3
-views = [few_of(each) for each in vectors]
-for given in [called(load_law(path)(0.5), *views) for path in sys.argv[1:]]:
-    run_law(given, vectors, False)
-    print(views[2].values[0])
+print(*[demanded(law)[0] for law in sys.argv[1:]])
 """
 
 
 @compiling
 def test_laws_that_other_processes_compiled_are_not_taken_for_one_another(tmp_path):
     """Numba's symbols of their methods were the same: the first became the second."""
-    paths = [tmp_path / 'one.py', tmp_path / 'two.py']
-    for path, factor in zip(paths, (1.0, 2.0), strict=True):
-        law_of_text(path, ADDING.format(factor))
+    one, two = (
+        law_file(tmp_path / f'{gain}.py', COUNTING.replace('0.5', gain))
+        for gain in ('1.5', '2.5')
+    )
     folder = Path(__file__).parent
-    environment = {
-        **os.environ,
-        'NUMBA_CACHE_DIR': str(tmp_path / 'cache'),
-        'PYTHONPATH': os.pathsep.join(map(str, (folder, folder.parent))),
-    }
+    paths = os.pathsep.join(map(str, (folder, folder.parent)))
+    environment = os.environ | {'PYTHONPATH': paths}
 
     def run(*laws):
-        done = subprocess.run(
-            [sys.executable, '-c', RUN_LAWS, *map(str, laws)],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        done = finished(sys.executable, '-c', RUN_LAWS, *laws, env=environment)
+        assert done.returncode == 0, done.stderr
         return done.stdout.split()
 
-    assert [*run(paths[0]), *run(paths[1])] == ['0.5', '1.0']
-    assert run(*paths, paths[0]) == ['0.5', '1.0', '0.5']
-
-
-@compiling
-def test_kernels_of_the_loop_are_those_of_every_law_of_a_file(tmp_path):
-    """So that none but the two methods of a law are compiled with it."""
-    given = [
-        for_kernels(law(*[1.0] * len(law._fields)), *views(LAW))
-        for law in (law_of_text(tmp_path / 'law.py', METHODS), load_law(LAW))
-    ]
-    mine, computed_torque = given
-    assert typeof(mine) == typeof(computed_torque)
-    assert mine.computes.address != computed_torque.computes.address
-    for each in given:
-        assert for_law(update, each) is update
+    assert [*run(one), *run(two)] == ['-1.5', '-2.5']
+    assert run(one, two, one) == ['-1.5', '-2.5', '-1.5']
 
 
 @pytest.mark.parametrize(
@@ -375,19 +211,13 @@ def test_bound_at_the_tool_needs_a_barrier_and_contacts_a_law_that_learns(
         load_loop('panda_rigid', {'blf_dsc_controller': given})
 
 
-def test_traits_of_the_packaged_laws_are_those_of_the_laws():
-    for law in LAWS:
-        config = build(ControllerConfig, {'law': law})
-        assert traits_of(config).has_barrier == law_of(config).has_barrier
-        assert traits_of(config).learns == (law in ('blf_dsc', 'paper'))
-
-
 @pytest.mark.parametrize(
     ('preset', 'bound'), [('recommended', 0.1), ('panda_rigid', 0.01)]
 )
 def test_law_tracks_and_keeps_its_memory_in_the_state(preset, bound):
     """Its integral removes the constant part of what its model lacks."""
-    loop = loop_with(preset, 3.0)
+    given = {'blf_dsc_controller': {'law': LAW}, 'sim_plant': {'duration': 3.0}}
+    loop = blf.load_loop(preset, given)
     record = blf.simulate(loop.controller, loop.plant)
     errors = np.abs(record.true_errors())
     assert errors[2000:].max() < bound
@@ -398,11 +228,6 @@ def test_law_tracks_and_keeps_its_memory_in_the_state(preset, bound):
     np.testing.assert_allclose(
         integral, 1e-3 * samples.sum(axis=0), rtol=1e-6, atol=1e-6
     )
-    saved = controller.save()
-    controller.reset()
-    assert not controller.state.memory.any()
-    controller.restore(saved)
-    assert controller.state.memory.any()
 
 
 def computed_torque_with(path, statement):
@@ -450,21 +275,8 @@ def test_law_without_a_first_torque_does_not_start(tmp_path):
     file = tmp_path / 'loop.yaml'
     file.write_text(f'blf_dsc_controller:\n  ros__parameters: {json.dumps(given)}\n')
     run = closed_loop('--config', file, '--mode', 'lockstep', '--out', tmp_path / 'out')
-    assert run.returncode == STOPPED, run.stderr
+    assert run.returncode == 5, run.stderr  # it stopped
     assert 'torque not finite: the demanded torque is not finite' in run.stdout
-
-
-def test_gains_change_while_it_runs():
-    loop = loop_with('recommended', 1.0)
-    controller = controller_of(loop.controller)
-    q, dq = np.array(loop.plant.initial.position), np.zeros(2)
-    measurement = np.concatenate((q, dq, dq))
-    before = controller.trial(0.0, 1e-3, measurement)
-    stiffer = change(loop.controller, {'gains.position': 1800.0})
-    apply_bumpless(controller, stiffer, 0.0, measurement)
-    after = controller.trial(0.0, 1e-3, measurement)
-    assert np.abs(after - before).max() > 0.0
-    assert controller.law.position == 1800.0
 
 
 def section_of_all_nodes(folder, entries):
@@ -476,7 +288,7 @@ def section_of_all_nodes(folder, entries):
 
 def test_gains_may_be_in_the_section_of_all_nodes(tmp_path):
     file = section_of_all_nodes(tmp_path, 'gains: {velocity: 80.0}')
-    assert law_of(blf.load_loop(file).controller).velocity == 80.0
+    assert flatten(blf.load_loop(file).controller)['gains.velocity'] == 80.0
     file = section_of_all_nodes(tmp_path, 'gains: {velocty: 80.0}')
     with pytest.raises(ConfigurationError) as raised:
         blf.load_loop(file)
@@ -487,18 +299,9 @@ def test_gains_may_be_in_the_section_of_all_nodes(tmp_path):
     )
 
 
-def test_nodes_over_ros_take_their_own_of_the_section_of_all_nodes(bare_node, tmp_path):
-    from blf_dsc_controller.nodes.parameters import declare
-
-    file = section_of_all_nodes(tmp_path, 'gains: {velocity: 80.0}')
-    controller = declare(bare_node('blf_dsc_controller', file), ControllerConfig)
-    assert law_of(controller).velocity == 80.0
-    assert declare(bare_node('sim_plant', file), PlantConfig) == PlantConfig()
-
-
 def named(law):
     """The file of a law, as the user of a replay names it."""
-    return f'{law}@{digest(str(law))}'
+    return f'{law}@{hashlib.sha256(Path(law).read_bytes()).hexdigest()}'
 
 
 def test_replay_repeats_a_change_of_its_gains(tmp_path):
@@ -548,12 +351,7 @@ def test_replay_remarks_that_the_file_of_the_law_has_changed(tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec('rclpy') is None, reason='needs ROS 2')
 @pytest.mark.usefixtures('blank_pictures')
 def test_node_offline_run_and_replay_compute_the_same_bits(tmp_path):
-    file = tmp_path / 'mine.yaml'
-    file.write_text(
-        f'/**/blf_dsc_controller:\n  ros__parameters:\n    law: {LAW}\n'
-        '    gains: {velocity: 80.0}\n',
-        encoding='utf-8',
-    )
+    file = section_of_all_nodes(tmp_path, 'gains: {velocity: 80.0}')
     common = ['run', '--config', str(file), '--duration', '1.0', '--out']
     assert main([*common, str(tmp_path / 'offline'), '--offline']) == 0
     assert main([*common, str(tmp_path / 'ros'), '--mode', 'lockstep']) == 0
@@ -581,23 +379,3 @@ def test_random_study_runs_it(base, tmp_path):
     (of_package,) = run_chunk(load_study(locate(base)), 0, 1)[largest]
     assert 0.0 < mine < 10.0
     assert mine != of_package
-
-
-def test_comparison_of_laws_runs_it(tmp_path, monkeypatch):
-    """With its gains searched in the ranges that the file of the study gives."""
-    monkeypatch.setattr(laws, 'LAWS', dict(laws.LAWS))
-    file = tmp_path / 'contest_of_laws.py'
-    file.write_text(
-        'from blf_dsc_controller.studies.laws import StudiedLaw\n'
-        'from blf_dsc_controller.studies.tuning import Gain\n'
-        "GAINS = (Gain('gains.position', 100.0, 3e4),)\n"
-        f"LAWS = {{'mine': StudiedLaw('mine', GAINS, {LAW!r})}}\n",
-        encoding='utf-8',
-    )
-    assert laws.chosen_laws([str(file)]) == ['proposed', 'mine']
-    trial = laws.trial('ur5e_rigid', 1)
-    unseen = torque_rows(laws.trial('ur5e_rigid', UNSEEN).controller)
-    soft, stiff = (
-        laws.run('mine', trial, {'gains.position': gain}, unseen) for gain in (2e3, 1e4)
-    )
-    assert stiff.errors[1] < soft.errors[1] < 0.03
