@@ -168,31 +168,6 @@ def test_drawn_values_are_used_in_the_plant_of_the_run(tmp_path):
     assert (events.torque[1], events.torque[3]) == (0.0, 0.0)
 
 
-def test_start_is_as_configured_and_events_follow_each_other_by_gaps(tmp_path):
-    text = (
-        '\n'.join(line for line in STUDY.splitlines() if 'initial' not in line) + '\n'
-    )
-    begin = 'begin: ["uniform(0.05, 0.1)", "choice(0.2)"]'
-    gap = 'gap: ["uniform(0, 1)", "choice(2)"]'
-    a_study = study(tmp_path, LOOP + text.replace(begin, gap))
-    values = draw(a_study, 3)
-    plant = plant_with(a_study, values)
-    first = values['plant.events.gap.1']
-    assert plant.initial == a_study.plant.initial
-    assert plant.events.begin == (first, first + 2.0)
-
-
-def test_one_row_of_joints_serves_all_events_and_needs_some(tmp_path):
-    text = STUDY.replace(', "uniform(-0.5, 0.5)", "choice(0.0)"]', ']')
-    assert text != STUDY
-    assert study(tmp_path, LOOP + text) == study(tmp_path)
-    text = '\n'.join(line for line in LOOP.splitlines() if 'events' not in line)
-    with pytest.raises(
-        ConfigurationError, match=r'events.payload: .* no events: give events.beg'
-    ):
-        study(tmp_path, f'{text}\n{STUDY}')
-
-
 def test_study_may_be_based_on_a_preset(tmp_path):
     """Each file takes precedence over its base, value by value."""
     write(tmp_path)
@@ -209,20 +184,6 @@ def test_study_may_be_based_on_a_preset(tmp_path):
         study(tmp_path, text.replace(str(base), str(tmp_path / 'study.yaml')))
     with pytest.raises(ConfigurationError, match=r'leads back to a file'):
         study(tmp_path, text.replace(str(base), f'../{tmp_path.name}/study.yaml'))
-
-
-def test_study_may_be_based_on_a_file_beside_it(tmp_path, monkeypatch):
-    """One of that name in the current folder takes precedence, as with arms."""
-    monkeypatch.chdir(tmp_path)
-    folder = tmp_path / 'studies'
-    folder.mkdir()
-    write(folder).rename(folder / 'base.yaml')
-    text = 'monte_carlo:\n  ros__parameters: {base: base.yaml, seed: 1}\n'
-    assert study(folder, text).settings.runs == RUNS
-    write(tmp_path, (LOOP + STUDY).replace(f'runs: {RUNS}', 'runs: 2')).rename(
-        tmp_path / 'base.yaml'
-    )
-    assert study(folder, text).settings.runs == 2
 
 
 PAIRS = 6 if os.environ.get('NIGHTLY') else 3
@@ -365,9 +326,3 @@ def test_state_of_one_run_does_not_leak_into_the_next(tmp_path, changes):
             np.testing.assert_array_equal(
                 values, whole_study[name][run : run + 1], err_msg=name
             )
-
-
-def test_only_the_first_law_of_a_pair_learns(tmp_path):
-    pairs = STUDY.replace('seed: 7', 'seed: 7\n    pairs: true')
-    laws = study(tmp_path, LOOP + pairs).laws().values()
-    assert [law.learning.enabled for law in laws] == [True, False, False]

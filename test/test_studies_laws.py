@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,10 @@ import pytest
 from paper_case import P, configured, run
 from scipy.linalg import expm
 
-from benchmark import arms, tuning
+from benchmark import tuning
 from benchmark.__main__ import main as table
 from benchmark.paper import CASES, FAILS, HOLDS, ONLY_IF, case_name
 from blf_dsc_controller import (
-    BlfDscError,
-    ControllerConfig,
     PlantConfig,
     change,
     load_loop,
@@ -29,32 +27,11 @@ from blf_dsc_controller import (
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import known_names, locate
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.studies import laws
 from blf_dsc_controller.studies.monte_carlo import torque_rows
-from blf_dsc_controller.studies.tuning import Gain, parameters_at, value_at
-
-
-def test_every_law_is_tuned_with_the_same_effort():
-    """Same optimiser, seed and budget; one range per shared gain; as many for both of Fig. 2."""
-    ranges = {}
-    for task in tuning.TASKS.values():
-        for gain in task.gains:
-            key = gain.name, gain.joint
-            assert ranges.setdefault(key, (gain.least, gain.most)) == (
-                gain.least,
-                gain.most,
-            )
-        values = [value_at(k / 10.0) for k in range(len(task.gains))]
-        config = change(ControllerConfig(), task.fixed)
-        found = parameters_at(config, task.gains, values)
-        # of each joint; 10^0.1 to three digits
-        assert found['two_link.feedback_gain'] == (1.0, 1.26)
-        assert found['two_link.adaptation_gain'] == (1.58,) * 3
-    assert len(tuning.TASKS['proposed'].gains) == len(tuning.TASKS['comparison'].gains)
 
 
 @pytest.mark.parametrize('name', tuning.TASKS)
@@ -271,129 +248,6 @@ def test_law_of_a_file_acts_at_the_right_time():
     assert coarse / fine == pytest.approx(4.0, rel=0.1)
 
 
-def test_integrator_of_computed_torque_removes_the_error_of_a_push():
-    rest = ideal(1e-3, FRICTIONLESS | {'reference.amplitude': [0.0] * 18})
-    push = {'load.torque': [3.0, -2.0, 1.0, 0.3, -0.2, 0.1], 'duration': 3.0}
-    loop = rest._replace(plant=change(rest.plant, push))
-    (pushed, _), (integrated, _) = (
-        simulated(loop, GAINS | {'gains.integral': integral})
-        for integral in (1e-9, 5000.0)
-    )
-    assert np.all(np.abs(integrated[-1]) < 1e-3 * np.abs(pushed[-1]))
-
-
-def test_computed_torque_compensates_known_friction_along_the_reference():
-    (_, without), (_, compensated) = (
-        simulated(ideal(1e-3, law), GAINS) for law in (FRICTIONLESS, {})
-    )
-    config = load_loop('ur5e_rigid').controller
-    ((_, dq, _),) = terms.sampled(reference_of(config), np.zeros(1))
-    slip = np.tanh(dq / settings_of_config(config).columns.coulomb_velocity)
-    friction = config.robot.viscous * dq + config.robot.coulomb * slip
-    np.testing.assert_allclose(compensated[0] - without[0], friction, atol=1e-12)
-    assert np.abs(friction).min() > 0.1
-
-
-def test_computed_torque_without_gains_has_those_of_the_law_at_small_errors():
-    """k_p = 1.8 w^2, k_d = 2.1 w, k_i = 0.6 w^3 with the rate w = 0.625 / 7.5 ms."""
-    config = load_loop('ur5e_rigid').controller
-    found = laws.law_changes(laws.LAWS['computed_torque'], config, {})
-    rate = 0.625 / 7.5e-3
-    np.testing.assert_allclose(found['gains.position'], 1.8 * rate**2, rtol=1e-3)
-    np.testing.assert_allclose(found['gains.velocity'], 2.1 * rate, rtol=1e-3)
-    np.testing.assert_allclose(found['gains.integral'], 0.6 * rate**3, rtol=1e-3)
-
-
-@pytest.mark.parametrize('preset', ['panda', 'ur5e_commissioned', 'panda_rigid'])
-def test_both_ends_of_each_search_are_valid_configurations(preset):
-    config = load_loop(preset).controller
-    for studied in laws.LAWS.values():
-        for side in ('least', 'most'):
-            values = {gain.name: getattr(gain, side) for gain in studied.gains}
-            change(config, laws.law_changes(studied, config, values))
-
-
-def test_arm_that_is_as_its_urdf_says_is_noted_before_laws_are_compared(
-    tmp_path, monkeypatch, capsys
-):
-    text = locate('ur5e_rigid').read_text(encoding='utf-8')
-    ideal = tmp_path / 'ideal.yaml'
-    ideal.write_text(re.sub(r' +truth:\n( {6}.*\n)+', '', text), encoding='utf-8')
-    monkeypatch.setattr(laws, 'compare', lambda *_: {})
-    for config, notes in ((str(ideal), 1), ('ur5e_rigid', 0)):
-        out = tmp_path / f'out_{notes}'
-        assert main(['arms', '--config', config, '--out', str(out)]) == 0
-        assert capsys.readouterr().err.count('exactly that of the URDF') == notes
-
-
-def test_soft_trial_has_a_part_of_the_bandwidth_and_a_bound_that_fits():
-    stiff = laws.trial('ur5e_rigid', 1).controller
-    soft = arms.soft_trial('ur5e_rigid', 1, 0.25).controller
-    assert soft.barrier.bound == (16 * 0.005,) * 6
-    assert soft.reference == stiff.reference
-
-
-def test_events_of_a_file_become_the_pick_up_of_its_heaviest_load():
-    events = {
-        'events.begin': [1.0, 2.0],
-        'events.duration': [0.0, 3.0],
-        'events.payload': [0.5, 2.0],
-        'events.ramp': [0.5, 0.0],
-        'events.force': [0.0, 0.0, 0.0, 0.0, 0.0, -5.0],
-    }
-    plant = laws.trial('ur5e_rigid', 0, {'sim_plant': events}).plant
-    assert plant.events.payload == (2.0,)
-    assert plant.events == laws.trial('ur5e_rigid', 0).plant.events
-    none = {name: [] for name in events}
-    rated = {'sim_plant': none, 'blf_dsc_controller': {'robot.payload': 4.0}}
-    assert laws.trial('ur5e_rigid', 0, rated).plant.events.payload == (4.0,)
-
-
-def test_every_trial_has_its_own_truth_motion_and_noise():
-    trials = [laws.trial('ur5e_rigid', seed) for seed in range(4)]
-    for get in (
-        lambda loop: loop.controller.reference.phase,
-        lambda loop: loop.controller.reference.amplitude,
-        lambda loop: loop.plant.seed,
-        lambda loop: loop.plant.truth.seed,
-    ):
-        assert len({get(each) for each in trials}) == 4
-    assert (
-        trials[0].controller.reference == load_loop('ur5e_rigid').controller.reference
-    )
-
-
-def test_cost_penalises_rough_torque_and_is_largest_for_a_diverged_run():
-    figures = laws.Figures(
-        (1e-3, 1e-2, 1e-1, 1e0), 200.0, laws.ROUGHEST / 2.0, (0.0, 0.0)
-    )
-    assert laws.cost_of(figures) == pytest.approx(1.5)
-    assert laws.cost_of(
-        replace(figures, roughness=10.0 * laws.ROUGHEST)
-    ) == pytest.approx(11.5)
-    assert laws.cost_of(replace(figures, errors=(np.nan,) * 4)) == 30.0
-    assert laws.cost_of(replace(figures, errors=(1e300,) * 4)) == 30.0
-
-
-def test_table_shows_the_worst_run_of_each_law():
-    """Two runs with errors of 1 and 2 mrad, of which the second leaves the bound."""
-    inside = laws.Figures((1e-3,) * 4, 0.9, 0.01, (0.02, 0.01))
-    outside = laws.Figures((2e-3,) * 4, 1.0, 0.02, (0.03, 0.0))
-    results = {
-        'proposed': laws.Result({}, None, [inside, outside]),
-        'slotine_li_tuned': laws.Result(
-            {'position': 3.0}, 1.0, [replace(inside, model=(np.nan, np.nan))]
-        ),
-    }
-    heads, proposed, tuned, gains = (
-        re.split(r'  +', line) for line in laws.format_results(results).splitlines()
-    )
-    assert len(heads) == len(proposed) == len(tuned)
-    assert proposed[1:] == [*['2.00'] * 4, '3.00', '1.00', '2.0 %', '1 of 2']
-    assert tuned[1:] == [*['1.00'] * 4, '-', '-', '1.0 %', '1 of 1']
-    assert gains == [f'{tuned[0]}: position 3']
-
-
 @pytest.mark.nightly
 def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monkeypatch):
     """The smallest run of the command: one arm, one truth, a first population of 5."""
@@ -440,13 +294,6 @@ def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
         assert main(['arms', '--laws', str(tmp_path / name), '--out', str(out)]) == 1
         assert problem in capsys.readouterr().err
         assert not out.exists()
-
-
-def test_gain_that_a_law_does_not_have_is_named():
-    config = load_loop('ur5e_rigid').controller
-    mistaken = Gain('feedback.stifness', 0.1, 1.0)
-    with pytest.raises(BlfDscError, match=r'did you mean feedback\.stiffness'):
-        parameters_at(config, [mistaken], [0.5])
 
 
 def test_laws_of_a_file_join_those_chosen_by_name(tmp_path, monkeypatch, capsys):
