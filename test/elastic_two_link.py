@@ -3,7 +3,6 @@
 
 from blf_dsc_controller.commissioning import motion, planned, postures, response
 
-BEGIN = (0.1, 0.8)  # rad, where the arm rests
 NEAR, FAR = (0.3, 1.1), (0.8, 0.5)  # rad
 # Springs of 26 and 29 Hz, and no torque where nothing moves: no gravity.
 ARM = """

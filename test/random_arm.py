@@ -17,11 +17,11 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.values import base_matrix
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
 )
-from blf_dsc_controller.messages.topics import COMMANDS, JOINT_STATE
 from sim_plant.arm import rigid_arm, rigid_bodies
 
 CONFIG = Path(__file__).parents[1] / 'config'
@@ -374,9 +374,11 @@ def write_states(
         1_000_000_000 + round(k * period * 1e9) for k in range(len(states))
     ]
     with BagWriter(path, flush_interval=None) as bag:
-        handle = bag.add_topic('/joint_states', JOINT_STATE, [])
+        handle = bag.add_topic('/joint_states', topics.JOINT_STATE, [])
         other = (
-            bag.add_topic('/arm/commands', COMMANDS.type, []) if len(commands) else 0
+            bag.add_topic('/arm/commands', topics.COMMANDS.type, [])
+            if len(commands)
+            else 0
         )
         for stamp, state, command in zip_longest(
             stamps, states[: len(stamps)], commands

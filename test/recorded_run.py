@@ -22,24 +22,14 @@ from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateEncoder,
 )
-from blf_dsc_controller.messages.topics import (
-    BOUND,
-    COMMANDS,
-    JOINT_STATES,
-    MONITOR,
-    REFERENCE,
-    ROBOT_DESCRIPTION,
-    TIMING,
-    TRACKING_ERROR,
-    TRUTH,
-)
 from blf_dsc_controller.simulation.loop import write_bag
 
-LATCHED = {ROBOT_DESCRIPTION.resolved: [ROBOT_DESCRIPTION.offered]}
+LATCHED = {topics.ROBOT_DESCRIPTION.resolved: [topics.ROBOT_DESCRIPTION.offered]}
 
 # Learns within a second: a window of 0.3 s, which is less excited.
 QUICK = {
@@ -224,34 +214,46 @@ class Synthetic:
         timing = JointStateEncoder(('latency', 'lateness', 'late_steps'), ('position',))
         zero = np.zeros(2)
         bound = JointStateEncoder(JOINTS, ('position', 'effort'))
-        yield BOUND, START, bound.encode(START, [BOUND_RAD] * 2, (), [LIMIT_NM] * 2)
+        yield (
+            topics.BOUND,
+            START,
+            bound.encode(START, [BOUND_RAD] * 2, (), [LIMIT_NM] * 2),
+        )
         for k, stamp in enumerate(self.stamp.tolist()):
             yield (
-                JOINT_STATES,
+                topics.JOINT_STATES,
                 stamp,
                 states.encode(stamp, self.position[k, ::-1], zero, zero),
             )
-            yield COMMANDS, stamp, commands.encode(self.torque[k])
-            yield REFERENCE, stamp, reference.encode(stamp, self.reference[k], zero)
+            yield topics.COMMANDS, stamp, commands.encode(self.torque[k])
             yield (
-                TRACKING_ERROR,
+                topics.REFERENCE,
+                stamp,
+                reference.encode(stamp, self.reference[k], zero),
+            )
+            yield (
+                topics.TRACKING_ERROR,
                 stamp,
                 tracking.encode(stamp, self.error[k], zero, self.torque[k]),
             )
             vector = [*self.estimate[k], *(0.9 * self.disturbance[k]), 0.1, 0.004]
             yield (
-                MONITOR,
+                topics.MONITOR,
                 stamp,
                 learning.encode(stamp, [*vector, self.latched[k], 1e-9 * k]),
             )
             if k % 10 == 0:
                 yield (
-                    TRUTH,
+                    topics.TRUTH,
                     stamp,
                     truth.encode(stamp, [*TRUE, *self.disturbance[k], 1.0]),
                 )
             if with_timing:
-                yield TIMING, stamp, timing.encode(stamp, [1e-6 * k, 0.0, k // 100])
+                yield (
+                    topics.TIMING,
+                    stamp,
+                    timing.encode(stamp, [1e-6 * k, 0.0, k // 100]),
+                )
 
 
 def write_made(path, messages, rename=lambda topic: topic.resolved):

@@ -20,16 +20,9 @@ from blf_dsc_controller import draw, measure, read_run
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.analysis.report import read_bag, write_report
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.messages.topics import (
-    CHANGES,
-    JOINT_STATES,
-    JOURNAL,
-    MONITOR,
-    REFERENCE,
-    TRACKING_ERROR,
-)
 from blf_dsc_controller.supervision.supervisor import Reason
 
 pytest.importorskip('plotly', reason='needs plotly: pip install .[report]')
@@ -95,8 +88,12 @@ def folder(tmp_path_factory):
     data = json.dumps(
         {'stamp': START + 2_500_000_000, 'parameters': {'load.torque': [1.0, 0.0]}}
     )
-    message = typestore().types[CHANGES.type](data=data)
-    change = (CHANGES, START, bytes(typestore().serialize_cdr(message, CHANGES.type)))
+    message = typestore().types[topics.CHANGES.type](data=data)
+    change = (
+        topics.CHANGES,
+        START,
+        bytes(typestore().serialize_cdr(message, topics.CHANGES.type)),
+    )
     recorded_run.write_made(
         path / 'synthetic', [*synthetic.messages(with_timing=True), change]
     )
@@ -189,7 +186,9 @@ def test_page_is_self_contained_and_escapes_names(tmp_path, monkeypatch):
 
 
 def test_joint_states_alone_suffice_for_a_page(tmp_path, capsys):
-    states = [entry for entry in Synthetic(500).messages() if entry[0] is JOINT_STATES]
+    states = [
+        entry for entry in Synthetic(500).messages() if entry[0] is topics.JOINT_STATES
+    ]
     recorded_run.write_made(tmp_path / 'bag', states)
     assert (
         main(['report', str(tmp_path / 'bag'), '--out', str(tmp_path / 'page.html')])
@@ -252,9 +251,10 @@ def stopped(folder, reason=Reason.OUTSIDE_BOUND):
     messages = [
         (topic, stamp + LATE, raw)
         for topic, stamp, raw in Synthetic(4000).messages()
-        if topic not in (TRACKING_ERROR, REFERENCE, MONITOR) or stamp < stop
+        if topic not in (topics.TRACKING_ERROR, topics.REFERENCE, topics.MONITOR)
+        or stamp < stop
     ]
-    messages.append((JOURNAL, stop + 2 * LATE, event.encode()))
+    messages.append((topics.JOURNAL, stop + 2 * LATE, event.encode()))
     return recorded_run.write_made(
         folder / 'bag', sorted(messages, key=lambda entry: entry[1])
     )

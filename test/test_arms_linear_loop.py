@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from blf_dsc_controller import ControllerConfig, load_loop
+from blf_dsc_controller import ControllerConfig
 from blf_dsc_controller.arms.joint_gains import (
     JointGains,
     linear,
@@ -26,7 +26,6 @@ from blf_dsc_controller.arms.linear_loop import (
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.configuration.robot import parameters_of
-from blf_dsc_controller.factory.settings import settings_of_config
 
 ONE = np.ones((1, 1, 1))  # one joint with a link of 1 kg m^2, in one posture
 TIMING = Timing(0.001, delay=1, drive_lag=0.001, velocity_lag=0.0025)
@@ -104,16 +103,6 @@ def test_margin_is_the_distance_to_instability():
     assert not loop(2000.0).is_stable()
 
 
-def test_a_torque_loop_hides_the_motor():
-    """Far below its bandwidth the arm responds as a link with a motor of B / (1 + k_T)."""
-    loop = TorqueLoop(gain=4.0, damping=0.0, lag=0.0003)
-    arm = joints(1e6, torque_loop=loop)._replace(viscous=np.zeros(1))
-    s = np.array([2j * np.pi * 5.0])
-    hidden = joints(None, motors=0.2 / 5.0)._replace(viscous=np.zeros(1))
-    found, expected = (arm_response(ONE, each, TIMING, s) for each in (arm, hidden))
-    np.testing.assert_allclose(found, expected, rtol=0.01)
-
-
 # What is plausible where nothing but a URDF is known.
 SPRINGS = (5e3, 3e4, 1e6)  # N m/rad
 SIDES = (False, True)
@@ -138,14 +127,3 @@ def test_gains_of_an_unknown_arm_hold_whatever_its_gears_are(preset, payload):
         )
         loop_ = Loop(links, arm, Timing(0.002, 1, 0.002, 0.0025), law)
         assert loop_.is_stable(), (stiffness, side, loop, factor)
-
-
-@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'openarm'])
-def test_gains_of_the_law_add_up_to_stiffness_and_damping(preset):
-    """Of a static error: w + K_p (K / 2 + mu) is the stiffness; of a velocity, K_p the damping."""
-    config = load_loop(preset).controller
-    law = settings_of_config(config)
-    rate = law.surface.gain / 2.0 + law.surface.mu
-    found = law.barrier.weight + law.feedback.gain * rate
-    np.testing.assert_allclose(found, config.feedback.joint_stiffness, rtol=1e-3)
-    np.testing.assert_allclose(law.feedback.gain, config.feedback.joint_damping)

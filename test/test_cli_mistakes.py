@@ -12,7 +12,7 @@ import sys
 import pytest
 import recorded_run
 from command import finished
-from recorded_run import Synthetic, limited_files, small_disk
+from recorded_run import Synthetic, limited_files
 
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.compiled.announcement import COMPILING
@@ -134,22 +134,6 @@ def write_params(folder, plant='', controller=''):
     return path
 
 
-def test_full_disk_is_reported(tmp_path, capsys):
-    with small_disk(tmp_path / 'disk', 1) as disk:
-        run = here(capsys, '--offline', '--duration', 20, '--out', disk / 'out')
-    assert run.returncode == 1
-    assert 'cannot be written any further' in run.stderr
-
-
-def test_folder_goes_in_which_nothing_could_be_written(tmp_path, capsys):
-    """So that the same command can be given again."""
-    with limited_files(tmp_path / 'disk', 0) as disk:
-        run = here(capsys, '--offline', '--duration', 0.1, '--out', disk / 'out')
-        assert not (disk / 'out').exists()
-    assert run.returncode == 1
-    assert 'config.yaml cannot be written: File too large' in run.stderr
-
-
 def test_report_that_the_disk_does_not_hold_leaves_what_was_there(
     bag, tmp_path, capsys
 ):
@@ -213,15 +197,6 @@ def test_node_reports_what_is_wrong_with_its_arguments(tmp_path):
         assert run.returncode == 1
         assert expected in run.stderr
         assert 'Traceback' not in run.stderr
-
-
-def test_path_that_is_no_text_is_refused_before_anything_is_made(tmp_path, capsys):
-    name = os.fsdecode(os.fsencode(tmp_path) + b'/\xff')
-    with pytest.raises(SystemExit) as ended:
-        main(['run', '--offline', '--duration', '0.1', '--out', name])
-    assert ended.value.code == 2
-    assert 'is no text in UTF-8: rename' in capsys.readouterr().err
-    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize(

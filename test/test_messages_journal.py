@@ -10,21 +10,21 @@ import pytest
 import yaml
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.journal import (
     Event,
     EventType,
     decode,
 )
-from blf_dsc_controller.messages.topics import JOURNAL
 
 EXAMPLES = yaml.safe_load(Path(__file__).with_name('journal_events.yaml').read_text())
 POINT = EXAMPLES['trajectory']['points'][0]
 
 
 def encoded(text):
-    message = typestore().types[JOURNAL.type](data=text)
-    return bytes(typestore().serialize_cdr(message, JOURNAL.type))
+    message = typestore().types[topics.JOURNAL.type](data=text)
+    return bytes(typestore().serialize_cdr(message, topics.JOURNAL.type))
 
 
 def event(kind='activate', content=None, **fields):

@@ -11,8 +11,8 @@ import recorded_run
 
 from blf_dsc_controller import load_loop, simulate
 from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import typestore
-from blf_dsc_controller.messages.topics import CHANGES, JOURNAL
 from blf_dsc_controller.simulation.loop import write_bag
 
 REPLICAS = (
@@ -64,7 +64,7 @@ def entries(tmp_path_factory):
 def with_arm(entry, text):
     """The message, in which the text of the arm, if there is one, is another."""
     topic, kind, at, raw = entry
-    if topic not in (JOURNAL.resolved, CHANGES.resolved):
+    if topic not in (topics.JOURNAL.resolved, topics.CHANGES.resolved):
         return entry
     content = json.loads(typestore().deserialize_cdr(raw, kind).data)
     parameters = content.get('content', content).get('parameters', {})

@@ -259,6 +259,19 @@ def test_path_tolerance_of_a_goal_aborts_it_and_the_reference_rests(
     np.testing.assert_array_equal(reference(law)[1:], 0.0)
 
 
+def test_path_tolerance_of_a_goal_counts_once_its_trajectory_has_begun(loop):
+    """The arm is hardly ever as near to its reference as is allowed."""
+    _, law, client = loop
+    begin = law.guard.reference.time + 3.0
+    stamp = law.guard.reference.start_stamp + round(1e9 * begin)
+    path = [('joint1', 1e-7, 0.0)]
+    status, result = client.result(
+        client.follow(point(FAR, 1.0), stamp=stamp, path=path)
+    )
+    assert (status, result.error_code) == (ABORTED, result.PATH_TOLERANCE_VIOLATED)
+    assert law.guard.reference.time >= begin
+
+
 def test_goal_tolerance_aborts_a_goal_that_has_not_arrived_in_time(loop):
     _, law, client = loop
     tolerance = [('joint1', 1e-12, 0.0)]

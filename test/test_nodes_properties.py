@@ -32,7 +32,6 @@ from blf_dsc_controller.nodes.plant_node import PlantNode
 
 EXAMPLES = 2_000 if os.environ.get('NIGHTLY') else 60
 SETTINGS = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
-LIMIT = 20.0
 
 numbers = st.one_of(
     st.floats(allow_nan=True, allow_infinity=True, width=64),

@@ -24,7 +24,6 @@ from std_msgs.msg import String
 import blf_dsc_controller as blf
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.topics import Quality
 from blf_dsc_controller.nodes import parameters as node_parameters
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.endpoints import qos_profile
@@ -151,7 +150,7 @@ def test_topic_is_in_the_namespace_of_the_node_unless_it_begins_with_a_slash(ros
 def test_urdf_that_is_missing_or_not_latched_is_reported(ros, monkeypatch, publishers):
     monkeypatch.setattr(node_parameters, 'TIMEOUT', 1)
     if publishers:
-        publish(ros, 'robot_description', Quality(1, 'reliable', 'volatile'))
+        publish(ros, 'robot_description', topics.Quality(1, 'reliable', 'volatile'))
         ros.until(lambda: ros.tester.count_publishers('/robot_description') == 1)
     expected = f'within 1 s on /robot_description, which has {publishers} publishers'
     with pytest.raises(blf.ConfigurationError, match=expected):

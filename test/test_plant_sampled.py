@@ -114,16 +114,6 @@ ALL_KINDS = {
 }
 
 
-def truths(given, samples=SAMPLES):
-    """True values (samples, 9) under the usual torques."""
-    arm = plant_of(build(PlantConfig, given))
-    rows = np.empty((samples, 9))
-    for row, torque in zip(rows, commands(samples), strict=True):
-        row[:] = arm.truth()
-        arm.step(torque)
-    return rows
-
-
 OFFSET = {'sensor.offset': [0.01, -0.02]}
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 
 import hypothesis
@@ -64,19 +63,6 @@ def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t
 
     np.testing.assert_allclose(dqr, rate[0], atol=1e-9)
     np.testing.assert_allclose(ddqr, rate[1], atol=1e-9)
-
-
-MOMENTS = np.array([0.5, 1.0, 1.2, 2.5, 4.0])
-POINTS = np.random.default_rng(3).normal(size=(5, 2))
-
-
-def test_minimum_jerk_is_continuous_up_to_its_snap():
-    """Only then no other velocity or acceleration at an inner point costs less jerk."""
-    knots, pieces = pieces_of(minimum_jerk(MOMENTS, POINTS), 2)
-    for k, joint, order in itertools.product((1, 2, 3), (0, 1), range(5)):
-        before, after = map(np.polynomial.Polynomial, pieces[k - 1 : k + 1, joint])
-        end = before.deriv(order)(knots[k] - knots[k - 1])
-        assert end == pytest.approx(after.deriv(order)(0.0), rel=1e-9, abs=1e-9)
 
 
 JOINTS = ('shoulder', 'elbow')
@@ -230,10 +216,6 @@ def test_goal_with_much_time_is_not_overshot_by_more_than_the_braking_distance(
     np.testing.assert_array_equal(dqr[-1], (0.0, 0.0))
 
 
-# positions about -1.57 and 1, as of a Panda's elbow
-MIDDLE = limited([-3.07, -1.0], [-0.07, 3.0])
-
-
 # Trajectories that the limits do not allow as they are sent.
 
 
@@ -258,22 +240,6 @@ def test_path_that_is_too_fast_is_stretched_and_passes_its_points_in_order():
     passed = [int(distance.argmin()) for distance in nearest]
     assert passed == sorted(passed)
     np.testing.assert_allclose(at(motion.vector, motion.end)[0], GOALS[-1], atol=1e-9)
-
-
-def test_path_is_stretched_no_more_than_the_limits_ask_for():
-    """From rest: its velocities are those that were sent, over the factor of its times."""
-    still = pack(2, [minimum_jerk(np.zeros(1), GOALS[:1])])
-    times = np.array([0.4, 0.8, 1.2])
-    rates = np.diff(GOALS, axis=0, prepend=GOALS[:1]) / 0.4
-    motion = plan(trajectory((GOALS, rates), times=times.tolist()), still, 0.0)
-    factor = motion.end / times[-1]
-    assert factor > 1.5
-    for k in (1, 2):
-        q, dq, _ = at(motion.vector, np.nextafter(factor * times[k], 0.0))
-        np.testing.assert_allclose(q, GOALS[k], atol=1e-6)
-        np.testing.assert_allclose(dq, rates[k] / factor, atol=1e-5)
-    # each try is 1 % slower than needed (`_MARGIN`)
-    assert max(limits_used(motion, 0.0, motion.end)) > 0.95
 
 
 def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow():
@@ -321,29 +287,6 @@ def test_trajectory_that_ends_in_motion_brakes_after_its_last_point():
     ended = at(motion.vector, NOW + 4.0)[0, 0] - GOALS[-1, 0]
     assert 0.2**2 / (2.0 * 6.0) < ended < 0.2 * 0.1
     assert max(limits_used(motion, NOW, NOW + 4.0)) <= 1.0 + 1e-9
-
-
-def test_points_past_position_limits_are_named_and_no_consequence_of_them():
-    """Of the way to them only the velocity would be told, which a slower motion keeps."""
-    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.array([[-1.57, 1.0]]))])
-    path = np.array([[-1.5, 1.0], [-1.0, 3.5], [0.5, 3.5]])
-    sent = trajectory((path,), times=(0.1, 0.2, 0.3))
-    with pytest.raises(blf.TrajectoryError) as rejection:
-        plan_trajectory(sent, at_rest, 0.0, MIDDLE)
-    (problem,) = rejection.value.problems
-    assert problem == (
-        "point 3 has joint 'shoulder' at 0.5 rad, past its limit of -0.07 rad; "
-        "point 2 has joint 'elbow' at 3.5 rad, past its limit of 3 rad; reduce the motion, or "
-        'relax limits.position_lower and limits.position_upper'
-    )
-
-
-def test_without_ruckig_what_exceeds_the_limits_says_what_is_missing(monkeypatch):
-    monkeypatch.setattr(retargeting, 'ruckig', None)
-    with pytest.raises(blf.TrajectoryError, match='pip install ruckig') as rejection:
-        plan(trajectory((GOALS[:1],), times=(0.2,)))
-    assert 'past its limit of -6 rad/s^2' in str(rejection.value)
-    plan(trajectory((GOALS, VELOCITIES[::-1])))  # brakes after its end all the same
 
 
 # Random sequences of trajectories, chunks, streamed targets and stops, adopted as the

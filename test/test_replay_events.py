@@ -11,21 +11,13 @@ import recorded_run
 from fault_table import FAULTS, JOINTS, MILLISECOND, Rig, run
 from recorded_run import compared, of
 
-from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller import BlfDscError, TrajectoryPoint, change, verify
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.estimate import estimate_names
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
-from blf_dsc_controller.messages.topics import (
-    BOUND,
-    COMMANDS,
-    JOINT_STATES,
-    JOURNAL,
-    TRACKING_ERROR,
-)
 from blf_dsc_controller.reference.retargeting import Target
-from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
-from blf_dsc_controller.replay.verify import verify
+from blf_dsc_controller.reference.trajectory import Trajectory
 
 # Messages show neither a corrupted state of the law nor the end of a process.
 IN_MESSAGES = [fault for fault in FAULTS if 'poison' not in fault.inject.__qualname__]
@@ -49,11 +41,11 @@ class Recorder(Rig):
 
     def publish_events(self):
         while self.guard.journal.pending:
-            self.record(JOURNAL, self.guard.journal.pending.popleft().encode())
+            self.record(topics.JOURNAL, self.guard.journal.pending.popleft().encode())
 
     def deliver(self, raw):
         self.publish_events()
-        self.record(JOINT_STATES, raw)
+        self.record(topics.JOINT_STATES, raw)
         self.count += 1
         if self.count - 1 in self.drops:
             return None
@@ -69,7 +61,9 @@ class Recorder(Rig):
             for topic, message in self.telemetry.sample(
                 guard.reference.last_stamp, *known, 0.0
             ):
-                if topic is not BOUND:  # of which the node also sends the changed ones
+                if (
+                    topic is not topics.BOUND
+                ):  # of which the node also sends the changed ones
                     self.record(topic, message)
         self.publish_events()
         return torque
@@ -102,9 +96,9 @@ def test_every_fault_replays_with_identical_torques(fault, tmp_path):
     assert result.difference is None
     if any('another controller' in remark for remark in result.remarks):
         return  # the replay ends where the controller was killed
-    assert compared(result)['commands'] == 2 * len(of(rig.entries, COMMANDS))
+    assert compared(result)['commands'] == 2 * len(of(rig.entries, topics.COMMANDS))
     assert compared(result)['tracking_error'] == 6 * len(
-        of(rig.entries, TRACKING_ERROR)
+        of(rig.entries, topics.TRACKING_ERROR)
     )
     assert ('safe stop' in ' '.join(result.transitions)) == (outcome.noticed >= 0)
     assert [item for item in result.comparisons if 'torques' in item.left_out] == []
@@ -177,7 +171,7 @@ def test_every_kind_of_event_and_watchdog_torques_replay(tmp_path):
     assert [types[each] for each in kinds] == [2, 1, 1]
     assert result.motions == 8
     states, commands = (
-        len(of(rig.entries, topic)) for topic in (JOINT_STATES, COMMANDS)
+        len(of(rig.entries, topic)) for topic in (topics.JOINT_STATES, topics.COMMANDS)
     )
     assert compared(result)['commands'] == 2 * commands
     assert commands > states + 10
@@ -211,7 +205,7 @@ def test_dropped_state_is_told_from_a_missing_answer_beside_torques_of_the_watch
     rig.step(30)
     rig.release()
     result = rig.verify(tmp_path)
-    torques = len(of(rig.entries, COMMANDS))
+    torques = len(of(rig.entries, topics.COMMANDS))
     assert torques > 80  # those of 79 states, and the watchdog's
     assert (result.difference, result.skipped) == (None, 1)
     assert compared(result)['commands'] == 2 * torques
@@ -267,21 +261,21 @@ def strict(event):
 @pytest.mark.parametrize(
     ('kind', 'alter', 'topic', 'field'),
     [
-        ('stop', altered(reason='stamp jump'), TRACKING_ERROR, 'stop: '),
-        ('stop', later, TRACKING_ERROR, 'used by the law ('),
-        ('stop', altered(text='all is well'), JOURNAL, 'text of event'),
-        ('start', altered(resumed=True), JOURNAL, 'resumed of event'),
-        ('trajectory', later, TRACKING_ERROR, 'trajectory'),
-        ('trajectory', other_point, COMMANDS, 'effort of joint'),
-        ('configure', strict, TRACKING_ERROR, 'used by the law ('),
-        ('silence', altered(torques=3), TRACKING_ERROR, 'silence'),
+        ('stop', altered(reason='stamp jump'), topics.TRACKING_ERROR, 'stop: '),
+        ('stop', later, topics.TRACKING_ERROR, 'used by the law ('),
+        ('stop', altered(text='all is well'), topics.JOURNAL, 'text of event'),
+        ('start', altered(resumed=True), topics.JOURNAL, 'resumed of event'),
+        ('trajectory', later, topics.TRACKING_ERROR, 'trajectory'),
+        ('trajectory', other_point, topics.COMMANDS, 'effort of joint'),
+        ('configure', strict, topics.TRACKING_ERROR, 'used by the law ('),
+        ('silence', altered(torques=3), topics.TRACKING_ERROR, 'silence'),
     ],
 )
 def test_changed_event_is_a_difference(tmp_path, kind, alter, topic, field):
     """The recorded controller did something else than the replayed one."""
     rig = eventful()
     rig.publish_events()
-    events = [(entry, decode(entry[3])) for entry in of(rig.entries, JOURNAL)]
+    events = [(entry, decode(entry[3])) for entry in of(rig.entries, topics.JOURNAL)]
     chosen = [(entry, event) for entry, event in events if event.type == kind]
     entry, event = chosen[-1 if kind == 'stop' else 0]
     entry[3] = alter(event).encode()
@@ -300,25 +294,29 @@ def test_stop_that_the_recorded_controller_did_not_make_is_the_difference(tmp_pa
     rig.step(10)
     rig.publish_events()
     stops = [
-        each for each in of(rig.entries, JOURNAL) if decode(each[3]).type == 'stop'
+        each
+        for each in of(rig.entries, topics.JOURNAL)
+        if decode(each[3]).type == 'stop'
     ]
     rig.entries.remove(stops[0])
     result = rig.verify(tmp_path)
     assert result.difference.field.startswith('used by the law (')
-    assert result.difference.topic == TRACKING_ERROR.resolved
+    assert result.difference.topic == topics.TRACKING_ERROR.resolved
 
 
 @pytest.mark.parametrize('part', [0.1, 0.5, 0.9])
 def test_flipped_bit_of_a_safe_torque_is_found(tmp_path, part):
     rig = eventful()
-    safe = [entry for entry in of(rig.entries, TRACKING_ERROR) if NAN in entry[3]]
+    safe = [
+        entry for entry in of(rig.entries, topics.TRACKING_ERROR) if NAN in entry[3]
+    ]
     # another NaN
     safe[0][3] = safe[0][3].replace(NAN, struct.pack('<d', -float('nan')), 1)
     entry = safe[int(part * len(safe))]
     entry[3] = entry[3][:-8] + bytes([entry[3][-8] ^ 1]) + entry[3][-7:]
     difference = rig.verify(tmp_path).difference
     assert (difference.topic, difference.field) == (
-        TRACKING_ERROR.resolved,
+        topics.TRACKING_ERROR.resolved,
         'effort of joint2',
     )
     assert difference.recorded == pytest.approx(difference.replayed, abs=1e-12)
@@ -328,12 +326,17 @@ def test_flipped_bit_of_a_safe_torque_is_found(tmp_path, part):
     ('topic', 'number', 'samples', 'remark'),
     [
         (
-            TRACKING_ERROR,
+            topics.TRACKING_ERROR,
             40,
             40,
-            f'the recorder missed messages of {TRACKING_ERROR.resolved}',
+            f'the recorder missed messages of {topics.TRACKING_ERROR.resolved}',
         ),
-        (JOURNAL, 3, 1, 'an event of the journal, or a target, is not in the bag'),
+        (
+            topics.JOURNAL,
+            3,
+            1,
+            'an event of the journal, or a target, is not in the bag',
+        ),
     ],
 )
 def test_replay_ends_where_the_recorder_missed_what_it_needs(
@@ -377,7 +380,7 @@ def test_second_controller_in_a_bag_is_not_replayed(tmp_path, drops):
 def test_event_that_cannot_be_repeated_is_named(tmp_path, kind, content, words):
     rig = eventful()
     rig.publish_events()
-    events = [(entry, decode(entry[3])) for entry in of(rig.entries, JOURNAL)]
+    events = [(entry, decode(entry[3])) for entry in of(rig.entries, topics.JOURNAL)]
     entry, event = next(found for found in events if found[1].type == kind)
     event.content.update(content)
     entry[3] = event.encode()

@@ -19,15 +19,12 @@ from recorded_run import compared, of
 from ros_rig import FakeClock, RosRig, activate, configure, deactivate
 from test_nodes_trajectory import JOINTS, SECOND
 
+from blf_dsc_controller import verify
 from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.messages.topics import (
-    COMMANDS,
-    TRACKING_ERROR,
-)
 from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
-from blf_dsc_controller.replay.verify import verify
 
 # no two torques alike
 DAMPED = {'safety__torque': 'hold_gravity', 'safety__damping': [2.0, 1.0]}
@@ -103,11 +100,11 @@ def test_stops_ramps_and_activations_replay_with_identical_torques(tmp_path):
         'activate, deactivate, activate, safe stop (stamp jump), deactivate, activate, reset, '
         'safe stop (state timeout), deactivate, activate'
     )
-    errors = read_content(bag).topics[TRACKING_ERROR].joint_states(JOINTS, ())
+    errors = read_content(bag).topics[topics.TRACKING_ERROR].joint_states(JOINTS, ())
     used = errors.stamp[np.isfinite(errors.field(0)[:, 0])]
     assert result.samples == used.size
     assert np.count_nonzero(used > silent) >= 30
-    torques = len(of(recorded_run.messages(bag), COMMANDS))
+    torques = len(of(recorded_run.messages(bag), topics.COMMANDS))
     assert compared(result)['commands'] == 2 * torques
     assert compared(result)['tracking_error'] == 6 * errors.size
     assert torques - result.samples >= 600 + 2 * 50

@@ -16,26 +16,13 @@ from command import OLDER, finished
 from random_arm import random_urdf
 from recorded_run import MILLISECOND, START, compared, of
 
+from blf_dsc_controller import BlfDscError, load_loop, read_run, simulate, verify
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.reader import read_run
-from blf_dsc_controller.cli.bags import DIFFERENT, PARTIAL
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.configuration.nodes import load_loop
-from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JointStateEncoder
-from blf_dsc_controller.messages.event_content import FORMAT
 from blf_dsc_controller.messages.journal import EventType, decode
-from blf_dsc_controller.messages.topics import (
-    BOUND,
-    COMMANDS,
-    JOINT_STATES,
-    JOURNAL,
-    MONITOR,
-    REFERENCE,
-    TRACKING_ERROR,
-)
-from blf_dsc_controller.replay.verify import verify
-from blf_dsc_controller.simulation.loop import simulate, write_bag
+from blf_dsc_controller.simulation.loop import write_bag
 
 OF_URDF = """
 /**:
@@ -45,6 +32,8 @@ OF_URDF = """
   ros__parameters: {{duration: 0.2, truth.mass_deviation: 0.3}}
 """
 SAMPLES = 1001
+
+DIFFERENT, PARTIAL = 3, 4  # exit codes of a replay
 
 
 @pytest.fixture(scope='module')
@@ -111,11 +100,15 @@ def test_other_laws_and_a_narrowing_bound_replay_from_compressed_bags(tmp_path, 
 @pytest.mark.parametrize(
     ('topic', 'at', 'field'),
     [
-        (COMMANDS, -8, 'effort of joint2'),
-        (TRACKING_ERROR, -8, 'effort of joint2'),
-        (REFERENCE, -8 - 4, 'velocity of joint2'),  # followed by the empty effort
+        (topics.COMMANDS, -8, 'effort of joint2'),
+        (topics.TRACKING_ERROR, -8, 'effort of joint2'),
+        (
+            topics.REFERENCE,
+            -8 - 4,
+            'velocity of joint2',
+        ),  # followed by the empty effort
         # before model_changes, compute_time, velocity and effort
-        (MONITOR, -32, 'latched'),
+        (topics.MONITOR, -32, 'latched'),
     ],
 )
 def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
@@ -123,8 +116,8 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
 ):
     for flipped, k, place in (
         (topic, 700, at),
-        (COMMANDS, 800, -8),
-        (MONITOR, 900, -40),
+        (topics.COMMANDS, 800, -8),
+        (topics.MONITOR, 900, -40),
     ):
         entry = of(entries, flipped)[k]
         raw = bytearray(entry[3])
@@ -157,15 +150,17 @@ def test_flipped_bit_is_located_and_named_and_the_earliest_counts(
     )
 
 
-FLIPPED = COMMANDS.resolved, MONITOR.resolved
+FLIPPED = topics.COMMANDS.resolved, topics.MONITOR.resolved
 
 
 def test_repeated_and_unused_states_are_skipped(entries, tmp_path):
-    states = of(entries, JOINT_STATES)
+    states = of(entries, topics.JOINT_STATES)
     at = START + 300 * MILLISECOND + 5
     late = JointStateEncoder(('joint1', 'joint2')).encode(at, [9, 9], [9, 9], [9, 9])
     place = entries.index(states[301])
-    entries.insert(place, [JOINT_STATES.resolved, JOINT_STATES.type, at, late])
+    entries.insert(
+        place, [topics.JOINT_STATES.resolved, topics.JOINT_STATES.type, at, late]
+    )
     result = verify(recorded_run.write(tmp_path / 'bag', [states[0], *entries]))
     assert (result.difference, result.skipped, result.samples) == (None, 2, SAMPLES)
 
@@ -173,12 +168,12 @@ def test_repeated_and_unused_states_are_skipped(entries, tmp_path):
 @pytest.mark.parametrize(
     ('topic', 'number', 'publishers', 'percent', 'commands'),
     [
-        (JOINT_STATES, 333, 0, 33.2, 333),  # ends the replay
+        (topics.JOINT_STATES, 333, 0, 33.2, 333),  # ends the replay
         # Two of the 24 numbers of a sample are commands.
-        (COMMANDS, 333, 0, 91.4, 0),
-        (COMMANDS, 333, 2, 91.4, 0),  # have no common order
-        (COMMANDS, 333, 1, None, SAMPLES),
-        (COMMANDS, 0, 1, None, SAMPLES),
+        (topics.COMMANDS, 333, 0, 91.4, 0),
+        (topics.COMMANDS, 333, 2, 91.4, 0),  # have no common order
+        (topics.COMMANDS, 333, 1, None, SAMPLES),
+        (topics.COMMANDS, 0, 1, None, SAMPLES),
     ],
 )
 def test_lost_message_leaves_the_others_to_compare(
@@ -190,7 +185,7 @@ def test_lost_message_leaves_the_others_to_compare(
     result = verify(path)
     assert result.difference is None
     assert compared(result)['commands'] == 2 * commands
-    if topic is JOINT_STATES:
+    if topic is topics.JOINT_STATES:
         assert result.samples == number
         stamp = f'the state with stamp {lost[2]} ns was used but is not in the bag'
         assert any(remark.startswith(stamp) for remark in result.remarks)
@@ -211,12 +206,14 @@ def replayed(path, capsys):
     return code, capsys.readouterr().out
 
 
-@pytest.mark.parametrize('topic', [COMMANDS, REFERENCE, MONITOR, BOUND])
+@pytest.mark.parametrize(
+    'topic', [topics.COMMANDS, topics.REFERENCE, topics.MONITOR, topics.BOUND]
+)
 def test_missing_topic_is_named_in_the_verdict(entries, tmp_path, capsys, topic):
     kept = [entry for entry in entries if entry[0] != topic.resolved]
     code, text = replayed(recorded_run.write(tmp_path / 'bag', kept), capsys)
     assert code == PARTIAL
-    missing = {BOUND: 1, COMMANDS: SAMPLES + 1}.get(topic, SAMPLES)
+    missing = {topics.BOUND: 1, topics.COMMANDS: SAMPLES + 1}.get(topic, SAMPLES)
     assert f'MISSING in the bag: {missing} messages of {topic.resolved}' in text
     assert 'INCOMPLETE' in text.splitlines()[-1]
 
@@ -227,7 +224,7 @@ def test_missing_answer_makes_no_difference(
     entries, tmp_path, capsys, number, publishers
 ):
     """Without sequence numbers its state may as well have been dropped by the middleware."""
-    of(entries, TRACKING_ERROR)[number][3] = None
+    of(entries, topics.TRACKING_ERROR)[number][3] = None
     path = recorded_run.write(tmp_path / 'bag', entries, publishers=publishers)
     result = verify(path)
     assert result.difference is None
@@ -250,14 +247,17 @@ def test_recording_that_was_cut_is_incomplete(entries, tmp_path, capsys):
 @pytest.mark.parametrize(
     ('keep', 'words'),
     [
-        (lambda name, _: name == JOINT_STATES.resolved, r'/joint_states \(1001\)'),
+        (
+            lambda name, _: name == topics.JOINT_STATES.resolved,
+            r'/joint_states \(1001\)',
+        ),
         (lambda name, _: 'jo' in name, r'/joint_states \(1001\)'),  # and the journal
         (
-            lambda name, at: name == JOURNAL.resolved or at >= 200,
+            lambda name, at: name == topics.JOURNAL.resolved or at >= 200,
             f'stamp {START} ns, .* start the',
         ),
         (
-            lambda name, at: name != JOURNAL.resolved or at,
+            lambda name, at: name != topics.JOURNAL.resolved or at,
             'the beginning of /blf_.*/journal: start',
         ),
     ],
@@ -269,14 +269,14 @@ def test_bag_without_what_a_replay_needs_is_refused(entries, tmp_path, keep, wor
     path = recorded_run.write(tmp_path / 'bag', kept)
     with pytest.raises(BlfDscError, match=words):
         verify(path)
-    if not of(kept, JOURNAL):
+    if not of(kept, topics.JOURNAL):
         with pytest.raises(BlfDscError, match='not hold the configuration'):
             read_content(path).controller_config()
 
 
 def configured(entries, change):
     """Change the content of the first event."""
-    first = of(entries, JOURNAL)[0]
+    first = of(entries, topics.JOURNAL)[0]
     event = decode(first[3])
     change(event.content)
     first[3] = event.encode()
@@ -284,7 +284,7 @@ def configured(entries, change):
 
 def test_journal_of_a_later_format_is_refused(entries, tmp_path):
     def change(content):
-        content.update(format=FORMAT + 1, version='9.0.0')
+        content.update(format=content['format'] + 1, version='9.0.0')
 
     configured(entries, change)
     path = recorded_run.write(tmp_path / 'bag', entries)

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live view without a browser: what is drawn, where it is served, wrong usage.
-
-Of a loop.
-"""
+"""The live view without a browser: what it shows of a loop, where it is served, wrong usage."""
 
 from __future__ import annotations
 
@@ -10,6 +7,7 @@ import os
 import pty
 import re
 import signal
+import socket
 import subprocess
 from subprocess import PIPE
 from urllib.request import urlopen
@@ -32,65 +30,24 @@ import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.view.node import ViewNode
-from blf_dsc_controller.view.page import Page
-from blf_dsc_controller.view.snapshot import Snapshot
 
 HOST = '127.0.0.1'
 PORT = 18080
 LOG = topics.Topic(
     '', '/rosout', 'rcl_interfaces/msg/Log', topics.STREAM, topics.STREAM
 )
-LOAD = (2.0, *[np.nan] * 3, 0.05, *[np.nan] * 3)
 
 
-def moving(seconds, error=0.001):
-    """Snapshots of a two-link arm that moves, with this tracking error of its first joint [rad]."""
-    times = np.arange(0.0, seconds, 1 / 30)
-    unknown = np.full(5, np.nan)
-    # error, bound, torque
-    of_joints = np.array([[error, 0.0], [0.002, 0.002], [3.0, np.nan]])
-    learned = unknown, unknown, 0.1, np.array([1.0, 9.0, 100.0])
-    first = (Snapshot(t, np.array([1.0 + t, 0.5]), *of_joints, *learned) for t in times)
-    return [each._replace(load=LOAD) if each.time > 1.0 else each for each in first]
-
-
-@pytest.fixture(scope='module')
-def page():
-    page = Page(HOST, PORT)
-    page.draw_arm(blf.ControllerConfig(), {})
-    yield page
-    page.close()
-
-
-def node(page, name):
-    """Return what is drawn in the 3D scene under this name."""
-    return page.server.scene._handle_from_node_name[name]
-
-
-def test_plots_show_the_share_of_the_bound_and_a_caption_what_is_held(page):
-    page.plot(moving(1.0, error=-0.001))
-    assert 't = 0.97 s' in page.caption.content
-    assert 'held' not in page.caption.content
-    page.plot(moving(2.0, error=-0.001))
-    assert 'held: 2.000 +- 0.05 kg' in page.caption.content
-    errors, torques = (plot.data for plot in page.plots[:2])
-    assert errors[0][-1] == pytest.approx(1.97, abs=0.01)  # s
-    np.testing.assert_allclose(errors[1], 50.0)  # % of the bound
-    np.testing.assert_allclose(errors[3], 100.0)
-    assert (torques[1][-1], torques[2][-1]) == (3.0, -1.0)  # unknown: below the axis
-    model, weight = (plot.data for plot in page.plots[2:])
-    assert (model[1][-1], model[2][-1]) == pytest.approx((10.0, 30.0))  # %
-    assert [line[-1] for line in weight[1:4]] == pytest.approx([2.0, 1.95, 2.05])  # kg
-
-
-def test_port_in_use_is_skipped(page):
-    other = Page(HOST, PORT)
-    assert other.url != page.url
-    other.close()
+def test_port_in_use_is_skipped(ros):
+    with socket.create_server((HOST, PORT)):
+        view = ros.add(ViewNode, port=PORT)
+        ros.until(lambda: view.page)
+        assert view.page.server.get_port() != PORT
+        view.close()
     with pytest.raises(
         blf.BlfDscError, match=r"served at '192.0.2.1'.*of this computer"
     ):
-        Page('192.0.2.1', PORT)
+        ros.add(ViewNode, host='192.0.2.1')
 
 
 def test_view_of_an_offline_run_is_rejected_before_the_run(tmp_path):
