@@ -13,6 +13,7 @@ import sys
 import numpy as np
 import pytest
 from recorded_run import limited_files
+from scenario import Scenario
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
@@ -140,17 +141,15 @@ def test_law_takes_what_it_commanded_for_efforts_that_are_not_given():
 
 
 def test_it_follows_trajectories_and_stops_on_request():
-    controller = blf.ArmController(LOOP.controller)
-    plant = plant_of(LOOP.plant)
-    run(controller, plant, LOOP.plant, 10)
+    arm = Scenario(LOOP)
+    controller = arm.controller
+    arm.run(0.01)
     controller.follow([(2.0, np.array([2.2, 1.6]))])
     with pytest.raises(blf.TrajectoryError, match='rejected'):
         controller.follow([blf.TrajectoryPoint(1e-3, (90.0, 90.0))])
     with pytest.raises(blf.TrajectoryError, match='each point is a time and positions'):
         controller.follow([2.2, 1.6])
-    for step in range(10, 2500):
-        q, dq, effort = plant.measure().reshape(3, -1)
-        plant.step(controller.update(1.0 + 1e-3 * step, q, dq, effort))
+    (*_, q) = arm.run(2.5).q
     np.testing.assert_allclose(q, (2.2, 1.6), atol=2e-3)  # the bound
     controller.stop()
     assert controller.phase is blf.Phase.INACTIVE

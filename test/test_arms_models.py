@@ -6,8 +6,6 @@ Rules of URDFs.
 
 from __future__ import annotations
 
-from math import inf
-
 import numpy as np
 import pinocchio
 import plain_law
@@ -228,44 +226,7 @@ def test_base_parameters_are_the_smallest_set_that_gives_the_same_torques(chain)
     assert singular[p] < 1e-7  # pi / 2 has ten digits in the UR5e's file
 
 
-def test_base_parameters_agree_with_the_literature():
-    """43 for a Panda (Gaz et al., 2019), 36 for an arm like the UR.
-
-    Rotors except at the base.
-    """
-    for chain, inertial, rotors in ((PANDA_CHAIN, 43, 5), (UR5E_CHAIN, 36, 4)):
-        names = base_parameters(chain, GRAVITY).model.parameter_names
-        found = sum(name.startswith('rotor') for name in names)
-        assert (len(names) - found, found) == (inertial, rotors)
-    base = base_parameters(PANDA_CHAIN, GRAVITY)
-    sums = dict(zip(base.model.parameter_names, base.combinations, strict=True))
-    assert sums['Ixx7'] == 'Ixx7 - Iyy7'
-    assert sums['m*cx7'] == 'm*cx7'
-    assert sums['m*cx6'] == 'm*cx6 + 0.088 m7'
-    assert not any(name.startswith(('m7', 'm*cz', 'Iyy')) for name in sums)
-
-
 # Chains are read from a URDF by its rules; unusable files are rejected with a remedy.
-
-
-def test_limits_are_read_from_the_file_and_infinite_where_they_are_missing():
-    def limits(text):
-        joint = panda(text).joints[0]
-        return joint.lower, joint.upper, joint.velocity, joint.effort
-
-    given = '<limit lower="-2.8973" upper="2.8973" velocity="2.175" effort="87" />'
-    unlimited = '<limit effort="0" velocity="0" lower="-9" upper="9" />'
-    assert limits(PANDA_TEXT) == (-2.8973, 2.8973, 2.175, 87.0)
-    assert limits(changed(given, '', 1)) == (-inf, inf, inf, inf)
-    assert limits(changed(given, unlimited, 1)) == (-9.0, 9.0, inf, inf)
-    continuous = changed(FIRST_JOINT, FIRST_JOINT.replace('revolute', 'continuous'))
-    assert limits(continuous) == (-inf, inf, 2.175, 87.0)
-
-
-def test_friction_is_read_from_the_file_and_zero_by_default():
-    text = changed(AXIS, f'{AXIS}<dynamics damping="3" friction="2" />', 1)
-    found = [(joint.damping, joint.friction) for joint in panda(text).joints[:2]]
-    assert found == [(3.0, 2.0), (0.0, 0.0)]
 
 
 def test_gripper_is_carried_for_every_tip_and_its_fingers_are_held():
@@ -291,10 +252,6 @@ def panda(text):
 def changed(old, new, count=-1):
     assert old in PANDA_TEXT
     return PANDA_TEXT.replace(old, new, count)
-
-
-FIRST_JOINT = '"panda_joint1" type="revolute"'
-AXIS = '<axis xyz="0 0 1" />'
 
 
 def test_zero_tensor_rounding_below_zero_and_the_namespace_of_an_expanded_file_are_accepted():

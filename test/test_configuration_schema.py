@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import array
 from contextlib import suppress
 
 import numpy as np
@@ -13,34 +12,10 @@ from blf_dsc_controller import (
     ConfigurationError,
     ControllerConfig,
     PlantConfig,
-    change,
     load_loop,
 )
 from blf_dsc_controller.configuration.schema import build, flatten
 from blf_dsc_controller.configuration.side_nodes import RecorderConfig
-
-
-def test_values_are_kept_and_flattened_and_a_change_keeps_the_others():
-    given = {
-        'duration': 2.5,
-        'disturbance.viscous': (3.0, 0.0),
-        'mode': 'lockstep',
-        'seed': 5,
-    }
-    built = build(PlantConfig, given)
-    assert built.disturbance.viscous == (3.0, 0.0)
-    assert dict(flatten(PlantConfig()), **given) == flatten(built)
-    assert build(PlantConfig, flatten(built)) == built
-    entries = array.array('d', [3.0, 4.0])  # as ROS gives them
-    changed = change(built, {'disturbance.viscous': entries})
-    assert flatten(changed) == {**flatten(built), 'disturbance.viscous': (3.0, 4.0)}
-    computed = {'seed': np.int64(6), 'disturbance.viscous': 2.0 * np.array([3.0, 4.0])}
-    of_script = change(built, computed)
-    assert of_script.seed == 6
-    assert of_script.disturbance.viscous == (6.0, 8.0)
-    assert type(of_script.disturbance.viscous[0]) is float
-    with pytest.raises(ConfigurationError, match='shorter than one sample'):
-        change(changed, {'sample_time': 1.0, 'duration': 0.5})
 
 
 def test_recommended_preset_equals_the_defaults():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from paper_case import configured
 from random_arm import PANDA
+from scenario import Scenario
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.analysis.metrics_table import format_table
@@ -22,7 +23,6 @@ from blf_dsc_controller.simulation.loop import (
 )
 from blf_dsc_controller.supervision.supervisor import Reason
 from blf_dsc_controller.tool.tip_wrench import TipWrench
-from sim_plant.plant import plant_of
 
 # s
 TOUCHED = 8.0
@@ -141,6 +141,13 @@ def test_load_is_no_contact_but_learned():
     assert contacts(alone)[0] == pytest.approx(7.02, abs=0.03)  # the same, unexpected
 
 
+@pytest.mark.parametrize(('force', 'is_contact'), [(20.0, True), (-20.0, False)])
+def test_empty_hand_that_is_pushed_up_has_no_load_that_explains_it(force, is_contact):
+    """Down, it might be a load; none is lighter than nothing."""
+    record = run_of(pushed([0.0, 0.0, force], end=END), **{'contact.reaction': 'stop'})
+    assert bool(contacts(record)) is is_contact
+
+
 @pytest.mark.parametrize('reaction', ['none', 'stop', 'hold', 'yield'])
 def test_contact_is_found_and_answered_as_chosen(reaction, held, ignored):
     """20 N within 60 ms; after a stop nothing is commanded by the law."""
@@ -232,37 +239,28 @@ def test_tare_at_rest_is_zero_there_replays_and_is_forgotten(tmp_path):
         pushed(PUSH, 9.5, 10.0),
         **{'contact.reaction': 'hold', 'contact.loads': False},
     )
-    plant = plant_of(loop.plant)
-    count = 0
-
-    def run(seconds):
-        nonlocal count
-        for _ in range(round(1e3 * seconds)):
-            state = plant.measure().reshape(3, -1)
-            plant.step(controller.update(1.0 + 1e-3 * count, *state))
-            count += 1
-
-    with blf.ArmController(loop.controller, record=tmp_path / 'bag') as controller:
+    arm = Scenario(loop, record=tmp_path / 'bag')
+    with arm.controller as controller:
         guard = controller.guard
         law = guard.controller
         with pytest.raises(blf.TareError, match='the law is not in command'):
             controller.tare()
-        run(8.0)
+        arm.run(8.0)
         with pytest.raises(
             blf.TareError, match=r'the arm moves, .* hold it still for 0.2 s'
         ):
             controller.tare()
         assert not controller.is_tared
         guard.motions.brake()
-        run(1.0)
+        arm.run(1.0)
         before = law.sample.external_interval.copy()
         controller.tare()
-        run(0.3)
+        arm.run(0.3)
         assert controller.is_tared
         assert (law.sample.external_interval < 0.7 * before).all()
         assert (np.abs(law.sample.external) < law.sample.external_interval).all()
         assert not guard.findings.contacts.count
-        run(0.3)
+        arm.run(0.3)
         assert guard.findings.contacts.count == 1
         with pytest.raises(
             blf.TareError, match=r'something touches the arm: .* clear it first'

@@ -331,20 +331,6 @@ def test_robot_without_torques_is_remarked_with_settings_that_its_driver_takes(
 
 
 @pytest.mark.parametrize(
-    ('theta', 'has_motors'),
-    [([0.0] * 7, False), ([0.5] * 7, False), ([0.5] * 6 + [0.51], True)],
-)
-def test_motors_that_are_where_their_links_are_say_nothing(
-    connected, theta, has_motors
-):
-    """Gears that do not give way would be stiffer than any."""
-    driver, _, _ = connected(MadeUpRobot(theta=theta))
-    driver.start()
-    assert (driver.read().motors is not None) == has_motors
-    assert driver.load_in_force() == 1.5
-
-
-@pytest.mark.parametrize(
     ('raised', 'expected', 'call', 'remedy'),
     [
         ('NetworkException', ConnectionLostError, 'readOnce', 'check its computer and'),
@@ -408,13 +394,6 @@ def test_only_a_reflex_is_recovered_and_no_other_mode_is_started_from(connected)
         with pytest.raises(DriverError, match=f'is not idle, but in mode {mode.name}'):
             connected(robot)
         assert robot.told == ['recovered'] * (mode is modes.Reflex)
-
-
-def test_realtime_is_enforced_where_a_priority_is_asked_for(connected):
-    wanted = pylibfranka.RealtimeConfig
-    for priority, kind in ((0, wanted.kIgnore), (80, wanted.kEnforce)):
-        _, _, asked = connected(MadeUpRobot(), **{'realtime.priority': priority})
-        assert asked == [('here', kind)]
 
 
 def test_an_address_without_a_robot_is_an_error_with_a_remedy(wire):

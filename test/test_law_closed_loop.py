@@ -20,11 +20,8 @@ from plain_law import PlainLaw, R, dynamics, regressor
 from plants import QUIET, START
 from scipy.integrate import solve_ivp
 
-from blf_dsc_controller import ControllerConfig, controller_of, read_run, simulate
+from blf_dsc_controller import controller_of, read_run, simulate
 from blf_dsc_controller.analysis.lyapunov import energies as offline_energies
-from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.factory.estimate import columns_of
-from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.numerics.algebra import cholesky_factor
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.simulation.loop import write_bag
@@ -288,24 +285,6 @@ def test_lyapunov_function_of_the_oracle_decreases_to_the_floor_of_the_lag():
     assert above[-1] > 50  # there is a decrease to check
     assert np.all(np.diff(V[: above[-1] + 2]) < 0.0)
     assert V[0] > 1e4 * V[loop.t >= 1.0].max()
-
-
-def test_settings_follow_the_configuration():
-    """Learning waits for window and filters, tau_d + T_a of (26)."""
-    given = {'learning.window': 0.75}
-    given |= {'two_link.adaptation_gain': [1.5, 2.0, 3.0]}
-    config = build(ControllerConfig, given)
-    settings = settings_of_config(config)
-    columns = len(columns_of(config))
-    assert settings.excitation.learning_start == 1.25
-    assert settings.window.length == 750
-    assert columns > 0
-    assert settings.adaptation.adaptation_gain.tolist() == [
-        1.5,
-        2.0,
-        3.0,
-        *[1.0] * columns,
-    ]
 
 
 def test_terms_of_equation_29_follow_from_what_a_bag_holds(tmp_path):

@@ -98,6 +98,20 @@ def test_erratum_12_linear_virtual_control_crosses_zero_without_a_jump():
     assert max(gap) < mu * bound
 
 
+def test_erratum_14_virtual_control_has_no_singularity():
+    """At zero it is that of the reference; at the bound and beyond only mu is left."""
+    bound = 0.002
+
+    def beta2(xi1, dqr=0.0):
+        return virtual_control(xi1, bound, 150.0, 20.0, dqr)
+
+    assert beta2(0.0, -0.3) == -0.3
+    for xi1 in (1e-12, -1e-9, 1e-7):  # linear: the next term is 1e-17 at 1e-7 rad
+        assert beta2(xi1) == pytest.approx(-95.0 * xi1, rel=1e-14)
+    for xi1 in (bound, -1.1 * bound, 10.0 * bound):
+        assert beta2(xi1) == -20.0 * xi1
+
+
 def damping_torque(d2, xi1, xi2):
     """Contribution of d2 to (28), for a law with these errors at its first sample."""
     demands = []

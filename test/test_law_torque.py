@@ -20,7 +20,6 @@ from closed_loop_case import (
 from paper_case import P
 from plain_law import PlainLaw, R, regressor
 from plants import QUIET
-from scipy.signal import cont2discrete
 
 from blf_dsc_controller.configuration.law_file import load_law
 
@@ -185,28 +184,6 @@ class Filter:
         begins = self.samples == 0
         PAPER.differentiate(self.memory, xi2, self.omega, begins, dt)
         self.samples += 1
-
-
-@pytest.mark.parametrize('omega', [1.0, 30.0, 1000.0])
-@pytest.mark.parametrize('dt', [1e-3, 7e-3])
-def test_differentiating_filter_matches_the_exact_discretisation_of_scipy(omega, dt):
-    """(8) without its hat and with damping 1, for an input held over each sample."""
-    filtered = Filter(omega)
-    system = (
-        np.array([[0.0, 1.0], [-(omega**2), -2.0 * omega]]),
-        np.array([[0.0], [omega**2]]),
-    )
-    A, B, *_ = cont2discrete((*system, np.eye(2), np.zeros((2, 1))), dt)
-    rounding = {'rtol': 1e-9, 'atol': 1e-9 * omega}
-    expected = np.zeros((2, 2))
-    for xi2 in np.random.default_rng(0).normal(size=(100, 2)):
-        is_first = filtered.samples == 0
-        filtered.step(xi2, dt)
-        expected = A @ expected + B * xi2
-        if is_first:
-            expected[:] = xi2, np.zeros(2)
-        np.testing.assert_allclose(filtered.memory.observed, expected[0], atol=1e-12)
-        np.testing.assert_allclose(filtered.memory.rate, expected[1], **rounding)
 
 
 def test_row_of_lambda_follows_equation_24_in_a_closed_loop():

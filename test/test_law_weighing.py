@@ -9,7 +9,6 @@ import pytest
 import blf_dsc_controller as blf
 from blf_dsc_controller.analysis.metrics_table import format_table
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.named_values import load_text
 from blf_dsc_controller.simulation.loop import write_bag
 
 # s
@@ -128,7 +127,7 @@ def test_lightest_hand_is_taken_for_empty_if_the_run_begins_with_a_load():
     begin, run = cycles('panda_rigid', -1.5, 1.5)
     lighter = at(run, begin[1] - 0.05)
     assert lighter[MASS] == pytest.approx(-1.5, abs=0.05)
-    assert 'lighter than at the start' in load_text(lighter)
+    assert 'lighter than at the start' in format_table(blf.measure(run))
     is_as_told(at(run, begin[1] + CARRIED - 0.05), 1.5, 0.04)
     is_as_told(at(run, begin[2] - 0.05), 0.0, 0.04)
 
@@ -173,15 +172,6 @@ def test_bag_tells_what_was_held_in_the_table_and_on_the_page(record, tmp_path):
     assert [' mm, until ' in line for line in lines] == [False, True, False]
     result = blf.verify(tmp_path / 'bag')  # which weighs again
     assert (result.difference, result.compared) == (None, 1.0)
-
-
-def test_text_of_a_load_leaves_out_what_is_unknown():
-    nan = float('nan')
-    assert load_text([nan] * 8) == 'unknown'
-    only_mass = [0.003, nan, nan, nan, 0.0124, nan, nan, nan]
-    assert load_text(only_mass) == '0.003 +- 0.012 kg'
-    text = load_text([2.0, 0.001, 0.0, -0.02, 0.05, 0.001, 0.002, 0.0031])
-    assert text == '2.000 +- 0.05 kg, its centre at 1.0 +- 1, 0.0 +- 2, -20.0 +- 3.1 mm'
 
 
 # Motions with rests, links up to 30 % off their URDF, and friction unlike the assumed one.

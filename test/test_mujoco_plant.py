@@ -13,6 +13,7 @@ pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 import mujoco
 from plants import commands
+from scenario import START, Scenario
 from test_plant_sampled import ALL_KINDS
 
 from blf_dsc_controller import (
@@ -31,8 +32,6 @@ from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.run import FIRST_STAMP
-from blf_dsc_controller.supervision.guard import Guard
 from sim_plant import mujoco_plant
 from sim_plant.mujoco_plant import MujocoPlant
 from sim_plant.plant import plant_of
@@ -181,28 +180,13 @@ def test_errors_with_dry_friction_are_as_documented(name, settled, peak):
     the libraries give 9 % more.
     """
     loop = load_loop(name)
-    *_, errors = close_loop(loop.controller, MujocoPlant(loop.plant), 22_000)
-    largest = 1e3 * np.abs(errors).max(axis=1)
+    run = Scenario(loop, plant=MujocoPlant(loop.plant)).run(22.0)
+    largest = 1e3 * np.abs(run.error).max(axis=1)
     for measured, documented in (
         (largest[8000:20_000].max(), settled),
         (largest[20_000:].max(), peak),
     ):
         assert 0.8 * documented < measured < documented
-
-
-def close_loop(config, arm, samples):
-    """Guard, and measured angles and errors (samples, n), of either arm under the controller."""
-    guard = Guard(config, lambda: 0, lambda: 0)
-    guard.starting.activate()
-    n = len(config.joints)
-    angles, errors = np.zeros((2, samples, n))
-    for k in range(samples):
-        measurement = arm.measure()
-        angles[k] = measurement[:n]
-        arm.step(guard.update(FIRST_STAMP + k * 1_000_000, measurement))
-        errors[k] = guard.controller.sample.xi1
-    assert not guard.supervisor.text
-    return guard, angles, errors
 
 
 PICKED_UP, THERE, ENDED = 7.0, 12.0, 15.0  # s; a wall is there from 12 s on
@@ -259,25 +243,18 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
     qr = sampled(reference_of(controller), t)[:, 0]
     farthest = frames(controller.robot.chain(controller.joints), qr)[-1][:, 0, 3].max()
     arm = beside_a_wall(monkeypatch, plant, farthest - DEPTH)
-    guard = Guard(controller, lambda: 0, lambda: 0)
-    guard.starting.activate()
+    run = Scenario(loop._replace(controller=controller), plant=arm)
+    guard = run.guard
     state = guard.controller.state
-    touched = 0
-    for k in range(round(1e3 * ENDED)):
-        if k == round(1e3 * THERE):
-            arm.model.geom('wall').pos[0] -= 1.0
-        torque = guard.update(FIRST_STAMP + k * 1_000_000, arm.measure())
-        guard.perceive()
-        arm.step(torque)
-        if arm.data.ncon and not touched:
-            touched = k
-            before = state.estimate.copy()
-            changes = state.change.changes[0]
-            assert state.weighing.load[0] == pytest.approx(LOAD, abs=0.05)
-    assert touched > 1e3 * THERE
-    events = [e for e in guard.journal.pending if e.type is EventType.CONTACT]
-    found = (events[0].stamp - FIRST_STAMP) // 1_000_000
-    assert 0 <= found - touched < 50  # ms
+    run.run(THERE)
+    arm.model.geom('wall').pos[0] -= 1.0
+    touched = run.run(ENDED - THERE, until=lambda: arm.data.ncon).t[-1]
+    before = state.estimate.copy()
+    changes = state.change.changes[0]
+    assert state.weighing.load[0] == pytest.approx(LOAD, abs=0.05)
+    torques = run.run(ENDED - touched).torque
+    events = [e for e in run.events if e.type is EventType.CONTACT]
+    assert -1e-6 <= 1e-9 * events[0].stamp - START - touched < 0.05
     if reaction == 'hold':
         assert not guard.supervisor.stops
         assert arm.data.ncon  # it leans on the wall
@@ -288,3 +265,4 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
     else:
         assert state.change.changes[0] > changes
         assert state.weighing.load[0] == 0.0  # unknown
+    assert np.isfinite(torques).all()

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import random
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,7 @@ from blf_dsc_controller.messages.codecs import (
 )
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.controller_node import ControllerNode
+from blf_dsc_controller.nodes.other_commander import Finding, OtherCommander
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 
 EXPECTING = {'safety.expect_watchdog': True}
@@ -79,6 +82,26 @@ def test_second_controller_does_not_start_unless_it_is_told_to(ros, word):
     ros.kill(second)
     ros.run(arm, 500)
     assert law.guard.supervisor.phase is blf.Phase.TRACKING
+
+
+def test_controllers_that_start_together_do_not_command_at_the_same_moment(
+    ros, monkeypatch
+):
+    """Each waits for a time of its own, so that the later one hears the first."""
+    waits = iter([0.110, 0.112])  # s, beyond the second in which others are heard
+    monkeypatch.setattr(random, 'uniform', lambda *_: next(waits))
+    clock = FakeClock()
+    topic = ros.publisher(topics.COMMANDS).topic_name
+    ros.publisher(topics.COMMANDS)
+    both = [OtherCommander(ros.tester, topic, 2, clock) for _ in range(2)]
+    ros.until(lambda: ros.tester.count_publishers(topic) == 2)
+    for _ in range(2200):
+        found = [other.find() for other in both]
+        if Finding.NOBODY in found:
+            break
+        clock.advance(0.001)
+    assert sorted(each.name for each in found) == ['NOBODY', 'UNKNOWN']
+    assert 1.0 <= clock() * 1e-9 - 1.0 <= 2.1
 
 
 def test_torques_of_the_watchdog_do_not_count_as_those_of_another_controller(ros):

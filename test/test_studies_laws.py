@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,6 @@ from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.reference import terms
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.studies import laws
-from blf_dsc_controller.studies.monte_carlo import torque_rows
 
 
 @pytest.mark.parametrize('name', tuning.TASKS)
@@ -246,29 +244,6 @@ def test_law_of_a_file_acts_at_the_right_time():
     coarse, fine = deviation(4e-3), deviation(1e-3)
     assert fine < 0.02 * np.abs(E0).max()
     assert coarse / fine == pytest.approx(4.0, rel=0.1)
-
-
-@pytest.mark.nightly
-def test_every_law_is_tuned_and_run_and_learning_finds_the_model(tmp_path, monkeypatch):
-    """The smallest run of the command: one arm, one truth, a first population of 5."""
-    for name, value in {'POPULATION': 5, 'GENERATIONS': 0, 'TRUTHS': 1}.items():
-        monkeypatch.setattr(laws, name, value)
-    assert main(['arms', '--config', 'ur5e_rigid', '--out', str(tmp_path / 'out')]) == 0
-    found = json.loads((tmp_path / 'out/figures.json').read_text(encoding='utf-8'))[
-        'ur5e_rigid'
-    ]
-    assert list(found) == list(laws.LAWS)
-    rows = torque_rows(laws.trial('ur5e_rigid', 1000).controller)
-    for name, studied in laws.LAWS.items():
-        assert list(found[name]['gains']) == [gain.name for gain in studied.gains]
-        # in this process
-        again = laws.run(name, laws.trial('ur5e_rigid', 1), found[name]['gains'], rows)
-        assert found[name]['runs'] == [json.loads(json.dumps(asdict(again)))]
-    learned, guessed = (
-        found[name]['runs'][0]['model'] for name in ('proposed', 'no_learning')
-    )
-    assert learned[0] < guessed[0] / 2.0
-    assert learned[1] < guessed[1] / 5.0  # the URDF does not include the payload
 
 
 def test_file_without_a_usable_law_is_rejected(tmp_path, capsys):
