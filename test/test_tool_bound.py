@@ -186,6 +186,9 @@ def test_run_shows_the_error_at_the_tool(tracked, tmp_path):
     text = f'tool        at most {1e3 * values[at, 0]:.3g} mm off, '
     text += f'{1e3 * values[at, 1]:.3g} mm certified there'
     assert text in format_table(blf.measure(run))
+    turned = values[:, 2].argmax()
+    told = blf.measure(run).tool
+    assert (told['angle'], told['angle_bound']) == pytest.approx(values[turned, 2:])
     titles = {panel.title for panel in panels([run])}
     assert {'error at the tool', 'angle at the tool'} <= titles
 
