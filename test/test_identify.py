@@ -41,10 +41,9 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
-from blf_dsc_controller.identification.from_files import identify_bag
+from blf_dsc_controller.identification.from_files import identify_bag, read_recording
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import problems_of
-from blf_dsc_controller.identification.reading import read_recording
 from blf_dsc_controller.identification.sliding import sliding_direction
 from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.simulation.loop import write_bag

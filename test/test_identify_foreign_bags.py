@@ -15,7 +15,7 @@ from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.bags.sources import open_bag
 from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.identification.reading import read_recording
+from blf_dsc_controller.identification.from_files import read_recording
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 

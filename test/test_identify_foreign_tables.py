@@ -3,19 +3,23 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import warnings
 from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pytest
+import recorded_run
 from random_arm import PANDA, PANDA_TEXT, UR5E, UR5E_TEXT
 from scipy.io import savemat
 
 from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.identification.reading import read_recording
+from blf_dsc_controller.identification.from_files import read_recording
+from blf_dsc_controller.messages.codecs import JointStateEncoder
+from blf_dsc_controller.messages.topics import JOINT_STATES
 
 PERIOD = 0.01  # s
 TIME = np.arange(300) * PERIOD
@@ -262,6 +266,57 @@ def test_matrices_of_npz_and_structures_of_mat_are_read(tmp_path):
     log = {'time_ms': 1e3 * TIME, 'pos': Q, 'torque': TAU}
     savemat(tmp_path / 'a.mat', {'log': log})
     is_read(tmp_path / 'a.mat')
+
+
+def test_parquet_and_feather_are_read_with_lists_as_their_cells(tmp_path):
+    """As data sets of LeRobot have them, beside text."""
+    arrow = pytest.importorskip('pyarrow', reason='needs pyarrow')
+    columns = {
+        'timestamp': TIME,
+        'observation.position': arrow.array(Q.tolist(), arrow.list_(arrow.float64())),
+        'observation.effort': arrow.array(
+            TAU.tolist(), arrow.list_(arrow.float64(), 6)
+        ),
+        'task': ['wave'] * len(TIME),
+    }
+    table = arrow.table(columns)
+    importlib.import_module('pyarrow.parquet').write_table(
+        table, tmp_path / 'a.parquet'
+    )
+    is_read(tmp_path / 'a.parquet')
+    importlib.import_module('pyarrow.feather').write_feather(
+        table, tmp_path / 'a.feather'
+    )
+    is_read(tmp_path / 'a.feather')
+
+
+@pytest.mark.parametrize(('suffix', 'has_efforts'), [('csv', True), ('parquet', False)])
+def test_own_export_is_read_without_a_map(tmp_path, suffix, has_efforts):
+    """By its stamps, and by its efforts; without any, by the torques that were applied."""
+    if suffix == 'parquet':
+        pytest.importorskip('pyarrow', reason='needs pyarrow')
+    made = recorded_run.Synthetic(200)
+    states = JointStateEncoder(UR5E[:2])
+    effort = 2.0 + made.position if has_efforts else 0.0 * made.position
+    still = np.zeros_like(effort)
+    measured = iter(zip(made.position, still, effort, strict=True))
+    messages = [
+        (topic, at, states.encode(at, *next(measured)))
+        if topic is JOINT_STATES
+        else (topic, at, raw)
+        for topic, at, raw in made.messages(with_timing=True)
+    ]
+    names = ['--map', f'shoulder={UR5E[0]}', '--map', f'elbow={UR5E[1]}']
+    bag = recorded_run.write_made(tmp_path / 'bag', messages)
+    out = tmp_path / f'table.{suffix}'
+    assert main(['export', str(bag), '--out', str(out), *names]) == 0
+    text = UR5E_TEXT.replace(UR5E[0], 'shoulder').replace(UR5E[1], 'elbow')
+    recording = read_recording(out, text)
+    assert recording.joints == ('shoulder', 'elbow')
+    size = len(recording.q)
+    np.testing.assert_allclose(recording.q, made.position[:size], atol=1e-9)
+    expected = effort if has_efforts else made.torque
+    np.testing.assert_allclose(recording.torque, expected[:size], atol=1e-9)
 
 
 def test_missing_cells_are_gaps(tmp_path):

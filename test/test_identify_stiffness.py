@@ -24,7 +24,7 @@ from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.configuration.nodes import PLANT
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.reading import read_recording
+from blf_dsc_controller.identification.from_files import read_recording
 from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import JOINT_STATE
 from blf_dsc_controller.simulation.loop import simulate_into_bag

@@ -53,15 +53,28 @@ def blocks_of(size: int) -> Iterator[slice]:
         yield slice(first, min(first + BLOCK, size))
 
 
-def on_disk(blocks: Iterator[Floats], *shape: int) -> Floats:
-    """Return blocks of rows (., *shape) as one array (N, *shape) that is not in memory."""
-    store = OnDisk()
-    for block in blocks:
-        store.append(np.asarray(block, dtype=np.float64))
-    return store.array('<f8').reshape(-1, *shape)
+class Samples:
+    """An array (N, *shape) of floats on disk, of which rows come into memory when indexed."""
+
+    def __init__(self, blocks: Iterator[Floats], *shape: int) -> None:
+        """Write blocks of rows (., *shape)."""
+        self._store = OnDisk()
+        self._shape = shape
+        for block in blocks:
+            self._store.append(np.asarray(block, dtype=np.float64))
+
+    def __len__(self) -> int:
+        return len(self._mapped())
+
+    def __getitem__(self, rows: Any) -> Floats:
+        return np.array(self._mapped()[rows])
+
+    def _mapped(self) -> Floats:
+        """Map the file for as long as it is read: pages that were read are memory, too."""
+        return self._store.array('<f8').reshape(-1, *self._shape)
 
 
-def mapped(size: int, function: Callable[[slice], Floats]) -> Floats:
+def mapped(size: int, function: Callable[[slice], Floats]) -> Samples:
     """Return the rows (`size`, k) that a function returns for the slices of `blocks_of`."""
     width = function(slice(0, 1)).shape[1]
-    return on_disk((function(rows) for rows in blocks_of(size)), width)
+    return Samples((function(rows) for rows in blocks_of(size)), width)

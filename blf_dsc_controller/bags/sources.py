@@ -34,7 +34,7 @@ METADATA = 'metadata.yaml'
 _ROS1 = '.bag'
 FILES = {'.mcap', '.db3', '.bag'}
 """Suffixes of the files of a bag."""
-_TABLES = {'.csv', '.txt', '.npz', '.mat', '.parquet'}
+_TABLES = {'.csv', '.tsv', '.txt', '.npz', '.mat', '.parquet', '.feather'}
 NOTHING_RECORDED = (
     'it is empty: nothing was recorded, as on a full disk: give another bag'
 )

@@ -366,7 +366,7 @@ _IDENTIFY = Command(
         _FORCE,
         option(
             'bags',
-            f'{_BAG}, or a table (.csv, .txt, .npz, .mat)',
+            f'{_BAG}, or a table (.csv, .txt, .npz, .mat, .parquet)',
             type=Path,
             nargs='+',
             metavar='RECORDING',

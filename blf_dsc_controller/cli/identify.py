@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import textwrap
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from datetime import datetime
 from pathlib import Path
@@ -26,7 +26,11 @@ from blf_dsc_controller.identification.from_files import identify_bag
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.identify import STAGES
 from blf_dsc_controller.identification.parameters import robot_parameters
-from blf_dsc_controller.identification.problems import is_usable, problems_of
+from blf_dsc_controller.identification.problems import (
+    is_usable,
+    problems_of,
+    verdict_of,
+)
 from blf_dsc_controller.identification.summary import (
     base_table,
     bodies_table,
@@ -61,24 +65,27 @@ def identify(options: Namespace) -> int:
     outputs = _outputs(options)
     found = _identified(options, robot)
     facts = _facts(found, options)
+    notes = _filled(notes_of(found))
     bodies = bodies_table(found)
     base = '\n'.join(base_table(found))
     joints = joints_table(found)
     others = [*stiffness_table(found), *ripple_table(found)]
-    tables = [*load_table(found), joints, *others, errors_table(found)]
-    print('\n\n'.join([*facts[:2], bodies, base, *tables, *facts[2:]]))
+    tables = [*load_table(found), joints, *others]
+    errors = errors_table(found)
+    print('\n\n'.join([*facts, errors, bodies, base, *tables, *notes]))
     if options.report:
         print_notice(f'drawing {options.report}: some seconds')
         # slow: its libraries
         from blf_dsc_controller.identification.page import write_identified
 
-        write_identified(options.report, found, facts, [bodies, *tables, base])
+        tables_of_page = [errors, bodies, *tables, base]
+        write_identified(options.report, found, [*facts, *notes], tables_of_page)
         print(f'wrote {options.report}')
     usable = is_usable(found)
     if outputs and not (usable or options.force):
         print(f'not written: {_listed(outputs)}; --force writes them nevertheless')
     else:
-        note = '\n'.join([*facts, *tables])
+        note = '\n'.join([*facts, *notes, *tables, errors])
         _write(outputs, found, robot, note)
     return 0 if usable else UNUSABLE
 
@@ -143,22 +150,29 @@ def _refuse_no_output(options: Namespace) -> None:
 
 
 def _facts(found: Identified, options: Namespace) -> list[str]:
-    """Return what was identified from what, and when.
-
-    Problems and notes follow, in lines of the terminal's width.
-    """
+    """Return the verdict, what was identified from what, and when, and problems."""
     today = datetime.now().astimezone().strftime('%Y-%m-%d %H:%M')
     origin = (
         f'{options.urdf} identified from {_listed(options.bags)} on {today} by '
         f'blf_dsc_controller {__version__}'
     )
-    lines = [origin, header_of(found), *problems_of(found, options.effort)]
+    lines = [
+        verdict_of(found, options.effort),
+        origin,
+        header_of(found),
+        *problems_of(found, options.effort),
+    ]
     if found.chain.gripper and not options.tip:
         lines.append(
             f'{found.chain.gripper} was identified as a joint of the arm; if it is that of a '
             f'gripper, give the link that carries it: --tip {found.chain.joints[-2].link}'
         )
-    return [textwrap.fill(line, _WIDTH) for line in [*lines, *notes_of(found)]]
+    return _filled(lines)
+
+
+def _filled(lines: Iterable[str]) -> list[str]:
+    """Return paragraphs in lines of the terminal's width."""
+    return [textwrap.fill(line, _WIDTH) for line in lines]
 
 
 def _write(outputs: Sequence[Path], found: Identified, robot: Robot, note: str) -> None:

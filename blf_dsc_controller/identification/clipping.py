@@ -38,7 +38,7 @@ def _limits(rows: Rows, sign: float) -> Floats:
 
     Infinity where it is not.
     """
-    is_moving = (np.abs(rows.dq) > STILL).any(axis=1)
+    is_moving = (np.abs(rows.dq[:]) > STILL).any(axis=1)
     torque = sign * rows.torque[is_moving]
     largest = torque.max(axis=0, initial=-np.inf)
     below = torque.max(axis=0, initial=-np.inf, where=torque < largest)

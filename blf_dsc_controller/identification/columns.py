@@ -329,12 +329,9 @@ def _seconds_and_nanoseconds(columns: Sequence[str]) -> list[Column]:
 def _with_factors(
     path: Path, names: Sequence[str], kind: str, given: str
 ) -> list[Column]:
-    try:
-        return [
-            Column(name, factor_of(_unit_of(name, kind, given), kind)) for name in names
-        ]
-    except BlfDscError as error:
-        raise BlfDscError(f'{path}: {error}') from error
+    units = [_unit_of(name, kind, given) for name in names]
+    factors = [factor_of(path, unit, kind) for unit in units]
+    return list(map(Column, names, factors))
 
 
 def _unit_of(name: str, kind: str, given: str) -> str:

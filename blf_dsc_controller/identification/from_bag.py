@@ -16,9 +16,8 @@ from blf_dsc_controller.bags.content import Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.bad_values import stand_ins
-from blf_dsc_controller.identification.columns import beginning
+from blf_dsc_controller.identification.columns import Column, beginning
 from blf_dsc_controller.identification.motion import Group, Motion, checked
 from blf_dsc_controller.identification.recording import GAP, interpolated
 from blf_dsc_controller.identification.units import factor_of, is_of_drive
@@ -88,7 +87,7 @@ class _Bag(NamedTuple):
 
     content: Content
     joints: Mapping[str, str]  # of the URDF, by their names in the bag
-    units: Mapping[str, _Unit]
+    units: Mapping[str, Column]
 
     def motion(
         self, states: JointStates, efforts: JointStates, source: str, others: str
@@ -133,38 +132,23 @@ def _of_one(
     return motion
 
 
-class _Unit(NamedTuple):
-    """The unit that positions or torques have in a bag, as it was given; empty: rad or N m."""
+def _split(path: Path, names: NameMap) -> tuple[NameMap, dict[str, Column], str]:
+    """Return names of the bag, units of q and tau, and the topic of the motors, if given.
 
-    name: str
-    factor: float
-
-
-def _split(path: Path, names: NameMap) -> tuple[NameMap, dict[str, _Unit], str]:
-    """Return names of the bag, the units of q and tau, and the topic of the motors, if given.
-
-    `names.joints` is what `--map` gives, such as `q=[deg]` and `theta=motors` among the joints.
+    `names.joints` is what `--map` gives, such as `q=[deg]` and `theta=motors` among the
+    joints.  A unit is a `Column`, whose name is empty if none was given: rad or N m.
 
     Raises:
         BlfDscError: a unit is not known.
     """
     joints = dict(names.joints)
     motors = joints.pop('theta', '')
-    units = {}
-    for kind in ('q', 'tau'):
-        units[kind] = _Unit('', 1.0)
+    units = {'q': Column('', 1.0), 'tau': Column('', 1.0)}
+    for kind in units:
         if given := _BRACKETED.fullmatch(joints.get(kind, '')):
-            units[kind] = _unit(path, given[1], kind)
+            units[kind] = Column(given[1], factor_of(path, given[1], kind))
             del joints[kind]
     return NameMap(names.topics, joints), units, motors
-
-
-def _unit(path: Path, name: str, kind: str) -> _Unit:
-    """Return the unit of q or tau; BlfDscError if it is not known."""
-    try:
-        return _Unit(name, factor_of(name, kind))
-    except BlfDscError as error:
-        raise BlfDscError(f'{path}: {error}') from error
 
 
 def _motors_at(stamp: Stamps, content: Content, joints: Sequence[str]) -> Floats:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings from tables: CSV and text with or without a header, npz, and mat.
+"""Recordings from tables: CSV and text with or without a header, npz, mat, and Parquet.
 
 A table needs the time, and a position and a torque of each joint: see `columns`.  It
 may have the positions of the motors, too.
@@ -30,6 +30,7 @@ from blf_dsc_controller.identification.table_files import Table, open_table
 from blf_dsc_controller.identification.units import split_unit
 from blf_dsc_controller.run import Floats, Stamps
 
+_EXPORTED = ('stamp [ns]', 'received [ns]', 'time [s]')
 _LEAST = 2  # rows
 _BETWEEN = 1.0  # s, least pause between runs in one table
 _MOST_RUNS = 100
@@ -53,7 +54,8 @@ def motion_of_table(
     """
     table = open_table(path)
     others = dict(names.joints)
-    given = {kind: others.pop(kind, '') for kind in KINDS}
+    exported = _exported(table)
+    given = {kind: others.pop(kind, exported.get(kind, '')) for kind in KINDS}
     trunk = tuple(joints) or tree.trunk() or tree.only_chain()
     theirs = NameMap(joints=others).joints_of(trunk)
     columns = choose_columns(path, table.names, given, theirs)
@@ -80,6 +82,15 @@ def motion_of_table(
         currents=columns.has_currents,
     )
     return motion.select(np.isfinite(time))
+
+
+def _exported(table: Table) -> dict[str, str]:
+    """Return what is chosen of a table of `blf_dsc export`; nothing of another one."""
+    if table.names[: len(_EXPORTED)] != _EXPORTED:
+        return {}
+    efforts = table.read([name for name in table.names if name.startswith('effort ')])
+    tau = 'effort *' if np.nan_to_num(efforts).any() else 'torque *'
+    return {'time': _EXPORTED[0], 'q': 'position *', 'tau': tau}
 
 
 def _check_count(path: Path, columns: Columns, arm: Sequence[str]) -> None:

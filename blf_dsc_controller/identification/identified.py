@@ -79,6 +79,7 @@ class Identified(NamedTuple):
     alone: Floats  # (n,) rms errors on the same windows of fits to each joint alone
     distances: Floats  # (n,) at which contacts slide, rad or m; 0: at once
     widths: dict[str, float]  # times the prior's, by group
+    outside: tuple[str, ...]  # joints that were mostly outside of their range, in words
     still: tuple[str, ...]  # joints that did not move
     reversed: tuple[str, ...]  # joints whose efforts had the opposite sign
     lasting: Floats  # (n,) correlation length of the residual, s

@@ -10,6 +10,7 @@ of that of one joint, other zeros and directions of the joints are tried.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from blf_dsc_controller.identification.identified import (
     Score,
 )
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
-from blf_dsc_controller.identification.plausibility import shares
+from blf_dsc_controller.identification.plausibility import outside_range, shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
 from blf_dsc_controller.identification.problems import is_usable, unexplained_joints
 from blf_dsc_controller.identification.recording import Recording
@@ -107,8 +108,15 @@ def identify_arm(
         other = converted(recording, convention)
         return _trained(other, robot, effort, picked_up, find_signs, tell_nobody)
 
+    explained = found.score
+    if found.other_gravity is not None:
+        elsewhere = replace(robot, gravity=tuple(found.other_gravity.tolist()))
+        mounted = _trained(
+            recording, elsewhere, effort, picked_up, find_signs, tell_nobody
+        )
+        explained = mounted.score
     likely = likely_conventions(recording, robot, unexplained.tolist())
-    convention = _better_convention(found, likely, trained_as)
+    convention = _better_convention(explained, likely, trained_as)
     return found._replace(other_convention=convention)
 
 
@@ -151,15 +159,19 @@ def _better_load(found: Identified, trained: _Trained) -> OtherLoad | None:
 
 
 def _better_convention(
-    found: Identified,
+    explained: Score,
     likely: Sequence[Convention],
     trained_as: Callable[[Convention], _Trained],
 ) -> OtherConvention | None:
     """Return the first of likely ones that explains the torques far better, or None."""
     for convention in likely:
         other = trained_as(convention)
-        is_better = _left(other.score) < _BETTER * _left(found.score)
-        if is_better and is_usable(_completed(other, tell_nobody)):
+        is_better = _left(other.score) < _BETTER * _left(explained)
+        if not is_better:
+            continue
+        # zeros that are not needed are left out below, so ranges mean nothing yet
+        completed = _completed(other, tell_nobody)._replace(outside=())
+        if is_usable(completed):
             return _simplest(OtherConvention(convention, other.score), trained_as)
     return None
 
@@ -250,6 +262,7 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
         alone=errors_alone(rows, windows.test, fits),
         distances=selected.distances,
         widths=selected.widths,
+        outside=tuple(outside_range(rows, problem.chain.joints)),
         still=_named(recording.joints, rows.speed < STILL),
         reversed=_named(recording.joints, problem.reversed),
         lasting=final.problem.lasting,

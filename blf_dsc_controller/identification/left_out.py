@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.serial_chain import SerialChain
-from blf_dsc_controller.bags.on_disk import mapped
+from blf_dsc_controller.bags.on_disk import Samples, mapped
 from blf_dsc_controller.identification.sliding import DISTANCES
 from blf_dsc_controller.identification.values import (
     COULOMB,
@@ -164,7 +164,7 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
     return found
 
 
-def transmitted_torques(rows: Rows, values: Floats) -> Floats:
+def transmitted_torques(rows: Rows, values: Floats) -> Samples:
     """Return the torque that each joint transmits to its link, and its rate (N, 2 n)."""
     from scipy.signal import savgol_filter
 

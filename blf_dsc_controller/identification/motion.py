@@ -44,6 +44,8 @@ class Group(NamedTuple):
     @property
     def scaled(self) -> Floats:
         """The values in rad, N m, or m, N."""
+        if (self.factors == 1.0).all():
+            return self.values  # as in `Motion.select`
         return np.asarray(self.values * self.factors)
 
 
@@ -64,6 +66,8 @@ class Motion(NamedTuple):
 
     def select(self, rows: NDArray[np.bool_]) -> Motion:
         """Return the states of some rows (N,)."""
+        if rows.all():
+            return self  # a long motion is not copied
         theta = self.theta
         return self._replace(
             stamp=self.stamp[rows],

@@ -9,12 +9,15 @@ its share is near 0.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.urdf import Joint
+from blf_dsc_controller.identification.recording import TURN
 from blf_dsc_controller.identification.windows import Indices, Rows
-from blf_dsc_controller.run import Floats
+from blf_dsc_controller.run import Floats, joint_units
 
 GRAVITY = (0.4, 1.6)
 """Least and largest share of the URDF's gravity: beyond, it is missing or double."""
@@ -22,6 +25,7 @@ GRAVITY = (0.4, 1.6)
 INERTIA = (0.2, 5.0)
 """Likewise of its inertia, which is asked where gravity is faint: rotors are guesses."""
 
+_TOLERANCE = 0.05  # rad or m, beyond the limits of a joint
 _FAINT = 0.02  # of the torque of the URDF, least part that says anything
 
 
@@ -41,6 +45,26 @@ def shares(rows: Rows, fit: Indices, urdf: Floats, found: Floats) -> Shares:
         _share(_varying(found_gravity), _varying(gravity), size),
         _share(found_inertial, inertial, size),
     )
+
+
+def outside_range(rows: Rows, joints: Sequence[Joint]) -> Iterator[str]:
+    """Yield which joints are mostly outside of their range in the URDF; turns do not count."""
+    positions = rows.over_windows(lambda at: rows.q[at], rows.g)
+    for joint, q in zip(joints, positions.T, strict=True):
+        span = joint.upper - joint.lower
+        if not 0.0 < span < np.inf:
+            continue
+        middle = 0.5 * (joint.lower + joint.upper)
+        off = q - middle
+        if joint.kind != 'prismatic':
+            off -= TURN * np.round(np.median(off) / TURN)
+        is_outside = np.abs(off) > 0.5 * span + _TOLERANCE
+        if 2 * is_outside.sum() > q.size:
+            unit = joint_units(joint.kind).position
+            yield (
+                f'{joint.name} is at {q.min():.3g} to {q.max():.3g} {unit}, but has a range of '
+                f'{joint.lower:.3g} to {joint.upper:.3g}'
+            )
 
 
 def inertial_torques(rows: Rows, windows: Indices, P: Floats) -> tuple[Floats, Floats]:

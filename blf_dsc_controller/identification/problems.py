@@ -15,12 +15,20 @@ from blf_dsc_controller.identification.identified import (
     OtherLoad,
 )
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
+from blf_dsc_controller.identification.values import OFFSET
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _GOOD = 0.02  # likewise, error that is accepted whatever else is possible
 _UNEXPLAINED = 0.2  # of the torque of a joint, error with which its values mean little
 _FAR = 3.0  # times the error of a model of a joint alone: this one is wrong
 _LARGE = 0.1  # of the torque of a joint, error that is a fault ...
+_NOTHING_EXPLAINED = 0.6  # of the torque of a joint, error that is a fault
+_OFFSET = 0.7  # of the torque of a joint, offset that is as large as the rest
+_TENFOLD = 10.0  # change of a mass
+_HEAVY = 0.01  # of all masses, that of a body that is no dummy
+_AGREE = np.log(1.1)  # of factors of gravity and inertia
+_SCALED = np.log(1.3)  # of the same factor, that is asked
 _RELEVANT = 0.02  # ... if it is so much of the largest torque
 
 
@@ -48,6 +56,27 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
             'throughout?'
         )
     yield from _joint_problems(found)
+    yield from _value_problems(found)
+
+
+def verdict_of(found: Identified, effort: str) -> str:
+    """Return whether the result can be used, and up to what."""
+    urdf, _, total = found.score.total
+    left = f'{total:.3g} % of the torque is left on motion held back, {urdf:.3g} % by the URDF'
+    problems = len(list(problems_of(found, effort)))
+    if problems:
+        return f'REFUSED for {problems} reason(s), given below: {left}'
+    agree = abs(np.log(found.inertia / found.gravity)) < _AGREE
+    if agree and abs(np.log(found.gravity)) > _SCALED:
+        return (
+            f'ACCEPTED IF EFFORTS ARE IN N m: gravity and inertia are both {found.gravity:.2g} '
+            "times the URDF's, as with another unit or gain of the torques: --gains would "
+            f'correct it. {left}'
+        )
+    return (
+        f'ACCEPTED: {left}. Masses and friction are known up to a common factor of the torque '
+        'sensors'
+    )
 
 
 def _load_problem(found: Identified, load: OtherLoad) -> str:
@@ -126,6 +155,46 @@ def _joint_problems(found: Identified) -> Iterator[str]:
             f'of this joint alone leaves {100.0 * alone / score.torque[i]:.1f} %. Do the sign and '
             'the unit of its effort, and its axis in the URDF, agree with those of other joints?'
         )
+
+
+def _value_problems(found: Identified) -> Iterator[str]:
+    """Yield values that no recording of this arm should give."""
+    if found.outside:
+        yield (
+            f'OUTSIDE OF ITS RANGE: {"; ".join(found.outside)} in the URDF. Correct zero and '
+            'direction, or the limits'
+        )
+    score = found.score
+    largest = score.torque.max()
+    for i in unexplained_joints(found):
+        share = score.errors[2, i] / score.torque[i]
+        if share > _NOTHING_EXPLAINED and score.torque[i] > IDLE * largest:
+            yield (
+                f'{found.joints[i]} IS NOT EXPLAINED: {100.0 * share:.0f} % of its torque is left. '
+                'Are its effort and that of another joint exchanged?'
+            )
+    offsets = np.abs(found.parts.terms[OFFSET])
+    is_large = (offsets > _OFFSET * score.torque) & (score.torque > _RELEVANT * largest)
+    for i in np.flatnonzero(is_large):
+        yield (
+            f'{found.joints[i]} HAS AN OFFSET OF {offsets[i]:.2g} beside a torque of '
+            f'{score.torque[i]:.2g} (rms). Calibrate its sensor; a spring or counterbalance, '
+            'which is not in the model, looks like this, too'
+        )
+    masses = found.parts.bodies[:, 0]
+    halves = TWO_SIDED * found.deviations.bodies[:, 0]
+    before = np.array([joint.inertia[0] for joint in found.chain.joints])
+    for joint, mass, half, old in zip(
+        found.chain.joints, masses, halves, before, strict=True
+    ):
+        is_other = not old / _TENFOLD < mass < _TENFOLD * old
+        is_unknown = half > max(mass, old)
+        if old > _HEAVY * before.sum() and (is_other or is_unknown):
+            yield (
+                f'THE MASS OF {joint.link} IS {mass:.3g} +- {half:.2g} kg instead of {old:.3g}: '
+                'record a motion that does not repeat and has other postures, or correct what '
+                'else is odd here'
+            )
 
 
 def unexplained_joints(found: Identified) -> NDArray[np.intp]:

@@ -64,23 +64,26 @@ def resampled(
     """
     groups = [q, torque] if motors is None else [q, torque, motors]
     order = _order(stamp, groups)
-    grid = _grid_of(stamp[order])
-    q = q[order]
+    if not np.array_equal(order, np.arange(stamp.size)):
+        stamp, q, torque = stamp[order], q[order], torque[order]
+        motors = None if motors is None else motors[order]
+    grid = _grid_of(stamp)
     turns = _turns(q, turning)
     if turns.any():
+        q = q + TURN * turns
         names = ', '.join(np.array(joints)[turns.any(axis=0)])
         source = f'{source} (positions of {names} are wrapped: full turns added)'
     recording = Recording(
         joints=joints,
         period=grid.period,
-        q=grid.evenly(q + TURN * turns),
-        torque=grid.evenly(torque[order]),
+        q=grid.evenly(q),
+        torque=grid.evenly(torque),
         gap=grid.gap,
         source=source,
     )
     if motors is None:
         return recording
-    return recording._replace(twist=grid.evenly(_twist(q, motors[order], turning)))
+    return recording._replace(twist=grid.evenly(_twist(q, motors, turning)))
 
 
 def _order(stamp: Stamps, groups: Sequence[Floats]) -> NDArray[np.intp]:
@@ -96,8 +99,11 @@ def _turns(q: Floats, turning: NDArray[np.bool_]) -> Floats:
     From one state to the next, a joint turns by less than half a turn.  A larger step is
     the end of the encoder's range.
     """
-    steps = np.diff(q, axis=0, prepend=q[:1])
-    return np.asarray(np.cumsum(-np.round(steps / TURN) * turning, axis=0))
+    turns = np.diff(q, axis=0, prepend=q[:1])
+    turns /= -TURN
+    np.round(turns, out=turns)
+    turns *= turning
+    return np.cumsum(turns, axis=0, out=turns)
 
 
 class _Grid(NamedTuple):

@@ -9,6 +9,7 @@ used, never the part held back for the score.  Bounds are ignored here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,9 @@ from blf_dsc_controller.run import Floats
 _WORTH = 0.01
 _WORTH_OF_TERM = 0.003  # ... and by an optional term
 _WIDTHS = (1.0, 3.0, 10.0, 30.0)  # of the prior
+_OF_REPEATED = 2  # of them, if all folds have the same motion: they reward overfitting
+_SAME = 0.1  # of the standard deviations of positions and speeds, from other folds
+_TINY = 1e-9
 _PARTS = 2 * FOLDS  # for optional terms
 
 
@@ -45,7 +49,8 @@ def select(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Selected:
     folds = found.folds.sum(axis=1, keepdims=True)
     prior = full.only(_worthwhile(found._replace(folds=folds), full))
     pairs = folds[::2] + folds[1::2]
-    widths = prior_widths(found._replace(folds=pairs), prior)
+    tried = _WIDTHS[:_OF_REPEATED] if repeats(rows, fit) else _WIDTHS
+    widths = prior_widths(found._replace(folds=pairs), prior, tried)
     widened = prior.widened(_factors(prior, widths))
     return Selected(distances, rows, widened, widths, found)
 
@@ -95,7 +100,25 @@ def _worthwhile(found: Regression, prior: Prior) -> list[Entry]:
     return kept
 
 
-def prior_widths(found: Regression, prior: Prior) -> dict[str, float]:
+def repeats(rows: Rows, fit: Indices) -> bool:
+    """Return whether most states of each fifth of the motion are also in the others."""
+    from scipy.spatial import cKDTree
+
+    states = np.hstack([rows.over_windows(lambda at: rows.q[at], rows.g), rows.speeds])[
+        fit
+    ]
+    states = states / np.maximum(states.std(axis=0), _TINY)
+    folds = np.array_split(states, FOLDS)
+    distances = []
+    for k, fold in enumerate(folds):
+        others = np.concatenate([*folds[:k], *folds[k + 1 :]])
+        distances.append(cKDTree(others).query(fold)[0])
+    return bool(np.median(np.concatenate(distances)) < _SAME)
+
+
+def prior_widths(
+    found: Regression, prior: Prior, tried: Sequence[float] = _WIDTHS
+) -> dict[str, float]:
     """Return the factor of each group's width, raised as long as that predicts better.
 
     Every fold must agree: a disturbance that lasts for a part of the recording looks
@@ -105,7 +128,7 @@ def prior_widths(found: Regression, prior: Prior) -> dict[str, float]:
     widths = dict.fromkeys(prior.groups, 1.0)
     least = cross_validated(found, used).sum(axis=1)
     for group in prior.groups:
-        for width in _WIDTHS[1:]:
+        for width in tried[1:]:
             wider = widths | {group: width}
             errors = cross_validated(found, used * _factors(prior, wider)).sum(axis=1)
             is_worth_it = errors.sum() < (1.0 - _WORTH) * least.sum()

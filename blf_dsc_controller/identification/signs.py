@@ -24,6 +24,7 @@ from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.run import Floats
 
 _AS_GOOD = 1.02  # times the least cost
+_SMALL = 0.03  # of the largest torque, whose sign only friction shows
 _MOST_UNCLEAR = 12  # joints whose signs are combined
 _MOST = 16  # combinations with physical bodies
 
@@ -36,7 +37,7 @@ def likely_signs(alone: Alone, G: Floats, prior: Prior) -> tuple[Signs, float]:
     Of signs that are as good, those of most joints are alike, and as recorded.
     """
     fit = _Fit(alone, G, prior)
-    combinations = np.array(list(_combinations(alone.friction)))
+    combinations = np.array(list(_combinations(alone)))
     bounds = fit.bounds(combinations)
     found: list[tuple[float, Signs]] = []
     for k in np.argsort(bounds)[:_MOST]:
@@ -50,9 +51,14 @@ def likely_signs(alone: Alone, G: Floats, prior: Prior) -> tuple[Signs, float]:
     return signs, cost
 
 
-def _combinations(friction: Floats) -> Iterator[Signs]:
-    """Yield the signs that friction leaves open, first the recorded ones."""
-    unclear = np.flatnonzero(friction == 0.0)[:_MOST_UNCLEAR]
+def _combinations(alone: Alone) -> Iterator[Signs]:
+    """Yield the signs that friction leaves open, first the recorded ones.
+
+    A small torque keeps its sign: the fit of the whole arm would hardly change with it.
+    """
+    friction = alone.friction
+    is_small = alone.torque < _SMALL * alone.torque.max()
+    unclear = np.flatnonzero((friction == 0.0) & ~is_small)[:_MOST_UNCLEAR]
     signs = np.where(friction < 0.0, -1.0, 1.0)
     for chosen in product((1.0, -1.0), repeat=unclear.size):
         each = signs.copy()

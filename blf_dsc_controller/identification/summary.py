@@ -67,9 +67,9 @@ _LEFT_OUT = (
 )  # of KINDS
 _REMEDIES = {
     'gain': (
-        ', but hold less often than they say. MASSES AND FRICTION ARE KNOWN UP TO THESE GAINS '
-        'ONLY: what all gains have in common cannot be known from torques. Calibrate the sensors, '
-        'as with a known weight'
+        ', but cover fewer than 95 % of the true values. MASSES AND FRICTION ARE KNOWN UP TO '
+        'THESE GAINS ONLY: what all gains have in common cannot be known from torques. Calibrate '
+        'the sensors, as with a known weight'
     ),
     'elasticity': '; positions of motors and links, --map theta=, would show their stiffness',
 }
@@ -227,7 +227,9 @@ def base_table(found: Identified) -> Iterator[str]:
         old = _beside(half, before[k], _ROUNDING)
         new = _beside(half, after[k], _NOTHING)
         unseen = posterior[k] > UNSEEN * prior[k]
-        mark = '  NOT SHOWN by this recording: from the URDF' if unseen else ''
+        is_same = abs(after[k] - before[k]) < 0.1 * half
+        source = 'from the URDF' if is_same else 'hardly more than the URDF'
+        mark = f'  NOT SHOWN by this recording: {source}' if unseen else ''
         yield f'{old:10.4g} -> {new:10.4g} +- {half:<8.2g}  {name}{mark}'
 
 

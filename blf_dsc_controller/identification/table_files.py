@@ -2,7 +2,8 @@
 """Files of tables: names of columns, and values that are read when they are asked for.
 
 The columns of npz and mat files are their vectors, and the columns of their matrices, each
-named after its matrix and its index.  Only the longest columns are kept.
+named after its matrix and its index.  Only the longest columns are kept.  Lists in the cells
+of Parquet and Feather files are rows of such matrices.
 
 Files are not trusted: what they unpack to has a limit.
 """
@@ -20,6 +21,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.identification.text_tables import text_table
 from blf_dsc_controller.run import Floats
 
@@ -212,12 +214,39 @@ def _numbers_in(
             yield prefix + name, values
 
 
+def _arrow(path: Path) -> _Arrays:
+    arrow = import_extra('pyarrow', 'parquet', f'reading {path.name}')
+    dataset = import_extra('pyarrow.dataset', 'parquet', f'reading {path.name}')
+    table = dataset.dataset(path, format=path.suffix.lower()[1:])
+    rows = table.count_rows()
+
+    def load(name: str) -> Any:
+        _check_size(path, _size_of(shapes[name]))
+        column = table.to_table(columns=[name]).column(0).combine_chunks()
+        if len(shapes[name]) > 1:
+            column = column.flatten()
+        return column.to_numpy(zero_copy_only=False).reshape(shapes[name])
+
+    shapes: dict[str, tuple[int, ...]] = {}
+    for field in table.schema:
+        number = getattr(field.type, 'value_type', field.type)
+        if not (arrow.types.is_floating(number) or arrow.types.is_integer(number)):
+            continue
+        shapes[field.name] = (rows,)
+        if number != field.type:
+            first = table.head(1, columns=[field.name]).column(0)
+            shapes[field.name] = rows, len(first[0])
+    return _Arrays(shapes, load)
+
+
 _TABLES: dict[str, Callable[[Path], Table]] = {
     '.csv': text_table,
     '.tsv': text_table,
     '.txt': text_table,
     '.npz': _npz,
     '.mat': _mat,
+    '.parquet': _arrow,
+    '.feather': _arrow,
 }
 
 TABLES = tuple(_TABLES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from math import pi
+from pathlib import Path
 from typing import NamedTuple
 
 from blf_dsc_controller.errors import BlfDscError
@@ -85,7 +86,7 @@ def _is_unit(word: str) -> bool:
     )
 
 
-def factor_of(unit: str, kind: str) -> float:
+def factor_of(path: Path, unit: str, kind: str) -> float:
     """Return the unit of time, q or tau in s, rad (m), N m (N), A or %; empty: 1.
 
     Raises:
@@ -96,8 +97,8 @@ def factor_of(unit: str, kind: str) -> float:
     factor = _OF[kind].get(_normal(unit))
     if factor is None:
         raise BlfDscError(
-            f'the unit {unit!r} of {kind} is not known; expected {_EXPECTED[kind]}: convert the '
-            'values, or correct the name of the column'
+            f'{path}: the unit {unit!r} of {kind} is not known; expected {_EXPECTED[kind]}: '
+            'convert the values, or correct the name of the column'
         )
     return factor
 

@@ -21,6 +21,9 @@ So gains are those relative to their mean.  With a spread s of n gains, their me
 unknown by s / sqrt(n), and so is a common factor of all values x:  t^2 s^2 / n  x x^T  is
 added to the covariance, where t is how much wider a 95 % interval is if the spread is
 that of n gains only (Student, The probable error of a mean, 1908).
+
+Load friction is one value for gears that drive and that are driven; the difference looks
+like another such factor.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ from blf_dsc_controller.identification.regression import (
     correlation_length,
     to_z,
 )
-from blf_dsc_controller.identification.values import parts
+from blf_dsc_controller.identification.values import LOAD_FRICTION, parts
 from blf_dsc_controller.identification.windows import HOP, Indices
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
@@ -51,6 +54,7 @@ _MOST_ROUNDS = 10  # ... if gains still change ...
 _AGREE = 0.01  # ... by more than this
 _STEPS = 3  # in each, of sizes
 _QUANTILE = 0.975  # that half of a 95 % interval reaches
+_LOST = 0.6  # of the mean load friction: gears lose more driving than driven
 _FLOOR = 1e-4  # of a joint's torque, least residual
 
 
@@ -74,7 +78,8 @@ def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
     scaled = fit.values.copy()
     parts(scaled).delay[:] = 0.0
     factor = _deviation_of_mean(spread, problem.rows.speed.size)
-    covariance += factor**2 * np.outer(scaled, scaled)
+    lost = _LOST * float(parts(fit.values).terms[LOAD_FRICTION].mean())
+    covariance += (factor**2 + lost**2) * np.outer(scaled, scaled)
     return Doubt(covariance, _torques(problem, columns, z[k:]))
 
 

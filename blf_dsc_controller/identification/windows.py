@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fadings, slidings
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
-from blf_dsc_controller.bags.on_disk import BLOCK, blocks_of, mapped, on_disk
+from blf_dsc_controller.bags.on_disk import BLOCK, Samples, blocks_of, mapped
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.recording import (
@@ -95,7 +95,7 @@ class Rows(NamedTuple):
     """
 
     time: Floats  # (R,) of their centres, s
-    inertial: Floats  # (R, n, p) columns of P
+    inertial: Samples  # (R, n, p) columns of P
     # (R, n) by name, one for each of COLUMNS: of each joint, zero for the others
     columns: Mapping[str, Floats]
     coupling: Floats  # (R, 2, 3) columns of COUPLING for the last two joints
@@ -105,15 +105,15 @@ class Rows(NamedTuple):
     clipped: NDArray[np.bool_]  # (R, n) whether a torque in the window is clipped
     speeds: Floats  # (R, n) mean speed in each window, rad/s or m/s
     speed: Floats  # (n,) 95th percentile of each joint's speed, rad/s or m/s
-    q: Floats  # (N, n) smoothed positions at all samples
-    dq: Floats  # (N, n) their velocities
-    torque: Floats  # (N, n) likewise
+    q: Samples  # (N, n) smoothed positions at all samples
+    dq: Samples  # (N, n) their velocities
+    torque: Samples | Floats  # (N, n) likewise
     g: Floats  # (L,) with sum 1
     slope: Floats  # (L,) g' in 1/s, scaled likewise
     starts: np.ndarray  # (R,) first sample of each window
     period: float  # s
-    sliding: Floats  # (N, n) s
-    gravity: Floats  # (N / every, n, p) regressor of the torque of gravity
+    sliding: Samples  # (N, n) s
+    gravity: Samples  # (N / every, n, p) regressor of the torque of gravity
     every: int  # samples between its positions
 
     @property
@@ -172,7 +172,7 @@ class Rows(NamedTuple):
     @property
     def largest_torque(self) -> Floats:
         """Largest torque of each joint (n,) [N m or N]."""
-        return np.asarray(np.abs(self.torque).max(axis=0))
+        return np.asarray(np.abs(self.torque[:]).max(axis=0))
 
     def with_torque(self, torque: OfSamples) -> Rows:
         """Return the rows with other torques."""
@@ -199,7 +199,7 @@ class Rows(NamedTuple):
 
         They have no load friction: `with_load` adds it.
         """
-        sliding = on_disk(self._sliding(distances), self.speed.size)
+        sliding = Samples(self._sliding(distances), self.speed.size)
         slid = self._replace(sliding=sliding)
         columns = {
             **self.columns,
@@ -298,7 +298,7 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
 def _filled(rows: Rows, model: SerialChain, distances: Floats) -> Rows:
     """Return rows that have no columns yet with all but load friction."""
     dq = rows.dq
-    inertial = on_disk(_inertial(rows, model), rows.speed.size, model.p)
+    inertial = Samples(_inertial(rows, model), rows.speed.size, model.p)
     rows = rows._replace(inertial=inertial)
     rows = rows.with_sliding(distances)
     rows = rows.with_column('viscous', lambda at: dq[at])
@@ -363,9 +363,10 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
         )
     q, dq = _smoothed(recording)
     every = max(1, round(_GRAVITY / h))
+    nothing = Samples(iter(()))
     return Rows(
         time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
-        inertial=np.empty(0),
+        inertial=nothing,
         columns={},  # those of `with_sliding` and `with_column`
         coupling=np.zeros((starts.size, min(n, 2), COUPLING)),
         load=np.zeros((model.p, LOAD)),
@@ -381,8 +382,8 @@ def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
         slope=slope,
         starts=starts,
         period=h,
-        sliding=np.empty(0),
-        gravity=on_disk(_at_rest(q[::every], model), n, model.p),
+        sliding=nothing,
+        gravity=Samples(_at_rest(q[::every], model), n, model.p),
         every=every,
     )
 
@@ -396,7 +397,7 @@ def _near_gap(recording: Recording) -> NDArray[np.bool_]:
     return np.asarray(found, dtype=bool)
 
 
-def _smoothed(recording: Recording) -> tuple[Floats, Floats]:
+def _smoothed(recording: Recording) -> tuple[Samples, Samples]:
     """Return smoothed positions and velocities (N, n)."""
     from scipy.signal import savgol_filter
 
@@ -420,7 +421,7 @@ def smoothing_width(h: float) -> int:
     return 2 * max(2, round(0.5 * SMOOTHING / h)) + 1
 
 
-def _fast(dq: Floats, chosen: NDArray[np.bool_]) -> Floats:
+def _fast(dq: Samples, chosen: NDArray[np.bool_]) -> Floats:
     """Return the 95th percentile of each joint's speed (n,) in the chosen samples."""
     return np.percentile(np.abs(dq[chosen]), 95.0, axis=0, overwrite_input=True)
 
