@@ -13,7 +13,6 @@ import pytest
 from plants import ARM
 from random_arm import (
     ARMS,
-    GRAVITY,
     PANDA,
     PANDA_CHAIN,
     PANDA_TEXT,
@@ -26,9 +25,8 @@ from blf_dsc_controller.arms.base_parameters import (
     base_parameters,
 )
 from blf_dsc_controller.arms.inertia import inertia_of
-from blf_dsc_controller.arms.model import arm_model, inertia_matrices, regressors_at
+from blf_dsc_controller.arms.model import arm_model, inertia_matrices
 from blf_dsc_controller.arms.serial_chain import serial_chain
-from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import frames, read_chain
 from sim_plant.arm import PointMassArm, rigid_arm, rigid_bodies
 
@@ -134,42 +132,7 @@ def test_regressors_and_accelerations_agree_with_pinocchio(name):
     same(ddq, pinocchio.aba(*case.theirs, dq, v), 1e-10)
 
 
-def test_payload_at_the_tip_is_that_of_the_plant_and_of_the_base_parameters():
-    """A truth that differs from the URDF: links 20 % heavier, 2 kg at the tip."""
-    case = Case('panda')
-    inertias = 1.2 * case.chain.inertias
-    for i, heavier in enumerate(inertias, start=1):
-        case.model.inertias[i] = pinocchio.Inertia.FromDynamicParameters(heavier)
-    point = case.chain.tip_placement[:3, 3]
-    case.model.inertias[7] += pinocchio.Inertia(2.0, point, np.zeros((3, 3)))
-    base = base_parameters(case.chain, case.gravity)
-    arm = rigid_arm(rigid_bodies(case.chain, case.gravity, inertias, case.rotors, base))
-    ddq, H = np.zeros(7), np.zeros((7, base.model.p))
-    arm.accelerate(2.0, case.q, case.dq, case.v, ddq)
-    same(ddq, pinocchio.aba(*case.theirs, case.dq, case.v), 1e-10)
-    base.model.regressor(case.q, case.dq, case.dq, ddq, H)
-    same(H @ (base.of(inertias, case.rotors) + 2.0 * base.load), case.v, 1e-9)
-
-
 # The two-link arm.
-
-
-def test_urdf_of_two_links_is_the_same_arm():
-    """As a chain, whose regressors agree with pinocchio's: Property III for any v and a."""
-    lengths, masses = (1.1, 0.7), (0.6, 0.45)
-    chain = read_chain(urdf(('a', 'b"<&'), lengths, masses), '', 'tip', ('a', 'b"<&'))
-    arm = PointMassArm(*lengths, *masses, g=9.81)
-    ours = arm_model(l1=arm.l1, gravity=arm.g)
-    P = np.empty(3)
-    arm.fill_parameters(0.0, P)
-    theirs = serial_chain(chain, GRAVITY)
-    phi = np.column_stack((chain.inertias, np.zeros(2))).ravel()
-    states = np.random.default_rng(0).normal(size=(4, 20, 2))
-    found = regressors_at(ours, *states) @ P
-    expected = regressors_at(theirs, *states) @ phi
-    # points have 1e-9 kg m^2 in it
-    np.testing.assert_allclose(found, expected, atol=1e-7)
-    np.testing.assert_allclose(frames(chain, np.zeros(2))[-1][:3, 3], (1.8, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(

@@ -58,10 +58,6 @@ def shown(path, width=1400, height=900):
         assert log == []
 
 
-def ranges(page):
-    return page.evaluate(f'Array.from({PLOTS}).map(p => p.layout.xaxis.range)')
-
-
 @pytest.mark.parametrize('name', ['one', 'both'])
 @pytest.mark.parametrize('width', [400, 1400])
 def test_every_panel_is_drawn_and_fits_the_window(pages, name, width):
@@ -86,24 +82,6 @@ def test_every_panel_is_drawn_and_fits_the_window(pages, name, width):
         assert covered == []
         assert page.evaluate('performance.getEntriesByType("resource").length') == 0
         page.screenshot(path=SHOTS / f'report_{name}_{width}.png', full_page=True)
-
-
-def test_dragging_zooms_all_time_panels(pages):
-    with shown(pages / 'one.html') as page:
-        assert all(limits == pytest.approx([0.0, 4.0]) for limits in ranges(page))
-        box = page.locator('.nsewdrag').first.bounding_box()
-        middle = box['y'] + box['height'] / 2
-        page.mouse.move(box['x'] + box['width'] * 0.25, middle)
-        page.mouse.down()
-        page.mouse.move(box['x'] + box['width'] * 0.5, middle, steps=5)
-        page.mouse.up()
-        page.wait_for_function(
-            f'Array.from({PLOTS}).every(p => p.layout.xaxis.range[1] < 2.5)'
-        )
-        for low, high in ranges(page):
-            assert low == pytest.approx(1.0, abs=0.05)
-            assert high == pytest.approx(2.0, abs=0.05)
-        page.screenshot(path=SHOTS / 'report_zoomed.png')
 
 
 GRIDLINES = (

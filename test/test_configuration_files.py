@@ -18,23 +18,23 @@ from blf_dsc_controller import (
     ConfigurationError,
     ControllerConfig,
     PlantConfig,
+    change,
     load_loop,
     share_folder,
 )
 from blf_dsc_controller.configuration.nodes import (
-    LoopConfig,
     dump,
     known_names,
     load,
     locate,
     read,
 )
-from blf_dsc_controller.configuration.schema import build, flatten
-from blf_dsc_controller.configuration.side_nodes import RecorderConfig
+from blf_dsc_controller.configuration.schema import flatten
 
-CHANGED = LoopConfig(
-    build(
-        PlantConfig,
+USUAL = load_loop('recommended')
+CHANGED = USUAL._replace(
+    plant=change(
+        USUAL.plant,
         {
             'sensor.position_noise': 1e-5,
             'arm.l1': 1 / 3,
@@ -42,15 +42,15 @@ CHANGED = LoopConfig(
             'mode': 'lockstep',
         },
     ),
-    build(
-        ControllerConfig,
+    controller=change(
+        USUAL.controller,
         {
             'two_link.surface_gain': [1e300, 12345.678901234567],
             'two_link.bias': False,
         },
     ),
-    build(
-        RecorderConfig, {'output': "it's a 'bag': #1", 'topics': ['/clock', '~/größe']}
+    recorder=change(
+        USUAL.recorder, {'output': "it's a 'bag': #1", 'topics': ['/clock', '~/größe']}
     ),
 )
 COMMITTED = Path(__file__).parents[1] / 'doc' / 'parameters.md'

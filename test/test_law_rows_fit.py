@@ -1,20 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identities of what rows say: load and intervals by numpy, changes of the arm by scipy."""
+"""The load that rows say, and its intervals, as numpy finds them."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from law_part import part
 
 from blf_dsc_controller.law import innovation, weighing
-from blf_dsc_controller.numerics.algebra import cholesky_factor
 
 N, M, P = 2, 5, 3  # joints, entries of theta; base parameters, the others are friction
 LOAD = weighing.LOAD
 SINCE = LOAD + N
 K = M + 2 * N  # theta, breakaway torques, shares of the torque that are lost
-PERIOD = 0.01  # s, of the rows
 UNSURE = np.repeat(
     (0.3, 0.1), N
 )  # deviations of breakaway torques [N m], and of shares
@@ -80,23 +77,3 @@ def test_load_is_that_of_joint_least_squares_with_all_priors():
     J = np.column_stack((-centre, np.eye(3))) / mass
     deviation = np.sqrt(np.append(C[0, 0], np.diag(J @ C @ J.T)))
     np.testing.assert_allclose(state.load, [mass, *centre, *deviation], rtol=1e-5)
-
-
-def test_square_of_an_innovation_is_that_of_its_covariance():
-    """It is s^2 on average, whatever is known of theta."""
-    noise = 0.5
-    a = noise * innovation.CORRELATION / PERIOD
-    squares = []
-    for count in random.integers(1, 40, 1000):
-        before = random.normal(size=(count, M))
-        A = before.T @ before + a * np.eye(M)
-        theta = random.multivariate_normal(np.zeros(M), a * np.linalg.inv(A))
-        X = random.normal(size=(N, M))
-        u = X @ theta + np.sqrt(noise) * random.normal(size=N)
-        S = noise * np.eye(N) + a * X @ np.linalg.inv(A) @ X.T
-        expected = noise * u @ np.linalg.solve(S, u) / N
-        cholesky_factor(A)
-        square = innovation.normalized_square(X, u, A, PERIOD, np.zeros((N, N)))
-        assert square == pytest.approx(expected, rel=1e-9)
-        squares.append(square / noise)
-    assert np.mean(squares) == pytest.approx(1.0, abs=0.1)

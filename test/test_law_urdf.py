@@ -272,28 +272,6 @@ def test_error_of_the_guess_is_between_no_rotor_and_the_guess(evidence, share):
     )
 
 
-@pytest.mark.parametrize(
-    ('asked', 'work', 'kept'),
-    [
-        (-0.5, 1.0, True),
-        (-1.9, 1.0, True),
-        (-2.1, 1.0, False),
-        (1.0, 1.0, True),
-        (1.0, -1.0, False),
-        (-1.0, -1.0, False),
-    ],
-)
-def test_half_oscillation_that_no_drive_explains_is_forgotten(asked, work, kept):
-    """As pushes are: they ask for more than a drive can lack, or move it against its torque."""
-    law, swing = swinging_panda(199)
-    counted = law.state.rotors.sums[:2].copy()
-    half = 1e6 * np.array([asked * law.settings.rotors.rotor, np.full(7, work)])
-    law.state.rotors.sums[2:4] = half
-    swing(199, 208)  # past the next reversal of the acceleration
-    added = law.state.rotors.sums[:2] - counted
-    np.testing.assert_allclose(added, half if kept else 0.0 * half, atol=1.0)
-
-
 @pytest.mark.parametrize('later', [-0.01, 0.0, 0.03, 0.06])
 @pytest.mark.parametrize('prefix', ['', 'without.'])
 def test_push_is_not_taken_for_light_drives(prefix, later):

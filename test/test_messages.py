@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from blf_dsc_controller.messages.codecs import (
-    Float64MultiArrayDecoder,
     Float64MultiArrayEncoder,
     JointStateDecoder,
     JointStateEncoder,
@@ -146,20 +145,3 @@ def test_bad_message_is_rejected_and_does_not_affect_the_next(raw, error, words)
         decoder.decode(raw)
     assert decoder.position.tolist() == [1, 2]
     assert decoder.decode(GOOD) == STAMP
-
-
-@pytest.mark.parametrize('warm', [False, True])
-@pytest.mark.parametrize(
-    ('create', 'raw'),
-    [
-        (lambda: JointStateDecoder('ab'), GOOD),
-        (lambda: Float64MultiArrayDecoder(2), multi_array([1, 2])),
-    ],
-)
-def test_every_truncation_is_rejected(create, raw, warm):
-    decoder = create()
-    for length in range(len(raw)):
-        if warm:
-            decoder.decode(raw)
-        with pytest.raises(MessageError, match='is cut off'):
-            decoder.decode(raw[:length])

@@ -7,13 +7,11 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from scipy import stats
 
 from benchmark.studies import path_of
 from blf_dsc_controller import ConfigurationError, load_study, run_chunk, simulate
 from blf_dsc_controller.law.samples import sample_columns
-from blf_dsc_controller.studies.distributions import parse
 from blf_dsc_controller.studies.monte_carlo import (
     another_motion,
     draw,
@@ -73,41 +71,28 @@ def whole(a_study):
     return run_chunk(a_study, 0, a_study.settings.runs)
 
 
-FRACTIONS = st.floats(0.0, 1.0, exclude_max=True)
-
-
-@pytest.mark.parametrize(
-    ('text', 'reference'),
-    [
-        ('uniform(-2, 3)', ('uniform', -2, 5)),
-        ('loguniform(0.01, 10)', ('loguniform', 0.01, 10)),
-    ],
-)
-@given(u=FRACTIONS)
-def test_distributions_match_scipy(text, reference, u):
-    from scipy import stats  # slow
-
-    name, *values = reference
-    reference = getattr(stats, name)(*values)
-    distribution = parse(text, float)
-    assert distribution.at(u) == pytest.approx(reference.ppf(u), rel=1e-9, abs=1e-9)
-    low, high = distribution.extremes
-    assert low <= distribution.at(u) <= high
-
-
-def test_values_are_as_frequent_as_stated():
-    draws = np.arange(1000) / 1000
-    for text in ('integers(-1, 3)', 'choice(-1, 0, 1, 2, 3)'):
-        values = [parse(text, int).at(u) for u in draws]
-        assert [values.count(i) for i in range(-1, 4)] == [200] * 5
-    maybe = parse('maybe(0.3, 1, 2)', float)
-    values = np.array([maybe.at(u) for u in draws])
-    assert (values == 0.0).sum() == 700
-    assert 1.0 <= values[values > 0.0].min() < values.max() < 2.0
-    assert values[values > 0.0].mean() == pytest.approx(1.5, abs=0.01)
-    assert 0.0 in maybe.extremes
-    assert parse('uniform(0.5, 0.5)', float).at(0.9) == 0.5
-    assert parse('choice(brake)', str).at(0.9) == 'brake'
+def test_values_are_as_frequent_as_stated(tmp_path):
+    text = STUDY.replace('payload: uniform(0.0, 0.2)', 'payload: maybe(0.3, 0.1, 0.2)')
+    a_study = study(tmp_path, LOOP + text)
+    drawn = [draw(a_study, run) for run in range(1000)]
+    mass, noise, delay, sensor, payload = (
+        np.array([values[f'plant.{name}'] for values in drawn])
+        for name in (
+            'arm.m2',
+            'sensor.position_noise',
+            'actuator.delay',
+            'sensor.velocity',
+            'events.payload.1',
+        )
+    )
+    assert stats.kstest(mass, stats.uniform(0.3, 0.4).cdf).pvalue > 0.01
+    assert stats.kstest(noise, stats.loguniform(1e-6, 2e-5).cdf).pvalue > 0.01
+    for values, choices in ((delay, range(4)), (sensor, ('measured', 'differenced'))):
+        counts = [np.count_nonzero(values == each) for each in choices]
+        assert stats.chisquare(counts).pvalue > 0.01
+    loads = payload[payload > 0.0]
+    assert loads.size == pytest.approx(300, abs=45)
+    assert stats.kstest(loads, stats.uniform(0.1, 0.1).cdf).pvalue > 0.01
 
 
 def test_all_problems_are_named_at_once(tmp_path):

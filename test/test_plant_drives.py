@@ -7,10 +7,8 @@ Its encoders and drives.
 from __future__ import annotations
 
 import numpy as np
-import pinocchio
 import pytest
 from plants import PERIOD, QUIET, commands, plant
-from random_arm import CONFIG
 
 from blf_dsc_controller import PlantConfig
 from blf_dsc_controller.configuration.schema import build
@@ -28,33 +26,6 @@ def panda(given):
 
 def panda_config(given):
     return build(PlantConfig, PANDA | given)
-
-
-def waited(plant, samples):
-    """Positions after some samples without a command."""
-    for _ in range(samples):
-        plant.step(np.zeros(7))
-    return plant.measure()[:7]
-
-
-def test_drives_with_another_model_let_the_arm_sag_by_the_difference():
-    plant = panda(HELD | NO_FRICTION | {'drive.mass_factor': 0.9})
-    model = pinocchio.buildModelFromXML((CONFIG / 'panda.urdf').read_text())
-    q = np.append(POSITION, np.zeros(model.nq - 7))
-    G = pinocchio.computeGeneralizedGravity(model, model.createData(), q)[:7]
-    np.testing.assert_allclose(plant.measure()[14:], 0.9 * G, atol=1e-6)
-    assert np.abs(waited(plant, 100) - POSITION).max() > 1e-3
-
-
-@pytest.mark.parametrize(('payload', 'effort'), [(0.0, 20.0), (2.0, 30.0)])
-def test_drives_hold_the_arm_and_a_told_payload_without_any_command(payload, effort):
-    """The effort shows it if it is the whole."""
-    loaded = {'robot.drive_payload': payload, 'load.payload': payload}
-    plant = panda(HELD | NO_FRICTION | loaded)
-    np.testing.assert_allclose(waited(plant, 500), POSITION, atol=1e-9)
-    assert np.abs(plant.measure()[14:]).max() > effort
-    relative = panda(HELD | NO_FRICTION | loaded | {'robot.effort': 'commanded'})
-    assert not relative.measure()[14:].any()
 
 
 @pytest.mark.parametrize(

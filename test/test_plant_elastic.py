@@ -9,9 +9,6 @@ import pytest
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 import mujoco
-import pinocchio
-from random_arm import PANDA as JOINTS
-from random_arm import PANDA_TEXT, pinocchio_model
 from scipy.integrate import solve_ivp
 
 from blf_dsc_controller import PlantConfig
@@ -201,38 +198,6 @@ def panda(**changes):
     return build(PlantConfig, PANDA | given)
 
 
-def energy_of(model, config, q, dq, motors):
-    """Return the energy [J] of links, motors and springs by pinocchio."""
-    data = model.createData()
-    pinocchio.computeKineticEnergy(model, data, q, dq)
-    pinocchio.computePotentialEnergy(model, data, q)
-    theta, dtheta = motors
-    twist, B = theta - q, np.array(config.truth.rotor_inertia)
-    spring = np.array(config.joint.stiffness) @ twist**2
-    return data.kinetic_energy + data.potential_energy + 0.5 * (spring + B @ dtheta**2)
-
-
-def test_energy_is_kept_without_damping_friction_and_torque():
-    """For 5 s, in which the arm falls and swings at up to 10 rad/s: 80 J to 16 mJ.
-
-    The error is one of the blocks in which M is held: half as long, it is a quarter.
-    """
-    config = panda(
-        joint__stiffness=[1e4] * 7,
-        joint__damping_ratio=0.0,
-        initial__velocity=[1.0, -0.5, 0.7, -0.3, 1.0, 0.4, -1.0],
-    )
-    arm, model = plant_of(config), pinocchio_model(PANDA_TEXT, JOINTS)
-    energies = []
-    for _ in range(5000):
-        q, dq = arm.truth()[-14:].reshape(2, 7)
-        energies.append(energy_of(model, config, q, dq, arm.motors))
-        arm.step(np.zeros(7))
-    assert np.ptp(energies) < 0.02
-    released = arm.truth()[-7:] ** 2
-    assert released.sum() > 1.0  # it did move
-
-
 def swung(config, samples=300):
     """Return the measurements (samples, 3, n) of an arm with all joints swinging."""
     arm = plant_of(config)
@@ -304,27 +269,6 @@ def test_links_and_base_are_those_of_mujoco(given):
         swung(panda(physics=physics, **given)) for physics in ('own', 'mujoco')
     )
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-9)
-
-
-def test_base_swings_at_its_frequency_with_locked_joints():
-    """Joints do not move where a rotor weighs tons; the arm's weight slows tilts by 0.2 %."""
-    config = panda(
-        base__mass=60.0,
-        base__frequency=10.0,
-        base__damping_ratio=0.0,
-        truth__rotor_inertia=[1e9] * 7,
-        events__begin=[0.001],
-        events__duration=[0.008],
-        events__force=[30.0, 20.0, 10.0],
-    )
-    arm, rows = plant_of(config), []
-    for _ in range(1000):
-        arm.step(np.zeros(7))
-        rows.append(arm.base.copy())
-    for coordinate in np.array(rows)[20:].T:
-        crossings = np.flatnonzero(np.diff(np.sign(coordinate)))
-        half_periods = np.diff(crossings[[0, -1]])[0] / (crossings.size - 1)
-        assert 0.5e3 / half_periods == pytest.approx(10.0, rel=0.01)
 
 
 def test_run_repeats_after_a_reset():

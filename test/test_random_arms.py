@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,51 +10,8 @@ from benchmark import (
     joint_pd,
     random_arms,
 )
-from blf_dsc_controller import change, controller_of
+from blf_dsc_controller import controller_of
 from blf_dsc_controller.supervision.model_torque import gravity_torque
-
-ARMS = 300
-
-
-@pytest.mark.parametrize('drawn', ['study', 'wide'])
-def test_arms_do_not_depend_on_what_the_controller_has(drawn):
-    for name in random_arms.ROBOTS:
-        own = random_arms.study_of(name, drawn)
-        others = {'feedback.stiffness': 0.1, 'disturbance.observer_bandwidth': 0.0}
-        other = replace(own, controller=change(own.controller, others))
-        assert all(
-            random_arms.arm_of(own, k) == random_arms.arm_of(other, k)
-            for k in (0, 1, ARMS)
-        )
-
-
-def test_laws_have_the_same_arm_limits_and_sampling_and_are_run_once(
-    monkeypatch, tmp_path
-):
-    handed = []
-
-    def run(config, plant, bound):
-        handed.append((config, plant, bound))
-        return random_arms.Result(np.nan, 'text', 0, *[0.25] * 8)
-
-    def rows():
-        kept = random_arms.Kept(tmp_path / 'runs.jsonl')
-        return list(random_arms.arms(1, ['panda'], ['study'], kept))
-
-    monkeypatch.setattr(random_arms, 'run', run)
-    monkeypatch.setattr(random_arms, 'factor_of', lambda *_: 1.0)
-    table = rows()
-    assert len(handed) == len(random_arms.LAWS)
-    first, arm, bound = handed[0]
-    for config, plant, same in handed[1:]:
-        assert plant == arm
-        assert config.torque == first.torque
-        assert config.sample_time == first.sample_time
-        assert config.reference == first.reference
-        assert not config.learning.enabled
-        np.testing.assert_array_equal(same, bound)
-    assert rows() == table
-    assert len(handed) == len(random_arms.LAWS)
 
 
 def test_rivals_have_the_margin_of_this_law(monkeypatch):

@@ -29,42 +29,6 @@ from blf_dsc_controller.reference.trajectory import (
     plan_trajectory,
 )
 
-OFFSET = (0.5, -1.0, 2.0)
-FREQUENCY, PHASE = (1.0, 2.7), (0.3, -1.1)
-AMPLITUDE = ((0.3, 0.1), (0.0, -0.2), (0.25, 0.05))  # a row for each joint
-SINUSOIDS = sinusoids_term(OFFSET, np.ravel(AMPLITUDE), FREQUENCY, PHASE)
-KNOTS = np.array([0.4, 1.0, 1.1, 3.0])
-COEFFICIENTS = np.random.default_rng(0).normal(size=(4, 3, 6))
-SPLINE = spline_term(KNOTS, COEFFICIENTS)
-LATER = SPLINE._replace(begin=0.5, fade=1.6)
-KINDS = {
-    'sinusoids': [SINUSOIDS],
-    'spline': [SPLINE],
-    'one into the other': [SINUSOIDS, LATER],
-    'three at once': [SINUSOIDS, LATER, SINUSOIDS._replace(begin=1.0, fade=2.0)],
-}
-
-
-def value_at(terms, t):
-    out = np.full((3, 3), np.nan)
-    reference.evaluate(pack(3, terms), t, *out)
-    return out
-
-
-@pytest.mark.parametrize('terms', KINDS.values(), ids=KINDS)
-@pytest.mark.parametrize('t', [0.1, 0.7, 1.05, 1.234, 3.5])
-def test_velocity_and_acceleration_are_the_derivatives_of_the_reference(terms, t):
-    # Five-point stencil with step 1e-3: the fifth derivative, below 1e3 here, leaves
-    # 1e-10.
-    h = 1e-3
-    points = np.array([value_at(terms, t + side * h) for side in (-2, -1, 1, 2)])
-    rate = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * h)
-    _, dqr, ddqr = value_at(terms, t)
-
-    np.testing.assert_allclose(dqr, rate[0], atol=1e-9)
-    np.testing.assert_allclose(ddqr, rate[1], atol=1e-9)
-
-
 JOINTS = ('shoulder', 'elbow')
 
 
@@ -275,18 +239,6 @@ def test_chunk_whose_first_points_cannot_be_reached_in_time_keeps_the_later_ones
     wanted = 0.4 + times[-joined.size : -1]
     np.testing.assert_allclose(rates, np.tile(wanted, (2, 1)).T, rtol=0.05)
     assert max(limits_used(motion, NOW, motion.end)) <= 1.0 + 1e-9
-
-
-def test_trajectory_that_ends_in_motion_brakes_after_its_last_point():
-    sent = trajectory((GOALS, VELOCITIES[::-1]))
-    motion = plan(sent)
-    passed = at(motion.vector, NOW + 3.5)
-    np.testing.assert_allclose(passed[:2], (GOALS[-1], VELOCITIES[0]), atol=1e-9)
-    # from 0.2 rad/s at 6 rad/s^2 in 0.05 s: rest is 0.04 to 0.1 s later
-    np.testing.assert_array_equal(at(motion.vector, NOW + 4.0)[1:], 0.0)
-    ended = at(motion.vector, NOW + 4.0)[0, 0] - GOALS[-1, 0]
-    assert 0.2**2 / (2.0 * 6.0) < ended < 0.2 * 0.1
-    assert max(limits_used(motion, NOW, NOW + 4.0)) <= 1.0 + 1e-9
 
 
 # Random sequences of trajectories, chunks, streamed targets and stops, adopted as the
