@@ -69,16 +69,6 @@ def test_learning(run):
     assert np.isnan(measure(left).parameter_error.time_to_1_percent)
 
 
-def test_tail_is_the_last_ten_seconds_of_a_longer_run(run):
-    """Three times slower: 30 s, of which the parameter error of the last 10 s counts."""
-    stamp = run.stamp[0] + 3 * (run.stamp - run.stamp[0])
-    slow = replace(run, stamp=stamp, monitor=replace(run.monitor, stamp=stamp))
-    error = recorded_run.relative_error(1e-3 * np.arange(SAMPLES))
-    last = error[3e-3 * np.arange(SAMPLES) >= 29.997 - 10.0]
-    expected = np.sqrt(np.mean(last**2))
-    assert measure(slow).parameter_error.tail == pytest.approx(expected, rel=1e-9)
-
-
 def test_timing(run):
     timing = measure(run).timing
     assert timing['rate'] == pytest.approx(1000.0)

@@ -76,22 +76,6 @@ def test_the_law_has_the_frequency_response_of_its_linear_form(
     assert found / size == pytest.approx(-C[SHAKEN, SHAKEN], rel=1e-5)
 
 
-def test_the_lag_begins_anew_with_the_first_sample_after_a_reset(config):
-    """It damps what it finds, as a law without a lag does."""
-    law = blf.controller_of(config)
-    prompt = blf.controller_of(blf.change(config, of_joints(*(0.0,) * 6)))
-    qr = np.array(config.reference.offset)
-    rest, moving = np.zeros(12), np.concatenate((np.full(6, 0.1), np.zeros(6)))
-    first = law.update(0.0, T, np.concatenate((qr, moving))).copy()
-    at_once = prompt.update(0.0, T, np.concatenate((qr, moving)))
-    np.testing.assert_array_equal(first, at_once)
-    for k in range(1, 5):
-        law.update(k * T, T, np.concatenate((qr, rest)))
-    law.reset()
-    again = law.update(0.0, T, np.concatenate((qr, moving)))
-    np.testing.assert_array_equal(again, first)
-
-
 @pytest.mark.parametrize(('given', 'reports'), [({}, True), (LAG, False)])
 def test_an_arm_that_oscillates_with_the_published_gains_is_calm(given, reports):
     """Arm 442 of the study; it stops 1.6 s after the pick-up, at 26 Hz."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-import pinocchio
 import pytest
 from random_arm import CONFIG
 
@@ -17,7 +16,6 @@ from blf_dsc_controller.simulation.loop import write_bag
 
 PANDA = {'robot.urdf': 'panda.urdf', 'robot.tip': 'panda_hand_tcp'}
 HELD = {'robot.drive_compensates': 'gravity'}
-TOLD = {'robot.drive_payload': 1.5, 'robot.drive_payload_centre': [0.02, -0.03, 0.05]}
 # those of `truth`: the arm's
 OWN = {'drive.mass_deviation': 0.3, 'drive.centre_deviation': 0.01}
 OTHER = {'drive.mass_deviation': 0.8, 'drive.centre_deviation': 0.02, 'drive.seed': 3}
@@ -42,26 +40,6 @@ def ratios(record, begin=0.0):
     rows = range(round(begin * 1e3), record.stamps.size)
     samples = [record.sample(row) for row in rows]
     return np.max([np.abs(sample.xi1) / sample.bound for sample in samples], axis=0)
-
-
-def test_added_torque_is_the_gravity_of_the_urdf_and_of_the_payload_told():
-    model = pinocchio.buildModelFromXML((CONFIG / 'panda.urdf').read_text())
-    config = build(blf.ControllerConfig, PANDA | HELD | TOLD)
-    tip = model.getFrameId('panda_hand_tcp')
-    frame = model.frames[tip]
-    point = frame.placement.act(np.array(TOLD['robot.drive_payload_centre']))
-    model.appendBodyToJoint(
-        frame.parentJoint,
-        pinocchio.Inertia(1.5, point, np.zeros((3, 3))),
-        pinocchio.SE3.Identity(),
-    )
-    q = np.append(POSITION, np.zeros(model.nq - 7))
-    expected = pinocchio.computeGeneralizedGravity(model, model.createData(), q)[:7]
-
-    settings = blf.controller_of(config).settings
-    np.testing.assert_allclose(
-        added_torque(settings.torque, POSITION), expected, atol=1e-9
-    )
 
 
 def test_neither_the_command_nor_the_whole_torque_exceeds_the_limit():

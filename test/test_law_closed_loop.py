@@ -38,15 +38,6 @@ def test_recommended_loop_keeps_half_the_bound_and_finds_the_parameters():
     np.testing.assert_allclose(loop.estimate[-1, 3:], 0.1, atol=0.01)
 
 
-def test_arm_beyond_its_bound_comes_back():
-    """There the paper's law is not defined; the barrier continues as a straight line."""
-    law = controller(recommended())
-    arm = plant(start=(2.2935 + 0.004, 1.6961 - 0.004))
-    errors = np.array([np.abs(law.signals.xi1) for _ in closed_loop(law, arm, 1.0)])
-    assert errors[0].min() > 1.9 * BOUND
-    assert errors[100:].max() < 0.5 * BOUND
-
-
 def power_of_the_initial_model(law, q, dq):
     """xi2^T (H - H_r) (P^(0) - P) [W]: what the feedback's model lacks, away from the reference."""
     s = law.signals
@@ -156,20 +147,6 @@ def test_sampled_loop_converges_to_the_continuous_one_at_first_order():
     assert np.all(errors[-1] < 0.15 * errors[0])
 
 
-LATCH = 6.79  # s
-
-
-def test_first_latch_disturbs_neither_the_tracking_nor_the_disturbance_estimate():
-    """The estimate steps by half of P; without the handover the error reaches 0.42 mrad."""
-    end = LATCH + 1.0
-    true = 0.1 + 0.1 * np.sin(end)  # N m
-    loop = run_preset(end)
-    assert loop.parameter_error[np.searchsorted(loop.t, LATCH - 0.1)] > 0.1
-    assert loop.parameter_error[-1] < 1e-3
-    assert loop.largest(LATCH).max() < 0.02e-3
-    assert np.abs(loop.controller.state.disturbance - true).max() < 0.02
-
-
 NOISY = {'position_noise': 1e-5, 'sensor.velocity': 'differenced', 'delay': 2}
 
 
@@ -241,16 +218,6 @@ def test_torque_of_the_comparison_laws_is_that_of_their_equations():
     found, usual, z1, z2 = of_linear_surface('backstepping', named)
     expected = usual - 30.0 * z1 - 0.4 * np.clip(z2 / 0.01, -1.0, 1.0)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-def test_leakage_of_backstepping_shrinks_what_nothing_excites():
-    """At rest on the reference: P^' = -Gamma W_c P^."""
-    law = {'law': 'backstepping', 'gains.leakage': 2.0, 'reference.type': 'hold'}
-    quiet = NO_DISTURBANCE | {'initial.position': [1.2, 0.6]}
-    start = {'reference.offset': [1.2, 0.6], 'two_link.initial_estimate': list(P)}
-    loop = run_preset(0.1, quiet, law=law | start)
-    shrunk = np.exp(-2.0 * 0.5 * 0.1) * P
-    np.testing.assert_allclose(loop.estimate[-1, :3], shrunk, rtol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,6 @@ from blf_dsc_controller import PlantConfig
 from blf_dsc_controller.configuration.schema import build
 from sim_plant.plant import plant_of
 from sim_plant.settings import plant_settings
-from sim_plant.torque_input import TorqueInput
 
 TORQUE = np.array([-6.0, -2.0])
 
@@ -78,14 +77,6 @@ def test_disturbances_of_every_kind_add_up_against_the_motion(changes):
     undisturbed.step(np.zeros(2))
     disturbed.step(np.zeros(2))
     assert disturbed.truth()[-1] < undisturbed.truth()[-1]
-
-
-def test_torque_is_stale_after_its_limit_and_each_such_step_counts():
-    received = TorqueInput(2)
-    assert received.take(2, TORQUE, 5)
-    stale = [received.count_stale(k, 3) for k in range(7, 11)]
-    assert stale == [False, False, True, True]
-    assert received.stale_steps == 2
 
 
 @pytest.mark.parametrize('source', ['measured', 'differenced'])
