@@ -97,7 +97,7 @@ def test_wrap_of_a_joint_with_a_range_is_named_and_its_torque_sees_none(velocity
         rig.step()
         # A difference is that of half a sample before, and 110 rad/s^2 at most,
         # when the stop begins to brake.
-        used = rig.guard.safe_torque.last.dq
+        used = rig.guard.readings.last.dq
         np.testing.assert_allclose(used, rig.state().dq, atol=0.055)
     assert np.abs(np.diff(rig.commands[first:], axis=0)).max() < 0.5  # N m
 

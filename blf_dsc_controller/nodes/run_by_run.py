@@ -69,9 +69,9 @@ class RunByRunNode(ControllerNode):
     def position(self) -> np.ndarray | None:
         """Return the positions (n,) [rad] of the last joint state; None: there was none."""
         guard = self.guard
-        if guard is None or not np.isfinite(guard.safe_torque.last.age):
+        if guard is None or not np.isfinite(guard.readings.last.age):
             return None
-        return np.array(guard.safe_torque.last.q)
+        return np.array(guard.readings.last.q)
 
     def warn(self, text: str) -> None:
         """Log a warning."""

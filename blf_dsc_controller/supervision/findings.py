@@ -13,6 +13,7 @@ from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.supervision import not_sensors
 from blf_dsc_controller.supervision.contact import Contacts, contact_of, untarable
 from blf_dsc_controller.supervision.in_command import InCommand
+from blf_dsc_controller.supervision.reading import Reading
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
@@ -31,7 +32,6 @@ class Findings:
         self.contacts = Contacts()
         self.untrusted = ''
         self._command = command
-        self._n = len(command.config.joints)
 
     def restart(self) -> None:
         """Begin again before a start: the arm no longer holds after a contact."""
@@ -106,23 +106,27 @@ class Findings:
         stamp = command.reference.last_stamp
         return untarable(law, command.config, stamp, rests=command.is_at_rest)
 
-    def stop_at_invalid(self, stamp: int, measurement: Vector) -> None:
+    def stop_at_invalid(self, reading: Reading) -> None:
         """Stop because of a state that the law has not used."""
         command = self._command
         if command.controller.flags & CONTRADICTION:
-            self._distrust_velocities(stamp, measurement)
+            self._distrust_velocities(reading)
             return
-        invalid = command.states.invalid(command.config.safety, measurement)
+        invalid = command.states.invalid(command.config.safety, reading)
         # of an arm that is too fast, why if it oscillates
         cause = command.oscillation.cause if invalid.reason is Reason.VELOCITY else ''
         command.stop(invalid.reason, '; '.join(filter(None, (cause, invalid.text))))
 
-    def compare_velocities(self, stamp: int, measurement: Vector) -> None:
+    def compare_velocities(self, reading: Reading) -> None:
         """Distrust velocities that contradict the positions, in a state beside the law."""
-        if self._command.readings.compare_velocities(measurement):
-            self._distrust_velocities(stamp, measurement)
+        is_next = reading.gap > 0.0 and not reading.is_after_gap
+        if not is_next or not np.isfinite((reading.q, reading.dq)).all():
+            return
+        law = self._command.controller
+        if law.compare_velocities(reading.gap, reading.measurement):
+            self._distrust_velocities(reading)
 
-    def _distrust_velocities(self, stamp: int, measurement: Vector) -> None:
+    def _distrust_velocities(self, reading: Reading) -> None:
         """Stop, and difference all velocities from the positions from this state on."""
         command = self._command
         checks = command.controller.checks
@@ -137,10 +141,10 @@ class Findings:
         else:
             command.supervisor.add(fault.text)
             command.safe_torque.start_observing()  # this has let the error grow
-        command.readings.distrust_velocities(stamp, measurement)
+        command.readings.difference_velocities(reading)
         # What the wrong velocities showed of the rotors is as wrong.
         command.controller.state.rotors.gain_scale[:] = (
             checks.estimates.consistent_scale
         )
         # Else the change from the wrong velocity would pass for an acceleration.
-        command.safe_torque.last.dq[:] = measurement[self._n : -self._n]
+        command.readings.last.dq[:] = reading.dq

@@ -25,7 +25,6 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences
 from blf_dsc_controller.law.check_state import INVALID
 from blf_dsc_controller.law.checks import is_valid_state
-from blf_dsc_controller.law.sensor import LONG_GAP
 from blf_dsc_controller.messages.errors import (
     DuplicatedJointError,
     MessageError,
@@ -41,15 +40,14 @@ from blf_dsc_controller.supervision.envelope import LONGEST, Motion, limited
 from blf_dsc_controller.supervision.envelope_limits import limits_of
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
-from blf_dsc_controller.supervision.last_state import Doubt
 from blf_dsc_controller.supervision.motions import Motions
+from blf_dsc_controller.supervision.reading import Doubt, Reading
 from blf_dsc_controller.supervision.starting import Starting
 from blf_dsc_controller.supervision.state_check import SKIP
 from blf_dsc_controller.supervision.state_watchdog import PERIOD
 from blf_dsc_controller.supervision.supervisor import Fault, Phase, Reason
 
 Vector = NDArray[np.float64]
-_CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
 
 _REASONS: dict[type[MessageError], Reason] = {
     MissingJointError: Reason.JOINT_MISSING,
@@ -97,89 +95,49 @@ class Guard(InCommand):
         self._begin_message()
         gap = (stamp - self.journal.stamp) * NANOSECOND
         self.journal.stamp = stamp
-        self.readings.take_stamp(stamp)
         self.watchdog.restart()
-        measurement, wrapped = self._count_turns(measurement)
-        doubt = self.doubt(stamp, measurement)
-        if doubt is Doubt.OUT_OF_REACH and self.supervisor.phase is Phase.STARTING:
-            self.readings.compare_anew()  # from where the next episode begins
-        if doubt is None or not self.supervisor.running:
-            self.readings.replace_velocities(stamp, measurement)
-        if self.readings.is_after_gap:
-            self.held.after_gap = measurement
+        begins = self.supervisor.phase is Phase.STARTING
+        reading = self.readings.take(stamp, measurement, begins=begins)
+        if reading.is_after_gap:
+            self.held.after_gap = reading
         if not self.supervisor.uses_states:
-            if self.states.ignores(is_copy=doubt is Doubt.COPY):
+            if self.states.ignores(is_copy=reading.doubt is Doubt.COPY):
                 return None
             self.withdraw_after_silence(gap)
             if self.silenced:
                 return None
-            return self._safe_at(stamp, measurement, doubt)
+            return self._safe_at(reading)
         fault = self.states.check(self.config.safety, stamp)
         if fault is SKIP:
             return None
-        fault = fault or wrapped
+        fault = fault or reading.wrapped
         if fault is None and self.supervisor.running:
-            fault = self._doubtful(measurement, doubt) or self._clock_step(measurement)
+            last = self.readings.last
+            fault = self.states.check_motion(reading, last.q, last.dq)
         if fault is None:
-            return self._use(stamp, measurement, doubt)
+            return self._use(reading)
         self._wait_or_stop(*fault)
-        return self._safe_at(stamp, measurement, doubt)
+        return self._safe_at(reading)
 
-    def _doubtful(self, measurement: Vector, doubt: Doubt | None) -> Fault | None:
-        """Return the fault of a state in `doubt`, unless the law says what is wrong with it."""
-        if doubt is Doubt.OUT_OF_REACH and not self.readings.is_after_gap:
-            last = self.safe_torque.last.q
-            return self.states.jumped(self.readings.gap, last, measurement)
-        if doubt is Doubt.REPEATED:
-            return self.states.hangs(measurement)
-        return None
-
-    def _count_turns(self, measurement: Vector) -> tuple[Vector, Fault | None]:
-        """Count turns on in a measurement; return it, and the fault of an impossible wrap.
-
-        Before the start, positions after such a wrap count as they are.
-        """
-        fastest = np.array(self.config.safety.velocity_limit)
-        counted, wrapped = self.readings.count_turns(measurement, fastest)
-        if wrapped is not None and self.supervisor.phase is Phase.STARTING:
-            self.readings.believe_positions()
-        return counted, wrapped
-
-    def _clock_step(self, measurement: Vector) -> Fault | None:
-        """Return the fault of a clock that was set while the arm moved."""
-        last = self.safe_torque.last
-        gap = self.readings.gap
-        if gap < LONG_GAP * self.config.sample_time:
-            return None
-        q, dq, _ = measurement.reshape(3, -1)
-        mean = 0.5 * (dq + last.dq)
-        if np.abs(dq - last.dq).max() > _CHANGED * np.abs(mean).max():
-            return None  # it has been braked or driven on: the time has passed
-        return self.states.clock_step(gap, q - last.q, mean)
-
-    def _use(
-        self, stamp: int, measurement: Vector, doubt: Doubt | None
-    ) -> Vector | None:
+    def _use(self, reading: Reading) -> Vector | None:
         """Return the law's torque for a state, or the safe torque if it cannot be used."""
         if self.supervisor.phase is Phase.STARTING:
-            if not is_valid_state(self.controller.checks, measurement):
-                self._wait_for_valid(measurement)
-                return self._safe_at(stamp, measurement, doubt)
-            self.starting.forget_load_after_gap(stamp, measurement)
-            self._take(stamp, measurement)
-            if not self.starting.start(stamp, measurement):
+            if not is_valid_state(self.controller.checks, reading.measurement):
+                self._wait_for_valid(reading)
+                return self._safe_at(reading)
+            self.starting.forget_load_after_gap(reading)
+            self.readings.use(reading)
+            if not self.starting.start(reading):
                 return self.safe(self.config.sample_time)
-        elif self.held.after_gap is not None and not self.starting.rejoin(
-            stamp, measurement
-        ):
-            return self._safe_at(stamp, measurement, doubt)
-        dt = (stamp - self.reference.last_stamp) * NANOSECOND
-        torque = self._update_law(stamp, dt, measurement)
+        elif self.held.after_gap is not None and not self.starting.rejoin(reading):
+            return self._safe_at(reading)
+        dt = (reading.stamp - self.reference.last_stamp) * NANOSECOND
+        torque = self._update_law(reading, dt)
         if self.controller.flags & INVALID:
-            self.findings.stop_at_invalid(stamp, measurement)
-            return self._safe_at(stamp, measurement, doubt)
-        self._take(stamp, measurement)
-        self._advance_to(stamp)
+            self.findings.stop_at_invalid(reading)
+            return self._safe_at(reading)
+        self.readings.use(reading)
+        self._advance_to(reading.stamp)
         self.findings.check_efforts()
         fault = (
             self.samples.check(dt)
@@ -190,20 +148,21 @@ class Guard(InCommand):
             self.stop(*fault)
             return self.safe(self.config.sample_time)
         self.safe_torque.commanded[:] = torque
-        self.held.recent.take(stamp, measurement, torque)
+        self.held.recent.take(reading.stamp, reading.measurement, torque)
         self.has_sample = True
         self.journal.commands += 1
         return torque
 
-    def _wait_for_valid(self, measurement: Vector) -> None:
+    def _wait_for_valid(self, reading: Reading) -> None:
         """Wait for another state to start from, since the law finds this one invalid."""
-        invalid = self.states.invalid(self.config.safety, measurement)
+        invalid = self.states.invalid(self.config.safety, reading)
         self.starting.wait(invalid.text)
 
-    def _update_law(self, stamp: int, dt: float, measurement: Vector) -> Vector:
+    def _update_law(self, reading: Reading, dt: float) -> Vector:
         """Return the law's torque (n,) [N m], `dt` [s] after its last sample."""
         before = perf_counter()
-        torque = self.controller.update(self.reference.time_of(stamp), dt, measurement)
+        t = self.reference.time_of(reading.stamp)
+        torque = self.controller.update(t, dt, reading.measurement)
         self.compute_time = perf_counter() - before
         return torque
 
@@ -239,24 +198,14 @@ class Guard(InCommand):
 
     def observe(self, stamp: int, measurement: Vector) -> None:
         """Compare velocities with positions for a state that is held back."""
-        self.readings.take_stamp(stamp)
-        self.findings.compare_velocities(stamp, self._count_turns(measurement)[0])
+        reading = self.readings.take(stamp, measurement, begins=True)
+        self.findings.compare_velocities(reading)
 
-    def _safe_at(
-        self, stamp: int, measurement: Vector, doubt: Doubt | None
-    ) -> Vector | None:
+    def _safe_at(self, reading: Reading) -> Vector | None:
         """Return the safe torque for a state that the law has not used."""
-        if doubt is None:
-            self.findings.compare_velocities(stamp, measurement)
-        else:
-            self.readings.skip()
-        return self.safe_at(stamp, measurement, doubt)
-
-    def _take(self, stamp: int, measurement: Vector) -> None:
-        """Keep a state that the law uses, with its stamp [ns]."""
-        last = self.safe_torque.last
-        last.measure_gap(stamp, self.config.sample_time)
-        last.take(stamp, measurement, self.slow)
+        if reading.doubt is None and reading.continues:
+            self.findings.compare_velocities(reading)
+        return self.safe_at(reading)
 
     def _advance_to(self, stamp: int) -> None:
         self.reference.last_stamp = stamp
@@ -334,7 +283,7 @@ class Guard(InCommand):
         self.note(EventType.PARAMETERS, parameters=changed)
         self.reference.drop_prepared()
         if self.supervisor.running:
-            last = self.safe_torque.last.measurement
+            last = self.readings.last.measurement
             retuning.apply_bumpless(self.controller, config, self.reference.time, last)
         else:
             retuning.apply(self.controller, config)
@@ -342,6 +291,7 @@ class Guard(InCommand):
         self.config = config
         self.oscillation.configure(config)
         self.samples.set_limits(config.safety)
+        self.readings.set_limits(config.safety)
         self.envelope.configure(*limits_of(config, self.controller.settings))
 
     def problems(self, config: ControllerConfig) -> list[str]:

@@ -15,6 +15,7 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.model_torque import needed_torque
+from blf_dsc_controller.supervision.reading import Reading
 from blf_dsc_controller.supervision.recent_motion import RecentMotion
 
 Vector = NDArray[np.float64]
@@ -25,7 +26,7 @@ class HeldTorque:
 
     Attributes:
         recent: the motion of the last samples.
-        after_gap: the last measurement (3n,), if it is the first after a gap; else None.
+        after_gap: the last reading, if it is the first after a gap; else None.
     """
 
     def __init__(
@@ -36,7 +37,7 @@ class HeldTorque:
     ) -> None:
         """Look at the law of the controller, and at its kept `estimates`."""
         self.recent = RecentMotion(len(config.joints), config.sample_time)
-        self.after_gap: Vector | None = None
+        self.after_gap: Reading | None = None
         self._effort = config.robot.effort
         self._controller = controller
         self._estimates = estimates
@@ -48,7 +49,7 @@ class HeldTorque:
         """
         if self.after_gap is None or self._effort not in ('whole', 'commanded'):
             return None
-        q, _, effort = self.after_gap.reshape(3, -1)
+        q, effort = self.after_gap.q, self.after_gap.effort
         if not (np.isfinite(effort).all() and np.isfinite(q).all()):
             return None
         settings = self._controller.settings
@@ -65,7 +66,7 @@ class HeldTorque:
         """
         held = self.command()
         if held is not None and self.after_gap is not None:
-            return self.load_of(held, self.after_gap[: held.size])
+            return self.load_of(held, self.after_gap.q)
         load = self.recent.load(self._controller.settings, self._estimates.estimate)
         return self._estimates.disturbance if load is None else load
 

@@ -25,9 +25,8 @@ from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.supervision.envelope_limits import envelope_of
 from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
-from blf_dsc_controller.supervision.last_state import Doubt
 from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
-from blf_dsc_controller.supervision.readings import Readings
+from blf_dsc_controller.supervision.reading import Reading, Readings
 from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_stop import WINDING_UP, SafeStop
 from blf_dsc_controller.supervision.safe_torque import FADE_TIME, SafeTorque
@@ -70,7 +69,6 @@ class InCommand:
         wall: Callable[[], int] = time.time_ns,
     ) -> None:
         """Compile the law; `steady` and `wall` are the clocks [ns]."""
-        n = len(config.joints)
         self.config = config
         self.controller = controller_of(config)
         self.supervisor = Supervisor()
@@ -84,14 +82,10 @@ class InCommand:
         self.journal = Journal()
         self.has_sample = self.silenced = False
         self.clean = True
-        self.readings = Readings(config, self.controller)
+        self.readings = Readings(config, self.controller.checks.sensor)
         self.reference = RunningReference(self.controller)
-        self.safe_torque = SafeTorque(n)
+        self.safe_torque = SafeTorque(self.readings)
         self.safe_torque.scale = self.controller.state.rotors.gain_scale
-        sensor = self.controller.checks.sensor
-        self.safe_torque.noise = sensor.noise[:n]
-        self.safe_torque.resolution = sensor.resolution
-        self.safe_torque.last.resolution = sensor.resolution
         self.safe_torque.longest_step = config.sample_time
         self.envelope = envelope_of(config, self.controller.settings)
         self.held = HeldTorque(config, self.controller, self.estimates)
@@ -114,11 +108,6 @@ class InCommand:
     def commanded(self) -> Vector | None:
         """The last torque (n,) [N m]; None before the first one."""
         return self.safe_torque.commanded if self.commanding else None
-
-    @property
-    def slow(self) -> Vector:
-        """Velocities (n,) [rad/s] to be damped in a stop."""
-        return self.readings.slow(np.array(self.config.safety.velocity_limit))
 
     @property
     def is_at_rest(self) -> bool:
@@ -160,7 +149,7 @@ class InCommand:
         self.silenced = self.has_sample = False
         self.clean = True
         self.readings.restart()
-        if self.safe_torque.last.age >= FADE_TIME:
+        if self.readings.last.age >= FADE_TIME:
             # else a torque may have to fade, which a driver must not hold
             self.watchdog.wait()
 
@@ -208,7 +197,7 @@ class InCommand:
         By then the safe torque has faded to zero, and whoever restarted the driver may
         not expect another. `gap` [s] is the time since the state before.
         """
-        faded = self.safe_torque.last.age >= FADE_TIME
+        faded = self.readings.last.age >= FADE_TIME
         if not self.silenced and faded and self.commanding and gap > LONG_SILENCE:
             self.withdraw(
                 f'joint states are back after {gap:.3g} s, and no torque is commanded until the '
@@ -232,42 +221,31 @@ class InCommand:
             self.supervisor.add(swings)
         return torque
 
-    def doubt(self, stamp: int, measurement: Vector) -> Doubt | None:
-        """Return why a state is not trusted; None: it is."""
-        limit = np.array(self.config.safety.velocity_limit)
-        T = self.config.sample_time
-        return self.safe_torque.last.doubt(stamp, measurement, limit, T)
-
-    def safe_at(
-        self, stamp: int, measurement: Vector, doubt: Doubt | None
-    ) -> Vector | None:
+    def safe_at(self, reading: Reading) -> Vector | None:
         """Return the safe torque for a state that the law has not used.
 
         A state in doubt shows no motion, and a copy or two of the last one change nothing.
         """
-        last, T = self.safe_torque.last, self.config.sample_time
-        is_starting = self.supervisor.phase is Phase.STARTING
-        if doubt is None or (is_starting and doubt is not Doubt.NOT_FINITE):
-            limit = np.array(self.config.safety.velocity_limit)
-            last.follow(stamp, measurement, limit, T, continues=doubt is None)
-            self._observe_speed()
+        T, gap = self.config.sample_time, reading.gap
+        if reading.doubt is None:
+            self.readings.follow(reading)
+            self._observe_speed(gap)
         else:
-            last.skip(T)
+            self.readings.last.skip(T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
-        gap = self.readings.gap
         return self.safe(gap if 0.0 < gap < T else T * max(1, round(gap / T)))
 
     def safe_without_state(self, dt: float) -> Vector | None:
         """Return the safe torque, `dt` [s] later, by the last state."""
         self.has_sample = False
-        self.safe_torque.last.miss(dt)
+        self.readings.last.miss(dt)
         return self.safe(dt)
 
-    def _observe_speed(self) -> None:
-        """Return to the load known before if the arm speeds up in the safe stop."""
+    def _observe_speed(self, gap: float) -> None:
+        """Return to the load known before if the arm speeds up, `gap` [s] after the last state."""
         if self.supervisor.phase is not Phase.SAFE_STOP:
             return
-        speed, gap = self.readings.speed, self.readings.gap
+        speed = self.readings.speed
         if not self.safe_stop.observe_speed(self.config.safety, speed, gap):
             return
         when = 'in the safe stop' if self.commanding else 'while nothing is commanded'

@@ -20,6 +20,7 @@ from blf_dsc_controller.supervision.envelope import limited
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.model_torque import gravity_torque, needed_torque
 from blf_dsc_controller.supervision.observed_load import OBSERVER, ObservedLoad
+from blf_dsc_controller.supervision.reading import Readings
 from blf_dsc_controller.supervision.swing import Swing
 
 Vector = NDArray[np.float64]
@@ -108,20 +109,18 @@ class SafeTorque:
         longest_step: time [s] for which one torque may change at the rate limit.
         scale: factor (n,) on the damping: measured inertia of the joints over the assumed; at
             least a half of it is used.
-        noise: mean square (n,) [rad^2] of the noise of positions; infinite where it is not
-            known: then nothing passes for a swing.
-        resolution: steps (n,) [rad] of positions.
     """
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, readings: Readings) -> None:
+        """Hold the arm of these `readings`."""
+        n = readings.last.q.size
+        self.last = readings.last
+        self._sensor = readings.sensor
         self.commanded = np.zeros(n)
         self.load = np.zeros(n)
         self.scale = np.ones(n)
-        self.noise = np.full(n, inf)
-        self.resolution = np.zeros(n)
         self.missed_change: Vector | None = None
         self.longest_step = inf
-        self.last = LastState(n)
         self._start = np.zeros(n)
         self._duration = self._elapsed = 0.0
         self._usual = ObservedLoad(n, OBSERVER)
@@ -231,7 +230,8 @@ class SafeTorque:
         if self.last.age > 0.0:
             self._swing.forget()
         elif dt > 0.0:
-            self._swing.observe(self.last.slow, self.noise, self.resolution, dt)
+            noise = self._sensor.noise[: self.load.size]
+            self._swing.observe(self.last.slow, noise, self._sensor.resolution, dt)
         scale = self._swing.share * np.maximum(self.scale, _LIGHTEST)
         goal = safe_torque(safety, settings, self.last, estimate, self.load, scale)
         self._elapsed += dt

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import size_of, view_of
 from blf_dsc_controller.law import sensor
-from blf_dsc_controller.supervision.recent_motion import is_gap
+from blf_dsc_controller.supervision.reading import Reading
 
 Array = NDArray[np.float64]
 
@@ -36,26 +36,18 @@ class SensorNoise:
     """What the positions of an arm show of their sensor, as the law measures it.
 
     Attributes:
-        noise: mean square (n,) [rad^2] of the noise of positions.
-        resolution: steps (n,) [rad] of positions.
+        state: noise and steps of the positions.
     """
 
     def __init__(self, n: int) -> None:
         self._lengths = _Lengths(n)
         self._vector = np.zeros(_state_size(self._lengths))
-        self._state = _state_of(self._vector, self._lengths)
+        self.state = _state_of(self._vector, self._lengths)
         self._reading = np.zeros(2 * n)  # with velocities, of which nobody asks
-        self.noise: Array = self._state.noise[:n]
-        self.resolution: Array = self._state.resolution
 
-    def take(self, q: Array, elapsed: float, period: float) -> None:
-        """Take positions q (n,) [rad], `elapsed` [s] after the last, usually a `period` [s].
-
-        Those that are repeated or not finite are left out.
-        """
-        if elapsed < 0.0 or is_gap(elapsed, period):
-            sensor.restart(self._state)
-        if elapsed == 0.0 or not np.isfinite(q).all():
+    def take(self, reading: Reading) -> None:
+        """Take a trusted reading, whose gap the readings have taken note of."""
+        if reading.gap == 0.0:
             return
-        self._reading[: q.size] = q
-        _measure(self._lengths, self._vector, elapsed, self._reading)
+        self._reading[: reading.q.size] = reading.q
+        _measure(self._lengths, self._vector, reading.gap, self._reading)

@@ -15,6 +15,7 @@ from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
+from blf_dsc_controller.supervision.reading import Reading
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
 from blf_dsc_controller.supervision.support import check_support
 from blf_dsc_controller.supervision.takeover import Takeover
@@ -83,7 +84,7 @@ class Starting:
         """Return the torque (n,) [N m] of the drives at the last state, by the model."""
         command = self._command
         settings = command.controller.settings
-        return added_torque(settings.torque, command.safe_torque.last.q)
+        return added_torque(settings.torque, command.readings.last.q)
 
     def _carried(self, forgotten: Vector) -> Vector | None:
         """Return the load (n,) [N m] besides the initial estimate that is carried now, if any.
@@ -105,10 +106,9 @@ class Starting:
             return None
         return command.safe_stop.carried(command.config.safety, estimate)
 
-    def forget_load_after_gap(self, stamp: int, measurement: Vector) -> None:
+    def forget_load_after_gap(self, reading: Reading) -> None:
         """Drop the carried load after a gap, in which another controller may hold the arm."""
-        command = self._command
-        if command.readings.is_after_gap or command.doubt(stamp, measurement):
+        if reading.is_after_gap or not reading.continues:
             self._takeover.carried = None
 
     def prepare(self, positions: Vector) -> None:
@@ -153,38 +153,36 @@ class Starting:
         self.waiting_for = problem
         self._command.states.restart()
 
-    def start(self, stamp: int, measurement: Vector) -> bool:
+    def start(self, reading: Reading) -> bool:
         """Resume the running reference if possible, otherwise start at t = 0.
 
-        Return whether the law is in command from the state with this stamp [ns] on.
+        Return whether the law is in command from this state on.
         """
         command = self._command
         try:
-            resumed = self._takeover.start(
-                command.config, stamp, measurement, command.commanded
-            )
+            resumed = self._takeover.start(command.config, reading, command.commanded)
         except (StartError, MotionError) as error:
             self.refuse(error)
             return False
-        self._take_command(stamp, resumed=resumed)
+        self._take_command(reading.stamp, resumed=resumed)
         return True
 
-    def rejoin(self, stamp: int, measurement: Vector) -> bool:
+    def rejoin(self, reading: Reading) -> bool:
         """Return to the reference from where the arm is after a gap, or stop if it is too far.
 
         Whoever commanded it meanwhile may have braked it.  Without `safety.error_ratio` the
         law goes on instead.  Of an invalid state, the law says what is wrong.
         """
         command = self._command
-        if not is_valid_state(command.controller.checks, measurement):
+        if not is_valid_state(command.controller.checks, reading.measurement):
             return True
-        if self._takeover.rejoin(command.config, stamp, measurement, command.commanded):
-            self._take_command(stamp, resumed=True)
+        if self._takeover.rejoin(command.config, reading, command.commanded):
+            self._take_command(reading.stamp, resumed=True)
             return True
         if command.config.safety.error_ratio == 0.0:
             return True  # no error stops this arm
         text = (
-            f'no joint state came for {command.readings.gap:.3g} s, and the arm is too far from '
+            f'no joint state came for {reading.gap:.3g} s, and the arm is too far from '
             'its reference now'
         )
         command.stop(Reason.STAMP_JUMP, text)

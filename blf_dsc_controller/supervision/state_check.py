@@ -15,6 +15,7 @@ from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.sensor import LONG_GAP
 from blf_dsc_controller.run import NANOSECOND, JointUnits
 from blf_dsc_controller.supervision.envelope import Motion
+from blf_dsc_controller.supervision.reading import Doubt, Reading
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
@@ -22,6 +23,7 @@ _PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Fran
 _REPEATS = 3  # states in a row with the stamp of the one before that are ignored
 _MOVING = 0.02  # rad/s: a slower motion shows no time
 _LESS = 0.5  # of the time by the stamps
+_CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
 _AVERAGED = 1.0  # s, over which missed states are
 
 SKIP = Fault(Reason.NONE, '')
@@ -145,20 +147,32 @@ class StateCheck:
         )
         return Fault(Reason.OVERRUN, text)
 
-    def jumped(self, gap: float, before: Vector, measurement: Vector) -> Fault:
-        """Return the fault of positions that no arm reaches from `before` (n,) in `gap` [s]."""
-        step = measurement[: before.size] - before
+    def check_motion(self, reading: Reading, q: Vector, dq: Vector) -> Fault | None:
+        """Return the fault of a reading that does not follow q and dq (n,) [rad, rad/s].
+
+        Of one that comes after a gap, or is not finite, the law says what is wrong.
+        """
+        if reading.doubt is Doubt.OUT_OF_REACH and not reading.is_after_gap:
+            return self._jumped(reading, q)
+        if reading.doubt is Doubt.REPEATED:
+            return self._hangs(reading)
+        return self._clock_step(reading, q, dq)
+
+    def _jumped(self, reading: Reading, before: Vector) -> Fault:
+        """Return the fault of positions that no arm reaches from `before` (n,) [rad]."""
+        step = reading.q - before
         worst = int(np.argmax(np.abs(step)))
         unit = self._units[worst].position
         text = (
             f'the position of joint {self._joints[worst]!r} jumps by {step[worst]:+.3g} {unit} in '
-            f'{gap:.3g} s, which no arm does: two nodes publish joint states, or a sensor is faulty'
+            f'{reading.gap:.3g} s, which no arm does: two nodes publish joint states, or a sensor '
+            'is faulty'
         )
         return Fault(Reason.VELOCITY, text)
 
-    def hangs(self, measurement: Vector) -> Fault:
+    def _hangs(self, reading: Reading) -> Fault:
         """Return the fault of a reading that is repeated, with new stamps, of an arm in motion."""
-        dq = measurement.reshape(3, -1)[1]
+        dq = reading.dq
         worst = int(np.argmax(np.abs(dq)))
         unit = self._units[worst].of('rad/s')
         text = (
@@ -182,16 +196,21 @@ class StateCheck:
             text += f'; {_NO_VELOCITY}'
         return Fault(Reason.VELOCITY, text)
 
-    def clock_step(self, gap: float, q_step: Vector, dq: Vector) -> Fault | None:
-        """Return a fault if the arm has moved for much less than `gap` [s].
+    def _clock_step(self, reading: Reading, q: Vector, dq: Vector) -> Fault | None:
+        """Return a fault if the arm has moved from q (n,) [rad] for much less than the gap.
 
-        `q_step` (n,) [rad] is the motion since then, `dq` (n,) [rad/s] its mean
-        velocity.
+        One that has been braked or driven on since it moved at dq (n,) [rad/s] has had the time.
         """
-        speed = float(dq @ dq)
-        if gap < LONG_GAP * self._sample_time or not speed >= _MOVING**2:
+        gap = reading.gap
+        if gap < LONG_GAP * self._sample_time:
+            return None
+        mean = 0.5 * (reading.dq + dq)
+        if np.abs(reading.dq - dq).max() > _CHANGED * np.abs(mean).max():
+            return None
+        speed = float(mean @ mean)
+        if not speed >= _MOVING**2:
             return None  # also if it is not finite
-        moved_for = float(q_step @ dq) / speed
+        moved_for = float((reading.q - q) @ mean) / speed
         if not moved_for <= _LESS * gap:
             return None
         text = (
@@ -219,9 +238,9 @@ class StateCheck:
         )
         return Fault(Reason.VELOCITY, text)
 
-    def invalid(self, safety: Safety, measurement: Vector) -> Fault:
-        """Return the fault of an invalid measurement [q, dq, effort] (3n,)."""
-        q, dq, _ = measurement.reshape(3, -1)
+    def invalid(self, safety: Safety, reading: Reading) -> Fault:
+        """Return the fault of a reading that the law does not use."""
+        q, dq = reading.q, reading.dq
         if not np.isfinite(q).all():
             return Fault(Reason.NOT_FINITE, f'the positions are not finite: {q}')
         if not np.isfinite(dq).all():

@@ -12,6 +12,7 @@ from blf_dsc_controller.law.start import Start
 from blf_dsc_controller.reference.approach import BlendedReference
 from blf_dsc_controller.supervision.first_torque import check_first_torque
 from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.reading import Reading
 from blf_dsc_controller.supervision.running_reference import RunningReference
 
 Vector = NDArray[np.float64]
@@ -40,20 +41,19 @@ class Takeover:
     def start(
         self,
         config: ControllerConfig,
-        stamp: int,
-        measurement: Vector,
+        reading: Reading,
         commanded: Vector | None,
     ) -> bool:
-        """Begin with a measurement (3 n,); return whether the running reference is resumed.
+        """Begin with a joint state; return whether the running reference is resumed.
 
-        Else it starts at t = 0, the `stamp` [ns].  `commanded` (n,) [N m] is the last
+        Else it starts there at t = 0.  `commanded` (n,) [N m] is the last
         torque, None before the first one.
 
         Raises:
             StartError: the law cannot take over there.
             MotionError: no approach from there keeps the limits.
         """
-        q, dq, _ = measurement.reshape(3, -1)
+        stamp, q, dq = reading.stamp, reading.q, reading.dq
         reference = self._reference
         motion = None
         if reference.resumable:
@@ -68,7 +68,9 @@ class Takeover:
         if self.carried is not None:
             self._begin_with_load(self.carried)
         if commanded is None:
-            check_first_torque(self._controller, config, measurement, self.acting)
+            check_first_torque(
+                self._controller, config, reading.measurement, self.acting
+            )
         if not resumed:
             reference.start_at(stamp, config, q)
         self._follow(motion, q, commanded)
@@ -77,8 +79,7 @@ class Takeover:
     def rejoin(
         self,
         config: ControllerConfig,
-        stamp: int,
-        measurement: Vector,
+        reading: Reading,
         commanded: Vector | None,
     ) -> bool:
         """Return to the running reference; return whether the arm is near enough for that.
@@ -86,7 +87,7 @@ class Takeover:
         The arguments are those of `start`.  If the sample before was the first one, its plan
         may have taken all that time: another would take it again, and the law go on blind.
         """
-        q, dq, _ = measurement.reshape(3, -1)
+        stamp, q, dq = reading.stamp, reading.q, reading.dq
         reference = self._reference
         has_just_planned = self._controller.samples == 1
         way = reference.as_planned if has_just_planned else reference.plan_resumption

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.supervision.reading import Readings
 from blf_dsc_controller.supervision.safe_torque import FADE_TIME, SafeTorque
 from blf_dsc_controller.supervision.sensor_noise import SensorNoise
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
 from blf_dsc_controller.supervision.swing_names import SwingNames
-from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
 
@@ -59,14 +59,11 @@ class TorqueWatchdog:
         self.silence = 0.0
         self.stands_down = False
         self._timeout = timeout
-        self._safe = SafeTorque(len(config.joints))
         self._sensor = SensorNoise(len(config.joints))
-        self._safe.noise = self._sensor.noise
-        self._safe.resolution = self._sensor.resolution
-        self._safe.last.resolution = self._sensor.resolution
+        self._readings = Readings(config, self._sensor.state)
+        self._safe = SafeTorque(self._readings)
         self._swings = SwingNames(config.joints)
         self.config = config
-        self._wraps = Wraps(config)
         self.configure(config)
         self.stamp = -1
         self._commanded_stamp = -1  # of the last state before the last torque
@@ -81,7 +78,8 @@ class TorqueWatchdog:
         """Use another configuration of the same joints, from the next torque on."""
         if config.robot != self.config.robot:
             self._safe.forget_load()  # what was missing was missing from another model
-            self._wraps = Wraps(config)
+            self._readings.count_turns_anew(config)
+        self._readings.set_limits(config.safety)
         self.config = config
         self._settings = settings_of_config(config)
         self._estimate = self._settings.initial_estimate
@@ -90,14 +88,14 @@ class TorqueWatchdog:
     def _rehearse(self) -> None:
         """Compute a safe torque as after a takeover: its kernels are compiled then."""
         n = self._settings.n
-        safe = SafeTorque(n)
-        SensorNoise(n).take(np.zeros(n), self.config.sample_time, inf)
+        sensor = SensorNoise(n)
+        readings = Readings(self.config, sensor.state)
+        safe = SafeTorque(readings)
         holding = replace(self.config.safety, torque='hold_gravity')
-        rest = np.zeros(3 * n)
-        T = self.config.sample_time_ns
         for k in (1, 2):  # the second one shows an acceleration
-            limit = np.array(holding.velocity_limit)
-            safe.last.follow(k * T, rest, limit, self.config.sample_time)
+            reading = readings.take(k * self.config.sample_time_ns, np.zeros(3 * n))
+            sensor.take(reading)
+            readings.follow(reading)
             safe.advance(holding, self._settings, self._estimate, 0.0)
 
     @property
@@ -135,15 +133,11 @@ class TorqueWatchdog:
 
     def take_state(self, stamp: int, measurement: Vector, now: float) -> None:
         """Take a joint state [q, dq, effort] (3n,) with its stamp [ns]."""
-        limit = np.array(self.config.safety.velocity_limit)
-        period = self.config.sample_time
-        gap = (stamp - self.stamp) * 1e-9
-        measurement, _ = self._wraps.count(measurement, gap, limit)
-        last = self._safe.last
-        if last.doubt(stamp, measurement, limit, period):
+        reading = self._readings.take(stamp, measurement)
+        if reading.doubt is not None:
             return  # `poll` counts the time without a state
-        self._sensor.take(measurement[: self._settings.n], gap, period)
-        last.follow(stamp, measurement, limit, period)
+        self._sensor.take(reading)
+        self._readings.follow(reading)
         if now - self._seen_at > LONG_SILENCE:
             self._forget_controller()
         if stamp > self.stamp:

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint states as they arrive: turns counted on, velocities differenced, trusted or in doubt.
+
+A state is trusted if it comes from the last one: newer, within reach of an arm, and not the
+same reading although that says that the arm moves.  No other state ever enters a torque: not
+one of a second sender on the same topic, of a reader that hangs, or one that arrives twice.
+
+Velocities of arms that measure none, and those that contradict the positions once, are the
+differences of positions.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from math import inf, nan
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.controller_groups import Safety
+from blf_dsc_controller.law.repeats import BRIDGED
+from blf_dsc_controller.law.sensor import State as Sensor
+from blf_dsc_controller.law.sensor import restart
+from blf_dsc_controller.run import NANOSECOND
+from blf_dsc_controller.supervision.last_state import LastState
+from blf_dsc_controller.supervision.recent_motion import is_gap
+from blf_dsc_controller.supervision.supervisor import Fault
+from blf_dsc_controller.supervision.velocity import Velocity
+from blf_dsc_controller.supervision.wraps import Wraps
+
+Vector = NDArray[np.float64]
+
+_STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
+_FINEST = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
+
+
+class Doubt(Enum):
+    """Why a state is not trusted."""
+
+    NOT_FINITE = 'positions are not finite'
+    COPY = 'the stamp of the last one'
+    REPEATED = 'the same values, although they say that the arm moves'
+    OUT_OF_REACH = 'positions that an arm does not reach from the last ones'
+
+
+class Reading(NamedTuple):
+    """A joint state, and what the ones before it say about it."""
+
+    stamp: int  # ns
+    measurement: Vector  # [q, dq, effort] (3 n,) [rad, rad/s, N m]
+    gap: float  # s, since the last state that was not in doubt
+    is_after_gap: bool  # whether this time is too long to compare the two
+    continues: bool  # whether it comes from the last trusted state
+    doubt: Doubt | None  # why it is not trusted; None: it is
+    wrapped: Fault | None  # of positions that wrap
+
+    @property
+    def q(self) -> Vector:
+        """Positions (n,) [rad]."""
+        return self.measurement[: self.measurement.size // 3]
+
+    @property
+    def dq(self) -> Vector:
+        """Velocities (n,) [rad/s]."""
+        n = self.measurement.size // 3
+        return self.measurement[n : 2 * n]
+
+    @property
+    def effort(self) -> Vector:
+        """Efforts (n,) [N m]."""
+        n = self.measurement.size // 3
+        return self.measurement[2 * n :]
+
+
+class Readings:
+    """Reads the joint states of an arm, one after the other.
+
+    Attributes:
+        last: the last trusted state.
+        sensor: what the readings show of their sensor, as `law.sensor` finds it.
+    """
+
+    def __init__(self, config: ControllerConfig, sensor: Sensor) -> None:
+        """Read states of the joints of a configuration, with the noise of a `sensor`."""
+        n = len(config.joints)
+        self.sensor = sensor
+        self.last = LastState(n)
+        self._sample_time = config.sample_time
+        self._wraps = Wraps(config)
+        self._velocity: Velocity | None = None
+        if config.safety.velocity == 'estimated':
+            self._velocity = Velocity(n)
+        self._seen = self._before = 0  # ns, of the last trusted state, and before it
+        self._read = np.full(2 * n, nan)  # q and dq as last read
+        self._new_at = -1  # ns, stamp of the first state with these
+        self.set_limits(config.safety)
+
+    def set_limits(self, safety: Safety) -> None:
+        """Take these for the largest speeds of the joints from the next state on."""
+        self._fastest = np.array(safety.velocity_limit)
+
+    def count_turns_anew(self, config: ControllerConfig) -> None:
+        """Count turns from the next state on, of joints that a configuration describes."""
+        self._wraps = Wraps(config)
+
+    def take(self, stamp: int, measurement: Vector, *, begins: bool = False) -> Reading:
+        """Return the next state, of a stamp [ns], with [q, dq, effort] (3 n,) as measured.
+
+        `begins`: the law waits for a state to start from, which need not come from the last.
+        Differenced velocities are written to `measurement`.
+        """
+        gap = (stamp - self._seen) * NANOSECOND
+        is_after_gap = is_gap(gap, self._sample_time)
+        if gap < 0.0 or is_after_gap:
+            restart(self.sensor)
+        counted, wrapped = self._wraps.count(measurement, gap, self._fastest)
+        if begins and wrapped is not None:
+            self._wraps.restart()
+        found = self._doubt(stamp, counted)
+        if begins and found is Doubt.OUT_OF_REACH:
+            restart(self.sensor)
+        doubt = None if begins and found is not Doubt.NOT_FINITE else found
+        if doubt is None:
+            self._trust(stamp, counted)
+        return Reading(stamp, counted, gap, is_after_gap, found is None, doubt, wrapped)
+
+    def follow(self, reading: Reading) -> None:
+        """Let a trusted reading beside the law be the last one."""
+        self.last.follow(
+            reading.stamp,
+            reading.measurement,
+            self._fastest,
+            self._sample_time,
+            continues=reading.continues,
+        )
+
+    def use(self, reading: Reading) -> None:
+        """Let a reading that the law uses be the last one."""
+        self.last.measure_gap(reading.stamp, self._sample_time)
+        fastest = self._fastest
+        slow = np.minimum(np.maximum(self.velocity, -fastest), fastest)
+        self.last.take(reading.stamp, reading.measurement, slow)
+
+    def difference_velocities(self, reading: Reading) -> None:
+        """Difference all velocities from the positions, from this reading on."""
+        n = reading.q.size
+        self._velocity = Velocity(n)
+        self._velocity.begin(self._before, self.sensor.read_before[:n])
+        self._velocity.replace(reading.stamp, reading.measurement)
+        restart(self.sensor)
+
+    def restart(self) -> None:
+        """Begin with the next state, for a new start."""
+        if not self._wraps.restart():
+            return
+        # to positions that differ from those before
+        restart(self.sensor)
+        if self._velocity is not None:
+            self._velocity = Velocity(self.last.q.size)
+
+    @property
+    def velocity(self) -> Vector:
+        """Velocity (n,) [rad/s] that the positions show, behind a low pass."""
+        return self.sensor.derived
+
+    @property
+    def speed(self) -> float:
+        """Largest speed of a joint [rad/s], as the positions show it."""
+        return float(np.abs(self.velocity).max())
+
+    def _trust(self, stamp: int, measurement: Vector) -> None:
+        self._before, self._seen = self._seen, stamp
+        if self._velocity is not None:
+            self._velocity.replace(stamp, measurement)
+        if not self._equals(measurement):
+            self._read[:] = measurement[: self._read.size]
+            self._new_at = stamp
+
+    def _doubt(self, stamp: int, measurement: Vector) -> Doubt | None:
+        """Return why a state is not trusted; None: it comes from the last one.
+
+        A joint may be twice as fast as its limit, or twice as fast as before.  Stamps jitter,
+        and clocks are set back: a sample time counts as one at least.
+        """
+        last = self.last
+        q = measurement[: last.q.size]
+        if not np.isfinite(q).all():
+            return Doubt.NOT_FINITE
+        if last.age == inf:
+            return None
+        elapsed = (stamp - last.stamp) * NANOSECOND
+        if elapsed == 0.0:
+            return Doubt.COPY
+        if self._is_repeated(stamp, measurement):
+            return Doubt.REPEATED
+        fastest = self._fastest + last.speed
+        reach = 2.0 * fastest * max(elapsed, self._sample_time)
+        if (np.abs(q - last.q) > reach).any():
+            return Doubt.OUT_OF_REACH
+        return None
+
+    def _is_repeated(self, stamp: int, measurement: Vector) -> bool:
+        """Whether a state is an old reading for too long, of an arm that it says moves."""
+        n = self.last.q.size
+        age = (stamp - self._new_at) * NANOSECOND
+        if age < BRIDGED * self._sample_time or not self._equals(measurement):
+            return False
+        least = _STEPS * np.maximum(self.sensor.resolution, _FINEST)
+        return bool((np.abs(measurement[n : 2 * n]) * age > least).any())
+
+    def _equals(self, measurement: Vector) -> bool:
+        return bool((measurement[: self._read.size] == self._read).all())
