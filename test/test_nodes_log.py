@@ -138,7 +138,7 @@ def test_leaving_node_commands_the_safe_torque_last(ros):
     law.close()
     ros.until(lambda: len(commands) == law.guard.journal.commands)
     gravity = dynamics((1.0, 0.32, 0.4), 9.8, arm.plant.measure()[:2], ZERO)[2]
-    load = law.guard.safe_torque.load  # what it met on the way
+    load = law.guard.hold.load  # what it met on the way
     np.testing.assert_allclose(torques(commands)[-1], gravity + load, atol=0.05)
     assert np.abs(load).max() < 0.3
     assert law.guard.journal.pending == deque()

@@ -82,7 +82,7 @@ class MotorFeedback:
         damping = np.array(safety.damping)
         if safety.torque == 'zero':
             damping[:] = 0.0
-        measured = Motion(guard.readings.last.q, guard.safe_torque.last.slow)
+        measured = Motion(guard.readings.last.q, guard.readings.last.slow)
         here = Motion(measured.q, self._nothing.dq)
         gains = Gains(self._nothing.q, damping)
         return split(torque, measured, here, here, gains, self.ranges)

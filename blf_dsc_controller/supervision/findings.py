@@ -80,7 +80,7 @@ class Findings:
         elif reaction != 'none':
             command.stop(Reason.CONTACT, text)
             if reaction == 'yield':
-                command.safe_torque.yield_to_contact()
+                command.hold.yield_to_contact()
 
     def tare(self) -> None:
         """Take the external torque for zero where the arm rests now.
@@ -140,7 +140,7 @@ class Findings:
             command.stop(*fault)
         else:
             command.supervisor.add(fault.text)
-            command.safe_torque.start_observing()  # this has let the error grow
+            command.hold.start_observing()  # this has let the error grow
         command.readings.difference_velocities(reading)
         # What the wrong velocities showed of the rotors is as wrong.
         command.controller.state.rotors.gain_scale[:] = (

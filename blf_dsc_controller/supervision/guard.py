@@ -147,7 +147,7 @@ class Guard(InCommand):
         if fault is not None:
             self.stop(*fault)
             return self.safe(self.config.sample_time)
-        self.safe_torque.commanded[:] = torque
+        self.hold.commanded[:] = torque
         self.held.recent.take(reading.stamp, reading.measurement, torque)
         self.has_sample = True
         self.journal.commands += 1
@@ -177,7 +177,7 @@ class Guard(InCommand):
         now = Motion(signals.q, signals.dq, signals.xi1, signals.dqr)
         whole = torque + added
         estimate = self.estimates.estimate[: controller.settings.p]
-        last = self.safe_torque.commanded if controller.samples > 1 else None
+        last = self.hold.commanded if controller.samples > 1 else None
         braked = envelope.brake(now, whole, estimate, dt)
         leaves = torque if braked is whole else braked - added
         leaves = limited(leaves, last, envelope.limits.torque, envelope.limits.step)

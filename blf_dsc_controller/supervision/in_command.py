@@ -3,7 +3,7 @@
 
 `Supervisor` holds the phase, `Readings` reads joint states, `RunningReference` holds the
 reference and the time of the law.  `HeldTorque` finds the torque that holds the arm, from
-which `SafeStop` and `SafeTorque` compute the torque without the law.
+which `SafeStop` and `Hold` compute the torque without the law.
 """
 
 from __future__ import annotations
@@ -24,16 +24,22 @@ from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.supervision.envelope_limits import envelope_of
 from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.hold import FADE_TIME, Hold
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
 from blf_dsc_controller.supervision.reading import Reading, Readings
 from blf_dsc_controller.supervision.running_reference import RunningReference
-from blf_dsc_controller.supervision.safe_stop import WINDING_UP, SafeStop
-from blf_dsc_controller.supervision.safe_torque import FADE_TIME, SafeTorque
+from blf_dsc_controller.supervision.safe_stop import SafeStop
 from blf_dsc_controller.supervision.sample_check import SampleCheck
 from blf_dsc_controller.supervision.state_check import StateCheck, rate_mismatch
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE, Watchdog
-from blf_dsc_controller.supervision.supervisor import Phase, Reason, Supervisor
+from blf_dsc_controller.supervision.supervisor import (
+    Doubtful,
+    Phase,
+    Reason,
+    Supervisor,
+    is_in_doubt,
+)
 
 Vector = NDArray[np.float64]
 _MANY = 0.5  # states missed for each that came
@@ -53,7 +59,7 @@ class InCommand:
         oscillation: what follows from an oscillation, and the last one that is warned of.
         readings: stamps, turns and velocities of the joint states.
         reference: the reference in force, and the time of the law.
-        safe_torque: the ramp to the safe torque, and the last usable joint state.
+        hold: the ramp to the torque that holds the arm without the law.
         envelope: what no law may ask of the arm.
         held: the torque that holds the arm, by its last motion.
         safe_stop: computes the torque while the law is not in command.
@@ -84,13 +90,17 @@ class InCommand:
         self.clean = True
         self.readings = Readings(config, self.controller.checks.sensor)
         self.reference = RunningReference(self.controller)
-        self.safe_torque = SafeTorque(self.readings)
-        self.safe_torque.scale = self.controller.state.rotors.gain_scale
-        self.safe_torque.longest_step = config.sample_time
+        self.hold = Hold(
+            self.readings,
+            self.controller.settings,
+            self.estimates.estimate,
+            config.sample_time,
+        )
+        self.hold.scale = self.controller.state.rotors.gain_scale
         self.envelope = envelope_of(config, self.controller.settings)
         self.held = HeldTorque(config, self.controller, self.estimates)
         self.safe_stop = SafeStop(
-            config, self.controller, self.estimates, self.safe_torque, self.held
+            config, self.controller, self.estimates, self.hold, self.held
         )
         digest = (
             {'law_digest': law_file.digest(config.law)}
@@ -107,7 +117,7 @@ class InCommand:
     @property
     def commanded(self) -> Vector | None:
         """The last torque (n,) [N m]; None before the first one."""
-        return self.safe_torque.commanded if self.commanding else None
+        return self.hold.commanded if self.commanding else None
 
     @property
     def is_at_rest(self) -> bool:
@@ -119,7 +129,7 @@ class InCommand:
     @property
     def is_settled(self) -> bool:
         """Whether the arm rests under the safe torque."""
-        return not self.supervisor.running and self.safe_torque.is_settled
+        return not self.supervisor.running and self.hold.is_settled
 
     def check_running(self) -> None:
         """Raise TrajectoryError if the law is not in command."""
@@ -162,7 +172,7 @@ class InCommand:
         was_running = self.supervisor.running
         if not self.supervisor.stop(reason, text):
             return
-        if reason in WINDING_UP:
+        if is_in_doubt(reason, Doubtful.ESTIMATES):
             self.estimates.return_to_consistent()
         self.journal.note(EventType.STOP, reason=reason, text=text)
         self.clean = self.reference.resumable = False
@@ -212,7 +222,7 @@ class InCommand:
         """
         if not self.commanding:
             return None
-        torque = self.safe_stop.advance(self.config.safety, dt)
+        torque = self.hold.advance(self.config.safety, dt)
         self.journal.commands += torque is not None
         missing = self.safe_stop.missing_effect
         if missing and self.supervisor.reason is not Reason.NO_EFFECT:

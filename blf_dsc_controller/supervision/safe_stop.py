@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the arm gets while the law is not in command: the safe torque, by what holds the arm."""
+"""What becomes of an arm after a stop: which load it holds, and whether it comes to rest."""
 
 from __future__ import annotations
 
@@ -10,28 +10,47 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.supervision.held_torque import HeldTorque
+from blf_dsc_controller.supervision.hold import Hold, Load
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
-from blf_dsc_controller.supervision.model_torque import gravity_torque
-from blf_dsc_controller.supervision.safe_torque import Load, SafeTorque
-from blf_dsc_controller.supervision.stop_speed import StopSpeed
-from blf_dsc_controller.supervision.supervisor import Reason
-from blf_dsc_controller.supervision.swing_names import SwingNames
+from blf_dsc_controller.supervision.supervisor import Doubtful, Reason, is_in_doubt
+from blf_dsc_controller.supervision.swing import SwingNames
 
 Vector = NDArray[np.float64]
 
-# The cause may be commands that do not reach the arm, or wrong velocities: both wind up
-# the estimates.
-_PERHAPS_UNREACHED = (Reason.OUTSIDE_BOUND, Reason.SATURATED)
-# So do a velocity above its limit, a contact and an oscillation.
-WINDING_UP = (
-    *_PERHAPS_UNREACHED,
-    Reason.VELOCITY,
-    Reason.CONTACT,
-    Reason.OSCILLATION,
-)
-"""Reasons of stops before which the estimates may have wound up."""
-
 _FASTER = 0.1  # rad/s, of a joint while the torque of a deactivation ramps down
+# rad/s over twice the speed at the stop, for _SPEEDS_UP: a load that is new makes less of it
+_SPED_UP = 0.5
+_GROWING = 0.95  # of the largest speed so far
+_SPEEDS_UP = 0.2  # s
+
+
+class StopSpeed:
+    """Finds, once in a safe stop, that the arm speeds up instead of coming to rest."""
+
+    def __init__(self) -> None:
+        self.begin(0.0)
+
+    def begin(self, speed: float) -> None:
+        """Begin a safe stop at a speed [rad/s], the largest of a joint."""
+        self._at_stop = speed
+        self._peak = 0.0  # rad/s, since then
+        self._speeding = 0.0  # s, for which the arm has been faster
+
+    def observe(self, speed: float, gap: float) -> bool:
+        """Take the speed of a state; return whether this shows that the arm speeds up.
+
+        That is once it has been faster for long enough, and at most once in a stop.
+
+        `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last
+        one.
+        """
+        if self._speeding > _SPEEDS_UP:
+            return False
+        self._peak = max(speed, self._peak)
+        is_faster = speed > 2.0 * self._at_stop + _SPED_UP
+        is_growing = speed > _GROWING * self._peak
+        self._speeding = self._speeding + gap if is_faster and is_growing else 0.0
+        return self._speeding > _SPEEDS_UP
 
 
 class SafeStop:
@@ -42,14 +61,14 @@ class SafeStop:
         config: ControllerConfig,
         controller: Controller,
         estimates: KeptEstimates,
-        torque: SafeTorque,
+        hold: Hold,
         held: HeldTorque,
     ) -> None:
-        """Use the ramp of `torque`, what `held` finds, and the kept `estimates` of the law."""
+        """Use the ramp of `hold`, what `held` finds, and the kept `estimates` of the law."""
         self._joints, self._units = config.joints, config.units
         self._controller = controller
         self._estimates = estimates
-        self._torque = torque
+        self._hold = hold
         self._held = held
         self._speed = StopSpeed()
         self._swings = SwingNames(config.joints)
@@ -66,15 +85,15 @@ class SafeStop:
         """Begin the ramp of a stop at a speed [rad/s], the largest of a joint."""
         self._speed.begin(speed)
         self._swings.begin()
-        load = self._torque.load.copy()
+        load = self._hold.load.copy()
         if was_running:
             self._continue_from_held()
             load = self._load_at_stop(reason)
-        reached = reason not in (*_PERHAPS_UNREACHED, Reason.NO_EFFECT)
-        self._torque.begin_ramp(
+        awaits = is_in_doubt(reason, Doubtful.EFFECT) and not oscillates
+        self._hold.begin_ramp(
             safety.stop_ramp,
             load,
-            reached=reached or oscillates,
+            source=Load.AWAITED if awaits else Load.OBSERVED,
             oscillates=oscillates,
         )
 
@@ -89,35 +108,27 @@ class SafeStop:
         ramp = safety.deactivation_ramp
         if safety.torque == 'hold_gravity' and fastest * ramp > 2.0 * _FASTER:
             ramp = 2.0 * _FASTER / fastest
-        self._torque.begin_ramp(ramp, self._held.load(), source=Load.UNTIL_MOVED)
+        self._hold.begin_ramp(ramp, self._held.load(), source=Load.UNTIL_MOVED)
 
     def begin_anew(self, safety: Safety, load: Vector) -> None:
         """Begin the ramp of a law that forgets what it has learned, with this load (n,) [N m]."""
         self._swings.begin()
-        self._torque.begin_ramp(safety.stop_ramp, load)
+        self._hold.begin_ramp(safety.stop_ramp, load)
 
     def carried(self, safety: Safety, estimate: Vector) -> Vector | None:
         """Return the load (n,) [N m] besides an estimate (m,) that the safe torque carries.
 
         None: it holds none, or the arm has not shown that it does.
         """
-        if safety.torque != 'hold_gravity' or not self._torque.carries:
+        if safety.torque != 'hold_gravity' or not self._hold.carries:
             return None
-        settings, q = self._controller.settings, self._torque.last.q
-        held = gravity_torque(settings, self._estimates.estimate, q) + self._torque.load
-        return held - gravity_torque(settings, estimate, q)
-
-    def advance(self, safety: Safety, dt: float) -> Vector | None:
-        """Return the torque (n,) [N m] `dt` [s] later; None before a usable state."""
-        settings = self._controller.settings
-        return self._torque.advance(safety, settings, self._estimates.estimate, dt)
+        return self._hold.carried - self._hold.gravity(estimate)
 
     def leave(self, safety: Safety, *, was_running: bool) -> Vector | None:
         """Return the last torque (n,) [N m]; None before the first usable state."""
         if was_running:
-            self._torque.load[:] = self._held.load()
-        settings = self._controller.settings
-        return self._torque.leave(safety, settings, self._estimates.estimate)
+            self._hold.load[:] = self._held.load()
+        return self._hold.leave(safety)
 
     def observe_speed(self, safety: Safety, speed: float, gap: float) -> bool:
         """Return to the load known before if the arm speeds up; return whether it does.
@@ -127,17 +138,17 @@ class SafeStop:
         begins = self._speed.observe(speed, gap)
         if not begins or safety.torque == 'zero':
             return False
-        self._torque.stop_observing()
+        self._hold.stop_observing()
         return True
 
     def name_swings(self) -> str:
         """Return a text about joints that swing in the stop and have not been named; or empty."""
-        return self._swings.name(self._torque.has_swung)
+        return self._swings.name(self._hold.has_swung)
 
     @property
     def missing_effect(self) -> str:
         """That the last change of the commands has moved nothing; empty if it may have."""
-        change = self._torque.missed_change
+        change = self._hold.missed_change
         if change is None:
             return ''
         worst = int(np.argmax(np.abs(change) / self._controller.settings.torque.limit))
@@ -152,11 +163,10 @@ class SafeStop:
         """Let the ramp begin at the torque that acts after a gap, also that of another node."""
         held = self._held.command()
         if held is not None:
-            self._torque.commanded[:] = held
+            self._hold.commanded[:] = held
 
     def _load_at_stop(self, reason: Reason) -> Vector:
         """Return the torque (n,) [N m] that holds the arm besides its model when the law stops."""
-        is_wound_up = reason in WINDING_UP or reason is Reason.NO_EFFECT
-        if is_wound_up and self._held.after_gap is None:
+        if is_in_doubt(reason, Doubtful.MOTION) and self._held.after_gap is None:
             return self._estimates.disturbance
         return self._held.load()

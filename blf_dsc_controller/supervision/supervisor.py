@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import Enum, Flag, auto
 from typing import NamedTuple
 
 from blf_dsc_controller.messages.journal import OUTSIDE_BOUND
@@ -51,6 +51,29 @@ class Reason(str, Enum):
     FAILED = 'failed'
 
 
+class Doubtful(Flag):
+    """What was not in order before a stop, so that the torque without the law rests on less."""
+
+    MOTION = auto()  # the last motion of the law: it shows no load
+    ESTIMATES = auto()  # those since the error grew, which have wound up
+    EFFECT = auto()  # that commands reach the arm: it has to show that first
+
+
+DOUBTFUL: dict[Reason, Doubtful] = {
+    # commands that do not reach the arm
+    Reason.OUTSIDE_BOUND: Doubtful.MOTION | Doubtful.ESTIMATES | Doubtful.EFFECT,
+    Reason.SATURATED: Doubtful.MOTION | Doubtful.ESTIMATES | Doubtful.EFFECT,
+    Reason.NO_EFFECT: Doubtful.MOTION | Doubtful.EFFECT,
+    # wrong velocities, or a law that has fought against something
+    Reason.VELOCITY: Doubtful.MOTION | Doubtful.ESTIMATES,
+    Reason.CONTACT: Doubtful.MOTION | Doubtful.ESTIMATES,
+    Reason.OSCILLATION: Doubtful.MOTION | Doubtful.ESTIMATES,
+}
+"""By the reason of the stop; after any other one, all was in order.
+
+Estimates of a stop without effect are those of when a joint last moved, which its check finds.
+"""
+
 STAMPS = (Reason.STAMP_REPEATED, Reason.STAMP_BACKWARD, Reason.STAMP_JUMP)
 """What the states of two publishers on one topic look like, among others."""
 
@@ -60,6 +83,11 @@ class Fault(NamedTuple):
 
     reason: Reason
     text: str
+
+
+def is_in_doubt(reason: Reason, what: Doubtful) -> bool:
+    """Whether a stop of this reason leaves something in doubt."""
+    return what in DOUBTFUL.get(reason, Doubtful(0))
 
 
 class Supervisor:

@@ -24,6 +24,7 @@ in which a joint moves in one direction: what falls is braked, also while its sp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import pi
 
 import numpy as np
@@ -138,3 +139,40 @@ class Swing:
         self._since[ends] -= self._farthest_at[ends]
         self._direction[ends] *= -1.0
         self._steady[ends & returns] = 0.0
+
+
+class SwingNames:
+    """Names each joint that swings once in a stop."""
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._joints = joints
+        self._named = np.zeros(len(joints), dtype=np.bool_)
+
+    def begin(self) -> None:
+        """Begin a stop."""
+        self._named[:] = False
+
+    def name(self, has_swung: NDArray[np.bool_]) -> str:
+        """Name those joints (n,) that are not named yet, in a text; empty: all are.
+
+        Only the first text of a stop says what that means: the others follow it.
+        """
+        new = has_swung & ~self._named
+        if not new.any():
+            return ''
+        is_first = not self._named.any()
+        self._named |= new
+        names = [
+            repr(name) for name, is_new in zip(self._joints, new, strict=True) if is_new
+        ]
+        what = (
+            f'joints {", ".join(names)} swing'
+            if len(names) > 1
+            else f'joint {names[0]} swings'
+        )
+        if not is_first:
+            return f'{what}, too'
+        return (
+            f'{what} under the damping of the stop, which is taken down there: is a motor lighter '
+            'than robot.rotor_inertia, or a torque later than robot.lag?'
+        )

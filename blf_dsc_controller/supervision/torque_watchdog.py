@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.supervision.hold import FADE_TIME, Hold
 from blf_dsc_controller.supervision.reading import Readings
-from blf_dsc_controller.supervision.safe_torque import FADE_TIME, SafeTorque
 from blf_dsc_controller.supervision.sensor_noise import SensorNoise
 from blf_dsc_controller.supervision.state_watchdog import LONG_SILENCE
-from blf_dsc_controller.supervision.swing_names import SwingNames
+from blf_dsc_controller.supervision.swing import SwingNames
 
 Vector = NDArray[np.float64]
 
@@ -26,8 +26,8 @@ class TorqueWatchdog:
     Times are those [s] of a steady clock. It commands when no torque of the controller
     has been seen for `timeout` while joint states went on by half of that, by their
     stamps: a plant in lock-step, which waits for a torque, is left alone. It ends with
-    the next torque of the controller, or when the safe torque has faded because the
-    states stopped, too.
+    the next torque of the controller, or when load and damping have faded because the
+    states stopped, too: the drives then keep the gravity of where the arm was.
 
     It then waits for the next torque of the controller before it watches again, as it
     does after a silence of the states of LONG_SILENCE, and after the controller has
@@ -61,10 +61,13 @@ class TorqueWatchdog:
         self._timeout = timeout
         self._sensor = SensorNoise(len(config.joints))
         self._readings = Readings(config, self._sensor.state)
-        self._safe = SafeTorque(self._readings)
         self._swings = SwingNames(config.joints)
         self.config = config
-        self.configure(config)
+        settings = settings_of_config(config)
+        self._hold = Hold(
+            self._readings, settings, settings.initial_estimate, config.sample_time
+        )
+        self._limit = settings.torque.limit
         self.stamp = -1
         self._commanded_stamp = -1  # of the last state before the last torque
         self._seen_at = -inf
@@ -77,31 +80,34 @@ class TorqueWatchdog:
     def configure(self, config: ControllerConfig) -> None:
         """Use another configuration of the same joints, from the next torque on."""
         if config.robot != self.config.robot:
-            self._safe.forget_load()  # what was missing was missing from another model
+            self._hold.forget_load()  # what was missing was missing from another model
             self._readings.count_turns_anew(config)
         self._readings.set_limits(config.safety)
         self.config = config
-        self._settings = settings_of_config(config)
-        self._estimate = self._settings.initial_estimate
-        self._safe.longest_step = config.sample_time
+        settings = settings_of_config(config)
+        self._hold.configure(settings, settings.initial_estimate, config.sample_time)
+        self._limit = settings.torque.limit
 
     def _rehearse(self) -> None:
         """Compute a safe torque as after a takeover: its kernels are compiled then."""
-        n = self._settings.n
+        n = self._limit.size
         sensor = SensorNoise(n)
         readings = Readings(self.config, sensor.state)
-        safe = SafeTorque(readings)
+        settings = settings_of_config(self.config)
+        hold = Hold(
+            readings, settings, settings.initial_estimate, self.config.sample_time
+        )
         holding = replace(self.config.safety, torque='hold_gravity')
         for k in (1, 2):  # the second one shows an acceleration
             reading = readings.take(k * self.config.sample_time_ns, np.zeros(3 * n))
             sensor.take(reading)
             readings.follow(reading)
-            safe.advance(holding, self._settings, self._estimate, 0.0)
+            hold.advance(holding, 0.0)
 
     @property
     def has_state(self) -> bool:
         """Whether it knows where the arm is."""
-        return self._safe.last.age < FADE_TIME
+        return self._readings.last.age < FADE_TIME
 
     @property
     def watches(self) -> bool:
@@ -153,8 +159,8 @@ class TorqueWatchdog:
 
         Of one that is not finite or beyond its limit, it is not known what the drive holds.
         """
-        if (np.abs(torque) <= self._settings.torque.limit).all():
-            self._safe.commanded[:] = torque
+        if (np.abs(torque) <= self._limit).all():
+            self._hold.commanded[:] = torque
             self._knows_torque = True
         self._commanded_at = now
         self._commanded_stamp = self.stamp
@@ -165,29 +171,29 @@ class TorqueWatchdog:
         dt = min(now - self._polled_at, self._timeout)
         self._polled_at = now
         safety = self.config.safety
-        safe = self._safe
+        last = self._readings.last
         if now - self._seen_at > self.config.sample_time + safety.state_timeout:
-            safe.last.miss(dt)
+            last.miss(dt)
         if not self.active:
             if self._knows_torque:
-                safe.observe(self._settings, self._estimate, dt)
+                self._hold.observe(dt)
             self._begin_if_due(now)
         if not self.active:
             return None
-        torque = safe.advance(safety, self._settings, self._estimate, dt)
-        if safe.last.age >= FADE_TIME:
+        torque = self._hold.advance(safety, dt)
+        if last.age >= FADE_TIME:
             self._forget_controller()
         return torque
 
     def name_swings(self) -> str:
         """Return a text about joints that swing under its torque, each once; or empty."""
-        return self._swings.name(self._safe.has_swung)
+        return self._swings.name(self._hold.has_swung)
 
     def leave(self) -> Vector | None:
         """Return the torque to leave behind, None if the controller commands."""
         if not self.active:
             return None
-        return self._safe.leave(self.config.safety, self._settings, self._estimate)
+        return self._hold.leave(self.config.safety)
 
     def _forget_controller(self) -> None:
         """Wait for a torque of the controller."""
@@ -206,4 +212,4 @@ class TorqueWatchdog:
         self._swings.begin()
         # as if the torque that the drive holds were the model's
         if not self._knows_torque:
-            self._safe.leave(self.config.safety, self._settings, self._estimate)
+            self._hold.leave(self.config.safety)
