@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check the first torque before it is sent to an arm that nobody has commanded yet.
+"""Checks before the first torque of an arm that nobody has commanded yet.
 
 The effort of a resting arm shows whether its drives compensate gravity: it equals
 gravity if they do, and is zero if the brakes hold the arm.  Only its direction and
 order of magnitude are used, so it may also be a current.  A zero effort is inconclusive
 if it may not be measured, or may not contain what the drives add.  Then no torque of
-gravity is sent unless the configuration says that the drives tolerate it (`support`).
+gravity is sent unless the configuration says that the drives tolerate it (`check_support`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.supervision.model_torque import gravity_torque
+from blf_dsc_controller.supervision.reading import Reading
 
 Vector = NDArray[np.float64]
 
@@ -34,21 +35,52 @@ _DRIVER = (
 )
 
 
+def check_support(
+    controller: Controller, config: ControllerConfig, measurement: Vector
+) -> None:
+    """Raise StartError if it is unknown what holds the arm, and no step is limited.
+
+    Brakes may hold it, or drives that compensate gravity, to which gravity would be
+    added.
+    """
+    robot = config.robot
+    is_known = robot.drive_compensates != 'none' or robot.effort in ('whole', 'current')
+    if not robot.urdf or is_known or config.safety.first_torque == 'send':
+        return
+    q, dq, effort = measurement.reshape(3, -1)
+    gravity = gravity_torque(controller.settings, controller.state.estimate, q)
+    unlimited = np.where(np.array(config.torque.first_step) > 0.0, 0.0, np.abs(gravity))
+    worst = int(np.argmax(unlimited))
+    matters = unlimited[worst] > MATTERS * config.torque.limit[worst]
+    # of an effort like gravity, `check_first_torque` says more
+    is_held = np.isfinite(effort).all() and is_like(effort, gravity)
+    if matters and not is_held and not np.abs(dq).max() > AT_REST:
+        unit = config.units[worst].torque
+        raise StartError(
+            'what holds the arm? The arm rests, but the joint states do not show whether its '
+            'brakes hold it, or drives that compensate gravity: on joint '
+            f'{config.joints[worst]!r} gravity is {gravity[worst]:.4g} {unit}, and the effort is '
+            f'{effort[worst]:.4g} {unit}. If the drives compensate gravity, set '
+            'robot.drive_compensates. If not, set robot.effort to whole, if the drives measure '
+            'torques, or set torque.first_step to the torques that may be sent at once'
+        )
+
+
 def check_first_torque(
     controller: Controller,
     config: ControllerConfig,
-    measurement: Vector,
+    reading: Reading,
     acting: Vector | None,
 ) -> None:
     """Raise StartError if the first torque must not be sent; the controller has begun.
 
-    `measurement` is [q (n,) rad, dq (n,) rad/s, effort (n,) N m]; `acting` (n,) [N m] the
-    command of another node, if one holds the arm.
+    `reading` is the first state; `acting` (n,) [N m] the command of another node, if one holds
+    the arm.
     """
     if config.safety.first_torque == 'send':
         return
-    torque = controller.trial(0.0, config.sample_time, measurement)
-    q, dq, effort = measurement.reshape(3, -1)
+    torque = controller.trial(0.0, config.sample_time, reading.measurement)
+    q, dq, effort = reading.q, reading.dq, reading.effort
     gravity = np.zeros_like(q)
     if config.robot.urdf and acting is None:
         gravity = gravity_torque(controller.settings, controller.state.estimate, q)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,8 +12,10 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import StartError
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.reference.approach import (
+    AT_REST,
     BlendedReference,
     MotionError,
+    check_takeover,
     plan_resumption,
     plan_start,
 )
@@ -19,13 +23,48 @@ from blf_dsc_controller.reference.retargeting import plan_stop
 from blf_dsc_controller.reference.terms import remaining
 from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.run import NANOSECOND
-from blf_dsc_controller.supervision.start import (
-    PreparedStart,
-    can_take_over,
-    prepared_start,
-)
+from blf_dsc_controller.supervision.reading import Reading
 
 Vector = NDArray[np.float64]
+
+_SAME_PLACE = 0.05  # of the bound
+
+
+class PreparedStart(NamedTuple):
+    """A start that was planned before the first state."""
+
+    positions: Vector  # rad, from which it begins at rest
+    motion: BlendedReference
+
+    def fits(
+        self, config: ControllerConfig, bound: Vector, q: Vector, dq: Vector
+    ) -> bool:
+        """Whether it can be used for an arm at q (n,) [rad] with dq (n,) [rad/s].
+
+        The bound (n,) [rad] is the one at the start.
+        """
+        moved = np.abs(q - self.positions)
+        if not np.all(moved < _SAME_PLACE * np.array(config.barrier.bound)):
+            return False
+        if np.abs(dq).max() > AT_REST:
+            return False
+        return can_take_over(config, bound, q, dq, self.motion.vector, 0.0)
+
+
+def can_take_over(
+    config: ControllerConfig,
+    bound: Vector,
+    q: Vector,
+    dq: Vector,
+    reference_vector: Vector,
+    t: float,
+) -> bool:
+    """Whether the law can take over at time t [s]: `check_takeover` as an answer."""
+    try:
+        check_takeover(config, bound, q, dq, reference_vector, t)
+    except StartError:
+        return False
+    return True
 
 
 class RunningReference:
@@ -64,57 +103,52 @@ class RunningReference:
             MotionError: no approach from there keeps the limits.
         """
         bound = self._controller.bound_at(0.0)
-        self._prepared = prepared_start(config, bound, positions)
+        motion = plan_start(config, bound, positions, np.zeros(positions.size))
+        self._prepared = PreparedStart(positions.copy(), motion)
 
     def drop_prepared(self) -> None:
         """Plan the next start by the configuration that is in force then."""
         self._prepared = None
 
     def plan_start(
-        self, config: ControllerConfig, q: Vector, dq: Vector, *, again: bool
+        self, config: ControllerConfig, reading: Reading, *, again: bool
     ) -> BlendedReference:
-        """Return the reference from q (n,) [rad] and dq (n,) [rad/s] on, at t = 0.
+        """Return the reference from a state on, at t = 0.
 
         It is the one of `prepare`, once, if the arm rests there.  `again`: it is not the
         first one of this controller.  Raises as `prepare` does.
         """
         prepared = self._prepared
         self._prepared = None
-        bound = self._controller.bound_at(0.0)
+        bound, q, dq = self._controller.bound_at(0.0), reading.q, reading.dq
         if prepared is not None and prepared.fits(config, bound, q, dq):
             return prepared.motion
         return plan_start(config, bound, q, dq, again=again)
 
     def plan_resumption(
-        self, config: ControllerConfig, stamp: int, q: Vector, dq: Vector
+        self, config: ControllerConfig, reading: Reading
     ) -> BlendedReference | None:
-        """Return the way back to the reference, None if the arm is too far from it.
-
-        `stamp` [ns] is that of q (n,) [rad] and dq (n,) [rad/s].
-        """
-        if stamp <= self.last_stamp:
+        """Return the way back to the reference, None if the arm is too far from it."""
+        if reading.stamp <= self.last_stamp:
             return None
-        t = self.time_of(stamp)
+        t = self.time_of(reading.stamp)
         bound = self._controller.bound_at(t)
         vector = self._controller.reference_vector
         try:
-            return plan_resumption(config, bound, q, dq, vector, t)
+            return plan_resumption(config, bound, reading.q, reading.dq, vector, t)
         except (StartError, MotionError):
             return None
 
     def as_planned(
-        self, config: ControllerConfig, stamp: int, q: Vector, dq: Vector
+        self, config: ControllerConfig, reading: Reading
     ) -> BlendedReference | None:
-        """Return the reference as it is, None if the arm is too far from it.
-
-        The arguments are those of `plan_resumption`.
-        """
-        t = self.time_of(stamp)
+        """Return the reference as it is, None if the arm is too far from it."""
+        if reading.stamp <= self.last_stamp:
+            return None
+        t = self.time_of(reading.stamp)
         bound = self._controller.bound_at(t)
         vector = self._controller.reference_vector
-        if stamp <= self.last_stamp:
-            return None
-        if not can_take_over(config, bound, q, dq, vector, t):
+        if not can_take_over(config, bound, reading.q, reading.dq, vector, t):
             return None
         return BlendedReference(vector, self.settled)
 

@@ -11,14 +11,16 @@ from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.law.start import Start
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.messages.journal import EventType
-from blf_dsc_controller.reference.approach import MotionError
+from blf_dsc_controller.reference.approach import BlendedReference, MotionError
 from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
 from blf_dsc_controller.supervision.findings import Findings
+from blf_dsc_controller.supervision.first_torque import (
+    check_first_torque,
+    check_support,
+)
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.reading import Reading
 from blf_dsc_controller.supervision.supervisor import Phase, Reason
-from blf_dsc_controller.supervision.support import check_support
-from blf_dsc_controller.supervision.takeover import Takeover
 
 Vector = NDArray[np.float64]
 
@@ -40,7 +42,9 @@ class Starting:
         self._command = command
         self._findings = findings
         self._loads = loads
-        self._takeover = Takeover(command.controller, command.reference, command.held)
+        self._acting: Vector | None = None  # N m, by which another node holds the arm
+        self._load: Vector | None = None  # N m, load of a reset, which goes on
+        self._left_at: Vector | None = None  # rad, where the law left command
 
     def activate(self) -> None:
         """Take command with the next state, and what was learned before a fault.
@@ -52,14 +56,14 @@ class Starting:
         load = None
         law = command.controller
         if law.samples:
-            self._takeover.left_at = law.signals.q.copy()
+            self._left_at = law.signals.q.copy()
         if command.clean:
             law.begin(Start.AGAIN)
         else:
             load = self._held(command.estimates.estimate)
             command.estimates.restore()
         self._start_over()
-        self._takeover.carried = load
+        self._load = load
         command.watchdog.restart()
 
     def reset(self) -> None:
@@ -76,7 +80,7 @@ class Starting:
         load = self._carried(added - self._added_by_drives())
         command.estimates.keep()
         self._start_over()
-        self._takeover.carried = load
+        self._load = load
         if load is not None:
             command.safe_stop.begin_anew(command.config.safety, load)
 
@@ -95,7 +99,7 @@ class Starting:
         if command.supervisor.running:
             return command.held.load_before_learning()
         if command.supervisor.phase is Phase.STARTING:
-            return self._takeover.carried  # of a reset just before
+            return self._load  # of a reset just before
         load = self._held(command.controller.settings.initial_estimate)
         return None if load is None else load - forgotten
 
@@ -109,7 +113,7 @@ class Starting:
     def forget_load_after_gap(self, reading: Reading) -> None:
         """Drop the carried load after a gap, in which another controller may hold the arm."""
         if reading.is_after_gap or not reading.continues:
-            self._takeover.carried = None
+            self._load = None
 
     def prepare(self, positions: Vector) -> None:
         """Plan the start from rest at `positions` (n,) [rad], before the first state.
@@ -132,7 +136,7 @@ class Starting:
         this one, and what it contains besides the model is the law's load from the start.
         """
         self._command.note(EventType.TAKEOVER, torque=torque.tolist())
-        self._takeover.acting = torque.copy()
+        self._acting = torque.copy()
 
     def check_support(self, measurement: Vector) -> None:
         """Refuse to start if nothing shows what holds a live arm."""
@@ -158,13 +162,30 @@ class Starting:
 
         Return whether the law is in command from this state on.
         """
-        command = self._command
+        command, law = self._command, self._command.controller
+        reference, config = command.reference, command.config
+        commanded = command.commanded
         try:
-            resumed = self._takeover.start(command.config, reading, command.commanded)
+            motion = None
+            if reference.resumable:
+                motion = reference.plan_resumption(config, reading)
+            resumed = motion is not None
+            if motion is None:
+                again = commanded is not None
+                motion = reference.plan_start(config, reading, again=again)
+            law.reference_vector = motion.vector
+            self._begin_elsewhere(reading.q)
+            self._begin_at_acting(reading.q)
+            if self._load is not None:
+                self._begin_with_load(self._load)
+            if commanded is None:
+                check_first_torque(law, config, reading, self._acting)
         except (StartError, MotionError) as error:
             self.refuse(error)
             return False
-        self._take_command(reading.stamp, resumed=resumed)
+        if not resumed:
+            reference.start_at(reading.stamp, config, reading.q)
+        self._follow(motion, reading, resumed=resumed)
         return True
 
     def rejoin(self, reading: Reading) -> bool:
@@ -172,12 +193,20 @@ class Starting:
 
         Whoever commanded it meanwhile may have braked it.  Without `safety.error_ratio` the
         law goes on instead.  Of an invalid state, the law says what is wrong.
+
+        If the sample before was the first one, its plan may have taken all that time: another
+        would take it again, and the law go on blind.
         """
-        command = self._command
-        if not is_valid_state(command.controller.checks, reading.measurement):
+        command, law = self._command, self._command.controller
+        if not is_valid_state(law.checks, reading.measurement):
             return True
-        if self._takeover.rejoin(command.config, reading, command.commanded):
-            self._take_command(reading.stamp, resumed=True)
+        reference = command.reference
+        has_just_planned = law.samples == 1
+        way = reference.as_planned if has_just_planned else reference.plan_resumption
+        motion = way(command.config, reading)
+        if motion is not None:
+            law.begin(Start.AFTER_GAP)
+            self._follow(motion, reading, resumed=True)
             return True
         if command.config.safety.error_ratio == 0.0:
             return True  # no error stops this arm
@@ -188,19 +217,49 @@ class Starting:
         command.stop(Reason.STAMP_JUMP, text)
         return False
 
-    def _take_command(self, stamp: int, *, resumed: bool) -> None:
-        """Go on from a start, or from the return to the reference, with this state."""
+    def _begin_elsewhere(self, q: Vector) -> None:
+        """Keep nothing of the posture that the arm was left in, if it is elsewhere.
+
+        That is farther away than the bound on its error.
+        """
+        left_at, self._left_at = self._left_at, None
+        law = self._command.controller
+        if left_at is not None and (np.abs(q - left_at) > law.bound_at(0.0)).any():
+            law.begin(Start.ELSEWHERE)
+
+    def _begin_at_acting(self, q: Vector) -> None:
+        """Let the law begin with the torque that another node holds the arm by, if any."""
+        if self._acting is None:
+            return
+        self._begin_with_load(self._command.held.load_of(self._acting, q))
+        self._command.controller.take_over(self._acting, q)
+
+    def _begin_with_load(self, load: Vector) -> None:
+        """Let d^3 begin with a load (n,) [N m]."""
+        law = self._command.controller
+        integrates = law.settings.disturbance.gain > 0.0
+        law.state.disturbance[integrates] = load[integrates]
+
+    def _follow(
+        self, motion: BlendedReference, reading: Reading, *, resumed: bool
+    ) -> None:
+        """Follow a motion from this state on, at the torque that acts."""
         command = self._command
+        command.reference.follow_from_start(motion)
+        if command.commanded is not None and self._acting is None:
+            held = command.held.command()
+            acts = command.commanded if held is None else held
+            command.controller.take_over(acts, reading.q)
         command.journal.note(EventType.START, resumed=resumed)
-        command.reference.last_stamp = stamp - command.config.sample_time_ns
-        self._takeover.acting = self._takeover.carried = None
+        command.reference.last_stamp = reading.stamp - command.config.sample_time_ns
+        self._acting = self._load = None
         command.held.recent.restart()
-        command.watchdog.switch(command.config.safety.watchdog, stamp)
+        command.watchdog.switch(command.config.safety.watchdog, reading.stamp)
         command.supervisor.enter(Phase.APPROACHING)
 
     def _start_over(self) -> None:
         """Wait for a state to start from, with neither faults nor what they have led to."""
         self.error = None
-        self._takeover.acting = self._takeover.carried = None
+        self._acting = self._load = None
         self._command.start_over()
         self._findings.restart()
