@@ -2,8 +2,9 @@
 """The torque that holds an arm without its law, and ramps to it.
 
 It is zero, damping -D v, or damping with gravity H(q, 0, 0, 0) P^ and a load, as `safety.torque`
-says, less what the drives add.  Only trusted states enter it.  Without one, damping and load fade
-within half a second to what the model knows: its gravity where the arm was last, or nothing.
+says, less what the drives add.  Only trusted states enter it.  Without one, the damping fades
+within half a second, and so does a load that the arm has not shown to carry: what is left is the
+torque that held the arm where it was last.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from blf_dsc_controller.supervision.swing import Swing
 Vector = NDArray[np.float64]
 
 FADE_TIME = 0.5
-"""Time [s] in which damping and load fade while no usable state arrives."""
+"""Time [s] in which damping fades, and a load that is not sure, while no state is trusted."""
 
 _RESTED = 10.0 / OBSERVER[1]  # s at rest, in which the observed load settles
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
@@ -246,7 +247,8 @@ class Hold:
             if kind == 'hold_gravity':
                 D = braking_matrix(settings, damping, last.q, last.gap)
                 torque -= left * (D @ last.slow)
-                torque += self.gravity(self._estimate) + left * self.load
+                kept = 1.0 if self.carries else left
+                torque += self.gravity(self._estimate) + kept * self.load
                 torque -= added_torque(settings.torque, last.q)
         return torque
 

@@ -37,8 +37,8 @@ class LastState:
         age: time without a trusted state [s]; infinite before the first.
         gap: longest time [s] between two states of the last quarter of a second, in which
             states were missing, at most 0.25 s; 0 if none were.
-        speed: of each joint (n,) [rad/s], as the last two positions showed it.
         stamp: of the last state [ns]; -1 before the first.
+        speed: of each joint (n,) [rad/s], as the last two positions showed it.
     """
 
     def __init__(self, n: int) -> None:
@@ -52,6 +52,7 @@ class LastState:
         self._gap_ended = 0  # ns, stamp of the state after it
         self.stamp = -1
         self.speed = np.zeros(n)
+        self._known: Vector | None = None  # dq, while it is forgotten
 
     def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
         """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
@@ -60,6 +61,7 @@ class LastState:
         self.ddq = None
         self.age = 0.0
         self.stamp = stamp
+        self._known = None
 
     def follow(
         self,
@@ -81,6 +83,9 @@ class LastState:
         is_next = continues and elapsed > 0.0 and not is_gap(elapsed, period)
         is_next = is_next and self.age < inf
         self.measure_gap(stamp, period)
+        if self._known is not None:
+            self.dq[:] = self._known
+            self._known = None
         differenced = np.zeros_like(q)
         if is_next:
             differenced = (q - self.q) / elapsed
@@ -108,6 +113,8 @@ class LastState:
         self.age += period
 
     def _forget_motion(self) -> None:
+        if self._known is None:
+            self._known = self.dq.copy()
         self.dq[:] = self.slow[:] = 0.0
         self.ddq = None
 

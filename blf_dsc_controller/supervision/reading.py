@@ -31,6 +31,9 @@ from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
 
+ALONE = 0.5
+"""Time [s] after which states that follow from each other are trusted, wherever they began."""
+
 _STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
 _FINEST = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
 
@@ -125,6 +128,7 @@ class Readings:
     Attributes:
         last: the last trusted state.
         sensor: what the readings show of their sensor, as `law.sensor` finds it.
+        fastest: largest speed of each joint (n,) [rad/s].
     """
 
     def __init__(self, config: ControllerConfig, sensor: Sensor) -> None:
@@ -138,13 +142,17 @@ class Readings:
         if config.safety.velocity == 'estimated':
             self._velocity = Velocity(n)
         self._seen = self._before = 0  # ns, of the last trusted state, and before it
+        # ns and rad, of the last state, trusted or not, and since when each has followed from
+        # the one before
+        self._arrived = self._alone_since = 0
+        self._at = np.zeros(n)
         self._read = np.full(2 * n, nan)  # q and dq as last read
         self._new_at = -1  # ns, stamp of the first state with these
         self.set_limits(config.safety)
 
     def set_limits(self, safety: Safety) -> None:
         """Take these for the largest speeds of the joints from the next state on."""
-        self._fastest = np.array(safety.velocity_limit)
+        self.fastest = np.array(safety.velocity_limit)
 
     def count_turns_anew(self, config: ControllerConfig) -> None:
         """Count turns from the next state on, of joints that a configuration describes."""
@@ -160,10 +168,13 @@ class Readings:
         is_after_gap = is_gap(gap, self._sample_time)
         if gap < 0.0 or is_after_gap:
             restart(self.sensor)
-        counted, wrapped = self._wraps.count(measurement, gap, self._fastest)
+        counted, wrapped = self._wraps.count(measurement, gap, self.fastest)
         if begins and wrapped is not None:
             self._wraps.restart()
         found = self._doubt(stamp, counted)
+        if found is not Doubt.NOT_FINITE:
+            self._at[:] = counted[: self._at.size]
+        self._arrived = stamp
         if begins and found is Doubt.OUT_OF_REACH:
             restart(self.sensor)
         doubt = None if begins and found is not Doubt.NOT_FINITE else found
@@ -176,7 +187,7 @@ class Readings:
         self.last.follow(
             reading.stamp,
             reading.measurement,
-            self._fastest,
+            self.fastest,
             self._sample_time,
             continues=reading.continues,
         )
@@ -184,7 +195,7 @@ class Readings:
     def use(self, reading: Reading) -> None:
         """Let a reading that the law uses be the last one."""
         self.last.measure_gap(reading.stamp, self._sample_time)
-        fastest = self._fastest
+        fastest = self.fastest
         slow = np.minimum(np.maximum(self.velocity, -fastest), fastest)
         self.last.take(reading.stamp, reading.measurement, slow)
 
@@ -226,23 +237,30 @@ class Readings:
     def _doubt(self, stamp: int, measurement: Vector) -> Doubt | None:
         """Return why a state is not trusted; None: it comes from the last one.
 
-        A joint may be twice as fast as its limit, or twice as fast as before.  Stamps jitter,
-        and clocks are set back: a sample time counts as one at least.
+        Since the last trusted state, a joint may have gone on twice as fast as it was then, and
+        since the last of all states twice as fast as its limit.  So of two senders whose states
+        alternate, the one that was trusted is, however rare its states are.  Once all states have
+        followed from each other for ALONE, they are trusted again.  Stamps jitter, and clocks are
+        set back: a sample time counts as one at least.
         """
-        last = self.last
+        last, T = self.last, self._sample_time
         q = measurement[: last.q.size]
         if not np.isfinite(q).all():
             return Doubt.NOT_FINITE
+        elapsed = (stamp - last.stamp) * NANOSECOND
+        step = max(T, (stamp - self._arrived) * NANOSECOND)
+        limit = 2.0 * self.fastest * step
+        if (np.abs(q - self._at) > limit).any():
+            self._alone_since = stamp
         if last.age == inf:
             return None
-        elapsed = (stamp - last.stamp) * NANOSECOND
         if elapsed == 0.0:
             return Doubt.COPY
         if self._is_repeated(stamp, measurement):
             return Doubt.REPEATED
-        fastest = self._fastest + last.speed
-        reach = 2.0 * fastest * max(elapsed, self._sample_time)
-        if (np.abs(q - last.q) > reach).any():
+        reach = limit + 2.0 * last.speed * max(T, elapsed)
+        is_alone = (stamp - self._alone_since) * NANOSECOND >= ALONE
+        if not is_alone and (np.abs(q - last.q) > reach).any():
             return Doubt.OUT_OF_REACH
         return None
 
