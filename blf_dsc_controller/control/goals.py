@@ -33,7 +33,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.plan import Plan
+from blf_dsc_controller.supervision.motions import Plan
 from blf_dsc_controller.supervision.supervisor import Reason
 
 _FEEDBACK_PERIOD = 0.05  # s

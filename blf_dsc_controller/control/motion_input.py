@@ -35,7 +35,7 @@ from blf_dsc_controller.reference.trajectory import (
 from blf_dsc_controller.reference.turns import short_way
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.plan import LatePlanError, Plan
+from blf_dsc_controller.supervision.motions import LatePlanError, Plan
 
 # bytes per joint of a point with all its fields, each with a header of 8 bytes
 _POINT_SIZE = 32

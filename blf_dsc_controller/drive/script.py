@@ -171,7 +171,7 @@ class Script(Beside):
     def _declare(self, wanted: dict[str, Any]) -> None:
         load = DriveLoad(wanted['mass'], tuple(wanted['centre']))
         try:
-            self._guard.loads.declare(self._guard.config, load)
+            self._guard.loads.declare(load)
         except BlfDscError as error:
             self._tell_done(wanted['number'], str(error))
         else:

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.load_observer import most_load
@@ -68,50 +69,88 @@ class DriveLoad(NamedTuple):
 class DriveLoads:
     """The load that is declared to the drives of an arm, step by step.
 
+    It follows what the law weighs with `load.tell_drive`, else from the first load on that is
+    declared by hand.
+
     Attributes:
-        declared: the load at the start, `robot.drive_payload`.
-        base: the load when the law began to learn: at the start, or at a reset.
         in_force: the load that the drives have accepted last.
-        wanted: the load that a user declares, whatever is weighed; None: none.
     """
 
-    def __init__(self, config: ControllerConfig) -> None:
+    def __init__(self, config: ControllerConfig, controller: Controller) -> None:
         robot = config.robot
-        self.declared = DriveLoad(robot.drive_payload, robot.drive_payload_centre)
-        self.in_force = self.base = self.declared
-        self.wanted: DriveLoad | None = None
-        self._robot = robot
-        self._chain = robot.chain(config.joints)
+        self._at_start = DriveLoad(robot.drive_payload, robot.drive_payload_centre)
+        self.in_force = self._at_start
+        # when the law began to learn: at the start, or at a reset
+        self._base = self._at_start
+        self._wanted: DriveLoad | None = None  # by hand, whatever is weighed
+        self._controller = controller
+        self._robot, self._joints = robot, config.joints
+        self._is_used = config.load.tell_drive
         self._goes_on = False  # a load has been declared in part
 
-    def take(self, controller: Controller, load: DriveLoad) -> None:
-        """Count the weight of this load, which the drives add from now on, in the law."""
+    def declare(self, load: DriveLoad) -> None:
+        """Let the steps lead to this load, whatever is weighed.
+
+        Raises:
+            BlfDscError: the drives add no weight.
+        """
+        self._begin_use()
+        self._wanted = load
+
+    def _begin_use(self) -> None:
+        if self._robot.drive_compensates == 'none':
+            raise BlfDscError(
+                'robot.drive_compensates: got none: these drives add no weight, so no load '
+                'can be declared to them; the law weighs and carries it by itself'
+            )
+        self._is_used = True
+
+    def take(self, load: DriveLoad) -> None:
+        """Count the weight of this load, which the drives add from now on, in the law.
+
+        Raises:
+            BlfDscError: the drives add no weight.
+        """
+        self._begin_use()
         self.in_force = load
+        self.subtract_again()
+
+    def subtract_again(self) -> None:
+        """Subtract the weight that the drives add, after the settings were replaced."""
+        if not self._is_used:
+            return
+        controller = self._controller
         settings = controller.settings
         settings.torque.drive_inertias[:] = self._added()
         # the last command met the drives with this load already
         added = added_torque(settings.torque, controller.signals.q)
         controller.state.saturation.added[:] = added
 
-    def forget(self, controller: Controller) -> None:
+    def forget(self) -> None:
         """Begin again with a law that has forgotten what the tip holds.
 
         The drives hold it by the load in force: the law counts neither.  Joint torque
         sensors show both, so the load observer is off from then on.
         """
-        self.base = self.in_force
+        if not self._is_used:
+            return
+        self._base = self.in_force
         self._goes_on = False
-        controller.settings.torque.drive_inertias[:] = self._added()
-        is_left_out = not np.allclose(self.base.moments, self.declared.moments)
-        most = controller.settings.observer.most
-        most[:] = 0.0 if is_left_out else most_load(controller.settings.torque.limit)
+        settings = self._controller.settings
+        settings.torque.drive_inertias[:] = self._added()
+        is_left_out = not np.allclose(self._base.moments, self._at_start.moments)
+        most = 0.0 if is_left_out else most_load(settings.torque.limit)
+        settings.observer.most[:] = most
 
-    def begin_step(self, controller: Controller) -> DriveLoad | None:
+    def begin_step(self) -> DriveLoad | None:
         """Begin the next step: return the load to declare; None if there is none, or too uncertain.
 
         Nothing is declared while something touches the arm.
         """
-        target = self._weighed(controller) if self.wanted is None else self._left()
+        if not self._is_used:
+            return None
+        controller = self._controller
+        target = self._weighed() if self._wanted is None else self._left()
         if target is None or is_touched(controller.state.contact):
             return None
         settings = controller.settings
@@ -131,20 +170,20 @@ class DriveLoads:
 
     def _left(self) -> Vector | None:
         """Return mass and moments (4,) that a user declares; None: the drives have them."""
-        if self.wanted is None or np.allclose(
-            self.in_force.moments, self.wanted.moments
+        if self._wanted is None or np.allclose(
+            self.in_force.moments, self._wanted.moments
         ):
             return None
-        return self.wanted.moments
+        return self._wanted.moments
 
     @property
     def is_declared(self) -> bool:
         """Whether the drives have what a user declares, if anything."""
         return self._left() is None
 
-    def _weighed(self, controller: Controller) -> Vector | None:
+    def _weighed(self) -> Vector | None:
         """Return mass and moments (4,) that the drives should get; None: no change."""
-        load = controller.state.weighing.load
+        load = self._controller.state.weighing.load
         half = TWO_SIDED * load[DEVIATION]
         narrow = widest_interval(load[MASS])
         if not 0.0 < half < narrow:
@@ -155,22 +194,23 @@ class DriveLoads:
             if not ((spread > 0.0) & (spread < _CENTRE)).all():
                 return None
             picked_up[:] = load[MASS] * np.array((1.0, *load[MASS + 1 : DEVIATION]))
-        target = self.base.moments + picked_up
+        target = self._base.moments + picked_up
         target = np.asarray(DriveLoad.of(target).moments)
         is_new = abs(target[0] - self.in_force.mass) > narrow
         return target if is_new or self._goes_on else None
 
     def _added(self) -> Vector:
         """Return the factors of the columns of the drives' gravity, for the law."""
-        if self.base is self.declared:
+        if self._base is self._at_start:
             return self._columns(self.in_force)
-        since = self._columns(self.in_force) - self._columns(self.base)
-        return self._columns(self.declared) + since
+        since = self._columns(self.in_force) - self._columns(self._base)
+        return self._columns(self._at_start) + since
 
     def _columns(self, load: DriveLoad) -> Vector:
         """Return the factors of the columns of the drives' gravity, with this load."""
         robot = replace(
             self._robot, drive_payload=load.mass, drive_payload_centre=load.centre
         )
-        inertias = robot.drive_inertias(self._chain, self._chain.inertias)
+        chain = robot.chain(self._joints)
+        inertias = robot.drive_inertias(chain, chain.inertias)
         return np.asarray(inertias[:, :4].ravel())

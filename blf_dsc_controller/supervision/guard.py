@@ -8,7 +8,7 @@ joint state -> StateCheck -> law -> SampleCheck -> torque
 `Guard` answers each message, silence and error with a torque.  It leaves the rest to its
 parts: `Starting` brings the law into command, `InCommand` takes it out of command and
 computes the safe torque, `Findings` reacts to contacts and oscillations that the law has
-detected, `Motions` changes the reference, and `DeclaredLoads` counts the load that was
+detected, `Motions` changes the reference, and `DriveLoads` counts the load that was
 declared to the drives.
 """
 
@@ -34,8 +34,7 @@ from blf_dsc_controller.messages.errors import (
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision import retuning
-from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
 from blf_dsc_controller.supervision.envelope import LONGEST, Motion, limited
 from blf_dsc_controller.supervision.envelope_limits import limits_of
 from blf_dsc_controller.supervision.findings import Findings
@@ -80,7 +79,7 @@ class Guard(InCommand):
         """Compile the law; `steady` and `wall` are the clocks [ns]."""
         super().__init__(config, steady, wall)
         self.findings = Findings(self)
-        self.loads = DeclaredLoads(config, self.controller)
+        self.loads = DriveLoads(config, self.controller)
         self.starting = Starting(self, self.findings, self.loads)
         self.motions = Motions(self, self.findings.contacts)
         self.foreign = 0
@@ -272,7 +271,7 @@ class Guard(InCommand):
 
     def take_over(self, load: DriveLoad) -> None:
         """Subtract the weight of a load that the drives add from the next state on."""
-        self.loads.take(self.config, load)
+        self.loads.take(load)
         centre = list(load.centre)
         self.note(EventType.DRIVE_LOAD, mass=load.mass, centre=centre)
         self.held.recent.restart()  # the torques so far met drives without it

@@ -169,8 +169,6 @@ class Readings:
         if gap < 0.0 or is_after_gap:
             restart(self.sensor)
         counted, wrapped = self._wraps.count(measurement, gap, self.fastest)
-        if begins and wrapped is not None:
-            self._wraps.restart()
         found = self._doubt(stamp, counted)
         if found is not Doubt.NOT_FINITE:
             self._at[:] = counted[: self._at.size]
@@ -180,6 +178,8 @@ class Readings:
         doubt = None if begins and found is not Doubt.NOT_FINITE else found
         if doubt is None:
             self._trust(stamp, counted)
+            if begins and wrapped is not None:
+                self._wraps.restart()
         return Reading(stamp, counted, gap, is_after_gap, found is None, doubt, wrapped)
 
     def follow(self, reading: Reading) -> None:
@@ -228,6 +228,7 @@ class Readings:
 
     def _trust(self, stamp: int, measurement: Vector) -> None:
         self._before, self._seen = self._seen, stamp
+        self._wraps.trust(measurement[: self._at.size])
         if self._velocity is not None:
             self._velocity.replace(stamp, measurement)
         if not self._equals(measurement):

@@ -12,7 +12,7 @@ from blf_dsc_controller.law.start import Start
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import BlendedReference, MotionError
-from blf_dsc_controller.supervision.declared_loads import DeclaredLoads
+from blf_dsc_controller.supervision.drive_load import DriveLoads
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.first_torque import (
     check_first_torque,
@@ -34,7 +34,7 @@ class Starting:
     """
 
     def __init__(
-        self, command: InCommand, findings: Findings, loads: DeclaredLoads
+        self, command: InCommand, findings: Findings, loads: DriveLoads
     ) -> None:
         """Bring the law of `command` into command, without earlier findings."""
         self.error: BlfDscError | None = None

@@ -2,7 +2,7 @@
 """Positions that wrap: encoders that count within one turn, as (-pi, pi] or [0, 2 pi).
 
 Law, checks and differenced velocities need positions that go on.  Turns are counted
-from the first state on.  For a continuous joint this is all.  Another joint has a range,
+from the first trusted state on.  For a continuous joint this is all.  Another joint has a range,
 in which a driver that wraps cannot tell where it is: this is a fault.  Its turns are
 counted until the next start all the same, since the safe torque needs its motion, too.
 """
@@ -33,7 +33,7 @@ class Wraps:
         self._joints = config.joints
         self._is_free = turns_freely(config)
         self._has_range = np.array([kind == 'revolute' for kind in kinds])
-        self._offset = np.zeros(n)  # rad, whole turns
+        self._offset = self._next = np.zeros(n)  # rad, whole turns, and with this state
         self._is_off = False  # whether any is not zero
         self._last = np.full(n, nan)  # rad, counted on
         self._counted = np.zeros(3 * n)
@@ -44,40 +44,46 @@ class Wraps:
         """Count turns on in a measurement [q, dq, effort] (3n,); return it, and its fault.
 
         It is the given one unless a turn has been counted.  `gap` [s] is the time since
-        the state before, `fastest` (n,) [rad/s] the largest speed of each joint.
+        the last trusted state, `fastest` (n,) [rad/s] the largest speed of each joint.
         """
         n = self._last.size
         q = measurement[:n] + self._offset if self._is_off else measurement[:n]
         step = q - self._last
         fault = None
-        if hypot(*step.tolist()) <= pi:  # as a rule; not if a position is not finite
-            self._last[:] = q
-        else:
-            q, fault = self._counted_on(measurement, step, gap, fastest)
-        if not self._is_off:
+        self._next = self._offset
+        if (
+            not hypot(*step.tolist()) <= pi
+        ):  # as a rule; not if a position is not finite
+            fault = self._count_on(measurement, step, gap, fastest)
+            q = measurement[:n] + self._next
+        if not self._is_off and self._next is self._offset:
             return measurement, fault
         self._counted[:] = measurement
         self._counted[:n] = q
         return self._counted, fault
 
-    def _counted_on(
-        self, measurement: Vector, step: Vector, gap: float, fastest: Vector
-    ) -> tuple[Vector, Fault | None]:
-        """Count turns in a large or not finite `step` (n,) [rad]; return q and the fault."""
-        fault = None
-        if (np.abs(step) > pi).any():
-            turns = -np.rint(np.nan_to_num(step, posinf=0.0, neginf=0.0) / tau)
-            turns[np.abs(turns) > _MOST] = 0.0
-            moved = np.abs(step + tau * turns)
-            is_wrap = 0.0 < gap < _IN_A_ROW and moved <= fastest * gap
-            at_fault = self._has_range & is_wrap & (turns != 0.0)
-            if at_fault.any():
-                fault = self._fault(int(np.argmax(at_fault)), measurement)
-            self._offset += tau * turns * (self._is_free | at_fault)
+    def trust(self, q: Vector) -> None:
+        """Count on from the state that was counted last, at q (n,) [rad]."""
+        if self._next is not self._offset:
+            self._offset = self._next
             self._is_off = bool(self._offset.any())
-        q = measurement[: step.size] + self._offset
         np.copyto(self._last, q, where=np.isfinite(q))
-        return q, fault
+
+    def _count_on(
+        self, measurement: Vector, step: Vector, gap: float, fastest: Vector
+    ) -> Fault | None:
+        """Count turns in a large or not finite `step` (n,) [rad]; return the fault."""
+        if not (np.abs(step) > pi).any():
+            return None
+        turns = -np.rint(np.nan_to_num(step, posinf=0.0, neginf=0.0) / tau)
+        turns[np.abs(turns) > _MOST] = 0.0
+        moved = np.abs(step + tau * turns)
+        is_wrap = 0.0 < gap < _IN_A_ROW and moved <= fastest * gap
+        at_fault = self._has_range & is_wrap & (turns != 0.0)
+        self._next = self._offset + tau * turns * (self._is_free | at_fault)
+        if not at_fault.any():
+            return None
+        return self._fault(int(np.argmax(at_fault)), measurement)
 
     def restart(self) -> bool:
         """Take positions of joints that have a range as measured; return whether they change."""
