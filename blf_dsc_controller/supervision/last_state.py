@@ -38,7 +38,8 @@ class LastState:
         gap: longest time [s] between two states of the last quarter of a second, in which
             states were missing, at most 0.25 s; 0 if none were.
         stamp: of the last state [ns]; -1 before the first.
-        speed: of each joint (n,) [rad/s], as the last two positions showed it.
+        speed: of each joint (n,) [rad/s], as measured with the law, and beside it as the last
+            two positions showed it.
     """
 
     def __init__(self, n: int) -> None:
@@ -58,6 +59,7 @@ class LastState:
         """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
         self.measurement[:] = measurement
         self.slow[:] = slow
+        self.speed = np.abs(self.dq)
         self.ddq = None
         self.age = 0.0
         self.stamp = stamp

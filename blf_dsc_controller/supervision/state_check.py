@@ -168,7 +168,7 @@ class StateCheck:
             f'{reading.gap:.3g} s, which no arm does: two nodes publish joint states, or a sensor '
             'is faulty'
         )
-        return Fault(Reason.VELOCITY, text)
+        return Fault(Reason.JUMPED, text)
 
     def _hangs(self, reading: Reading) -> Fault:
         """Return the fault of a reading that is repeated, with new stamps, of an arm in motion."""

@@ -39,6 +39,7 @@ class Reason(str, Enum):
     NOT_FINITE = 'measurement not finite'
     VELOCITY = 'velocity not plausible'
     WRAPPED = 'position wrapped'
+    JUMPED = 'position jumped'
     START_REJECTED = 'start rejected'
     OUTSIDE_BOUND = OUTSIDE_BOUND
     NO_EFFECT = 'commands without effect'
