@@ -24,9 +24,10 @@ class Play(NamedTuple):
 def _moved(state: State, play: Play, *, q: float = 0.0, dq: float = 0.0) -> State:
     """Return a state with another position and velocity of one joint."""
     i = play.joint % state.q.size
-    one = np.zeros(state.q.size)
-    one[i] = 1.0
-    return replace(state, q=state.q + q * one, dq=state.dq + dq * one)
+    positions, velocities = state.q.copy(), state.dq.copy()
+    positions[i] += q
+    velocities[i] += dq
+    return replace(state, q=positions, dq=velocities)
 
 
 def _scaled(state: State, play: Play, q: float, dq: float) -> State:

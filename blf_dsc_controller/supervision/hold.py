@@ -66,8 +66,9 @@ class Hold:
     Above its first resonance, an elastic joint accelerates other than a rigid one, and shows
     a wrong load.  An observer with one pole of 30 1/s lets an oscillation go on at up to
     20 rad/s.  Two poles of 10 1/s do not feed an oscillation, but let a load sink further: an
-    arm that oscillates at the stop has these, and so has each joint that swings during it, and
-    one that has left command and rests.
+    arm that oscillates at the stop has these, and so has each joint that swings during it,
+    one that has left command and rests, and one whose velocities are differences of positions
+    behind a low pass.
 
     If commands do not reach the arm, the observed load would grow for ever.  `Load` says when it
     is kept instead: after a stop that may have this cause until the arm accelerates, as it does
@@ -296,6 +297,7 @@ class Hold:
         for each in (self._usual, self._calm):
             each.update(lacking, limit, dt)
         is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
+        is_calm |= not self._last.is_measured
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
 
     def _begin_observing(self, load: Vector | float) -> None:

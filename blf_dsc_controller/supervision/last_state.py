@@ -32,6 +32,7 @@ class LastState:
     Attributes:
         measurement: [q, dq, applied torque] (3 n,) [rad, rad/s, N m].
         q, dq: views of it; a velocity that is currently unknown is zero.
+        is_measured: whether dq is as measured; else it is `slow`.
         slow: v (n,) [rad/s], the velocity to damp.
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         age: time without a trusted state [s]; infinite before the first.
@@ -54,6 +55,7 @@ class LastState:
         self.stamp = -1
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
+        self.is_measured = True
 
     def take(self, stamp: int, measurement: Vector, slow: Vector) -> None:
         """Store a valid state with its stamp [ns] and v (n,) [rad/s]."""
@@ -73,12 +75,13 @@ class LastState:
         period: float,
         *,
         continues: bool = True,
+        is_measured: bool = True,
     ) -> None:
         """Store a trusted state beside the law, `period` [s] after the last as a rule.
 
-        A velocity that is not finite or beyond `fastest` (n,) [rad/s] is replaced with the one
-        that the positions show, within it.  After a silence, whose positions show only its mean
-        velocity, and where it does not continue the last one, `slow` begins with the measured.
+        Velocities that are not measured, not finite or beyond `fastest` (n,) [rad/s] are replaced
+        with `slow`.  After a silence, whose positions show only its mean velocity, and where the
+        state does not continue the last one, `slow` begins with those that were measured.
         """
         q, dq, _ = measurement.reshape(3, -1)
         elapsed = (stamp - self.stamp) * 1e-9
@@ -94,10 +97,17 @@ class LastState:
             self.speed = np.abs(differenced)
             differenced = np.clip(differenced, -fastest, fastest)
             self.slow += min(1.0, elapsed / FILTER) * (differenced - self.slow)
-        usable = np.where(np.abs(dq) <= fastest, dq, differenced)
+        is_usable = is_measured and bool((np.abs(dq) <= fastest).all())
+        usable = np.where(np.abs(dq) <= fastest, dq, 0.0)
         if not is_next:
             self.slow[:] = usable
-        self.ddq = (usable - self.dq) / elapsed if is_next else None
+        if (
+            not is_usable
+        ):  # differenced twice, positions show the noise of their encoders
+            usable = self.slow
+        is_known = is_next and is_usable == self.is_measured
+        self.is_measured = is_usable
+        self.ddq = (usable - self.dq) / elapsed if is_known else None
         self.q[:] = q
         self.dq[:] = usable
         self.age = 0.0

@@ -190,6 +190,7 @@ class Readings:
             self.fastest,
             self._sample_time,
             continues=reading.continues,
+            is_measured=self._velocity is None,
         )
 
     def use(self, reading: Reading) -> None:
