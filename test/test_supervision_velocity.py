@@ -55,7 +55,7 @@ def test_velocities_are_those_of_the_positions_after_the_stop_and_a_reset():
     arm.run(0.3, spoil=ALL_REVERSED)
     assert arm.reason == 'velocity not plausible'
     arm.controller.reset()
-    arm.run(2.0, spoil=ALL_REVERSED)  # an approach, too
+    arm.run(4.0, spoil=ALL_REVERSED)  # an approach, too
     assert arm.controller.phase is blf.Phase.TRACKING
 
 
