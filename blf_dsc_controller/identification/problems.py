@@ -26,6 +26,7 @@ _LARGE = 0.1  # of the torque of a joint, error that is a fault ...
 _NOTHING_EXPLAINED = 0.6  # of the torque of a joint, error that is a fault
 _OFFSET = 0.7  # of the torque of a joint, offset that is as large as the rest
 _TENFOLD = 10.0  # change of a mass
+_KNOWN = 0.1  # of all masses, half an interval that says nothing of a body
 _HEAVY = 0.01  # of all masses, that of a body that is no dummy
 _AGREE = np.log(1.1)  # of factors of gravity and inertia
 _SCALED = np.log(1.3)  # of the same factor, that is asked
@@ -188,7 +189,7 @@ def _value_problems(found: Identified) -> Iterator[str]:
         found.chain.joints, masses, halves, before, strict=True
     ):
         is_other = not old / _TENFOLD < mass < _TENFOLD * old
-        is_unknown = half > max(mass, old)
+        is_unknown = half > max(mass, old, _KNOWN * before.sum())
         if old > _HEAVY * before.sum() and (is_other or is_unknown):
             yield (
                 f'THE MASS OF {joint.link} IS {mass:.3g} +- {half:.2g} kg instead of {old:.3g}: '

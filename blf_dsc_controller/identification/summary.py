@@ -227,7 +227,7 @@ def base_table(found: Identified) -> Iterator[str]:
         old = _beside(half, before[k], _ROUNDING)
         new = _beside(half, after[k], _NOTHING)
         unseen = posterior[k] > UNSEEN * prior[k]
-        is_same = abs(after[k] - before[k]) < 0.1 * half
+        is_same = abs(after[k] - before[k]) < half
         source = 'from the URDF' if is_same else 'hardly more than the URDF'
         mark = f'  NOT SHOWN by this recording: {source}' if unseen else ''
         yield f'{old:10.4g} -> {new:10.4g} +- {half:<8.2g}  {name}{mark}'
@@ -246,7 +246,7 @@ def errors_table(found: Identified) -> str:
     begin, end = score.held_back
     title = (
         f'torque error from {begin:.1f} to {end:.1f} s, a part that was held back while the model '
-        'was chosen and fitted\n[% of rms torque]; the values above are a fit to the whole motion:'
+        'was chosen and fitted\n[% of rms torque]; the values below are a fit to the whole motion:'
     )
     return f'{title}\n{aligned(rows)}'
 
