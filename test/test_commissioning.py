@@ -36,7 +36,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import FIRST_STAMP, Oscillation, Stop
-from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.warnings.expected_errors import expected_errors
 
 ROTORS = (0.3, 0.1)  # kg m^2
 SPRINGS = (3e3, 1.5e3)  # N m/rad: free resonances of 26 and 29 Hz

@@ -30,7 +30,7 @@ from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.warnings.table import config_warnings
 
 # What the sources of a driver say; each is named beside it.
 FACTS = {

@@ -17,7 +17,7 @@ from blf_dsc_controller import (
     PlantConfig,
 )
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.warnings.table import config_warnings
 
 UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}  # reaches 1.04 m
 EFFORTS = np.array([150.0, 150.0, 150.0, 28.0, 28.0, 28.0])  # N m, of ur5e.urdf

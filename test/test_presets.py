@@ -33,9 +33,6 @@ LAW = {
 DRAWN = {'recommended', 'slotine_li', 'panda'}
 
 
-STOPPED = 5  # exit code
-
-
 def offline(preset, out, duration):
     words = f'run --config {preset} --offline --duration {duration} --out {out}'
     return main(words.split())
@@ -68,12 +65,22 @@ def test_preset_runs_by_name_and_saves_its_configuration(
 @pytest.mark.usefixtures('blank_pictures')
 @pytest.mark.parametrize('preset', IN_MOTORS)
 def test_preset_with_feedback_in_its_motors_is_driven_by_name(preset, tmp_path, capsys):
-    """Over the bus its gains shake it, which `run` says."""
+    """Over the bus its gains would shake it: every other path refuses it, with the command."""
     bag = tmp_path / 'bag'
     arguments = ['--robot', 'simulated', '--config', preset, '--out', str(bag)]
     assert main(['drive', *arguments, '--duration', '0.5']) == 0
     assert 'and 0 missed' in capsys.readouterr().out
     assert blf.verify(bag).difference is None
-    assert offline(preset, tmp_path / 'out', 0.5) == STOPPED
-    told = capsys.readouterr()
-    assert f'blf_dsc drive --robot simulated --config {preset}' in told.err
+    drive = f'blf_dsc drive --robot simulated --config {preset}'
+    for words in (['--offline'], ['--offline', '--physics', 'mujoco'], []):
+        assert main(['run', '--config', preset, '--duration', '0.5', *words]) == 1
+        assert drive in capsys.readouterr().err
+    loop = blf.load_loop(preset)
+    with pytest.raises(
+        blf.StartError, match=r'`blf_dsc drive` with drive.feedback: motor'
+    ):
+        blf.simulate(loop.controller, loop.plant)
+    with pytest.raises(blf.StartError, match=r'joint6 oscillates at \d+ Hz'):
+        blf.ArmController(preset)
+    with pytest.raises(blf.StartError, match='grow from sample to sample'):
+        blf.Commissioning(preset)

@@ -11,8 +11,8 @@ import pytest
 import blf_dsc_controller as blf
 from blf_dsc_controller import change
 from blf_dsc_controller.arms.inertia import inertia_of, moved
-from blf_dsc_controller.supervision.body_warnings import body_warnings
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.warnings.bodies import body_warnings
+from blf_dsc_controller.warnings.table import config_warnings
 
 PANDA = blf.load_loop('panda_rigid').controller
 CHAIN = PANDA.robot.chain(PANDA.joints)

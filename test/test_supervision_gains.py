@@ -12,19 +12,16 @@ from scenario import carrying
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import ControllerConfig, change, load_loop
+from blf_dsc_controller.arms.linear_loop import Joints, Loop, Timing
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.configuration.nodes import load, locate
 from blf_dsc_controller.configuration.robot import read_urdf
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.expected_errors import (
-    expectation,
-    expected_errors,
-    linear_feedback,
-    linear_loop,
-)
-from blf_dsc_controller.supervision.gain_limits import worsened
-from blf_dsc_controller.supervision.reference_load import reference_load
+from blf_dsc_controller.warnings.expected_errors import expectation, expected_errors
+from blf_dsc_controller.warnings.gains import worsened
+from blf_dsc_controller.warnings.reference_load import reference_load
+from blf_dsc_controller.warnings.stability import linear_feedback
+from blf_dsc_controller.warnings.table import config_warnings
 
 BOUND = 0.002  # rad
 KNOWN = {'two_link.initial_estimate': P.tolist(), 'two_link.learning_weight': 0.0}
@@ -219,17 +216,6 @@ def test_expectation_is_a_number_of_two_digits_or_the_reason_why_there_is_none(
     assert 'e+' not in text
 
 
-def test_gains_that_make_errors_grow_are_warned_of_once_and_without_a_figure_of_errors():
-    inside_the_motors = load_loop('yam').controller
-    warnings = config_warnings(inside_the_motors)
-    of_growth = [each for each in warnings if 'grow from sample to sample' in each]
-    assert len(of_growth) == 1
-    assert of_growth[0].startswith('feedback.stiffness: ')
-    assert 'drive.feedback: motor' in of_growth[0]
-    assert not any('e+' in each or 'e-' in each for each in warnings)
-    assert not any(each.startswith('barrier.bound') for each in warnings)
-
-
 URDF = read_urdf('panda.urdf')
 IN_KG_MM2 = re.sub(
     r'\b(i[xyz]{2})="(.+?)"',
@@ -333,8 +319,10 @@ def inertias(config, settings):
 
 def transition(settings, T, lag, M, M0, stiffness):
     """A and B of the law, whose inertias are M0, with an arm of M."""
+    nothing = np.zeros(settings.n)
+    timing = Timing(T, drive_lag=0.5 * lag, velocity_lag=0.5 * lag)
     feedback = linear_feedback(settings, M0, stiffness)
-    return linear_loop(settings, T, lag, M, feedback).transition()
+    return Loop(M, Joints(nothing, nothing), timing, feedback).transition()
 
 
 def growth(settings, T, lag, M, M0, stiffness):

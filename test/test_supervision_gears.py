@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from blf_dsc_controller import (
     ConfigurationError,
     ControllerConfig,
+    StartError,
     change,
     load_loop,
     simulate,
@@ -16,7 +19,7 @@ from blf_dsc_controller import (
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.warnings.table import config_warnings
 
 UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
 GAINS = {
@@ -96,11 +99,66 @@ def test_known_gears_choose_the_gains_and_bear_them():
     assert not [text for text in config_warnings(known) if 'joint_stiffness' in text]
 
 
-def test_gains_that_known_gears_do_not_bear_are_warned_of_with_the_frequency():
-    config = built(**GEARS, **GAINS, **{'feedback.stiffness': 4.0})
-    (warning,) = (text for text in config_warnings(config) if 'modulus margin' in text)
-    assert warning.startswith('feedback.stiffness: with robot.joint_stiffness the loop')
-    assert ' Hz, ' in warning
+def of_readme(stiffness, damping, **changes):
+    """Return the UR5e of README's file with gains of its shoulder; a quarter at the wrist."""
+    gains = {
+        'feedback.joint_stiffness': [stiffness] * 3 + [stiffness / 4] * 3,
+        'feedback.joint_damping': [damping] * 3 + [damping / 4] * 3,
+    }
+    return built(**gains, **changes)
+
+
+def said_of(config):
+    """Return what is said of gains that are too high, by their warning or refusal."""
+    try:
+        found = config_warnings(config)
+    except StartError as error:
+        return f'refused: {error}'
+    return next((text for text in found if 'grow from' in text or 'rings' in text), '')
+
+
+@pytest.mark.parametrize(
+    ('config', 'said'),
+    [
+        (of_readme(900.0, 60.0), ''),
+        # spectral radius 1.0142 if drives are as guessed, 0.996 if they are 7 times as heavy
+        (of_readme(2700.0, 100.0), 'feedback.stiffness: '),
+        (of_readme(9000.0, 200.0), 'feedback.stiffness: '),
+        (of_readme(9000.0, 60.0), 'refused: '),  # 1.051 and 1.0055
+        (
+            built(**GEARS, **GAINS, **{'feedback.stiffness': 4.0}),
+            'feedback.stiffness: ',
+        ),
+        (of_readme(9000.0, 200.0, **{'robot.rotor_inertia': [0.375] * 6}), 'refused: '),
+    ],
+)
+def test_gains_that_are_too_high_are_named_with_joint_frequency_and_what_holds(
+    config, said
+):
+    text = said_of(config)
+    assert text.startswith(said)
+    assert bool(text) == bool(said)
+    if not text:
+        return
+    assert re.search(r'_joint oscillates at \d+ Hz', text)
+    given = {
+        f'feedback.joint_{name}': [float(each) for each in values.split(', ')]
+        for name, values in re.findall(r'feedback.joint_(\w+): \[(.*?)\]', text)
+    }
+    assert given
+    robot = {
+        f'robot.{name}': getattr(config.robot, name)
+        for name in ('rotor_inertia', 'joint_stiffness')
+    }
+    assert said_of(built(**robot, **given)) == ''
+
+
+def test_gains_that_no_arm_bears_are_not_simulated_unless_they_are_insisted_on():
+    plant = load_loop('ur5e', {'sim_plant': {'duration': 0.01}}).plant
+    with pytest.raises(StartError, match=r'list feedback\.stiffness in insist'):
+        simulate(of_readme(9000.0, 60.0), plant)
+    insisted = of_readme(9000.0, 60.0, insist=['feedback.stiffness'])
+    assert simulate(insisted, plant).run().time.size
 
 
 def test_adaptation_integrates_no_faster_than_the_disturbance_estimate():

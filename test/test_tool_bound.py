@@ -19,9 +19,9 @@ from blf_dsc_controller.arms.two_link import urdf
 from blf_dsc_controller.arms.urdf import frames, read_chain
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.simulation.loop import write_bag
-from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.expected_errors import expected_errors
 from blf_dsc_controller.tool.errors import Tool
+from blf_dsc_controller.warnings.expected_errors import expected_errors
+from blf_dsc_controller.warnings.table import config_warnings
 
 TRAVEL = 2.5  # m, limit of the prismatic joints of random arms
 ROUNDING = 1e-13  # m and rad, of placements

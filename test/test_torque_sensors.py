@@ -10,7 +10,7 @@ import pytest
 from scenario import Scenario, changed, frozen
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.warnings.table import config_warnings
 from sim_plant.plant import plant_of
 
 POLE = 'disturbance.observer_bandwidth'

@@ -12,7 +12,7 @@ import pytest
 import blf_dsc_controller as blf
 from blf_dsc_controller import ConfigurationError, ControllerConfig, change
 from blf_dsc_controller.configuration.schema import build
-from blf_dsc_controller.supervision.config_warnings import config_warnings
+from blf_dsc_controller.warnings.table import config_warnings
 
 JOINTS = ('turning', 'sliding')
 NOW = np.zeros(2)

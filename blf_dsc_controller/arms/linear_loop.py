@@ -105,6 +105,17 @@ class Loop(NamedTuple):
         A, G, sensed = _sampled_arm(self.links, self.joints, self.timing)
         return _with_law(A, G, sensed, self.timing, self.feedback)
 
+    def at(self, postures: slice) -> Loop:
+        """Return the loop in some of the postures."""
+        law = self.feedback
+        some = law._replace(
+            position=law.position[postures],
+            surface=law.surface[postures],
+            inertia=law.inertia[postures],
+            integral=law.integral[postures],
+        )
+        return self._replace(links=self.links[postures], feedback=some)
+
     def is_stable(self) -> bool:
         """Return whether the errors decay in all postures."""
         A, _ = self.transition()
@@ -116,20 +127,22 @@ class Loop(NamedTuple):
         s: Complex = np.asarray(2j * np.pi * frequencies, complex)
         G = arm_response(self.links, self.joints, self.timing, s)
         C = law_response(self.feedback, self.timing, s)
-        least = np.linalg.svd(
-            np.eye(len(self.joints.motors)) + G @ C, compute_uv=False
-        )[..., -1]
+        distance = np.eye(len(self.joints.motors)) + G @ C
+        least = np.linalg.svd(distance, compute_uv=False)[..., -1]
         posture, at = np.unravel_index(int(least.argmin()), least.shape)
         value = float(least[posture, at]) if self.is_stable() else 0.0
-        return Margin(value, float(frequencies[at]), int(posture))
+        _, _, directions = np.linalg.svd(distance[posture, at])
+        joint = int(np.abs(directions[-1]).argmax())
+        return Margin(value, float(frequencies[at]), int(posture), joint)
 
 
 class Margin(NamedTuple):
-    """A modulus margin, with the frequency [Hz] and the posture at which it is least."""
+    """A modulus margin, with the frequency [Hz], posture and joint at which it is least."""
 
     value: float
     frequency: float
     posture: int
+    joint: int
 
 
 def arm_response(links: Floats, joints: Joints, timing: Timing, s: Complex) -> Complex:

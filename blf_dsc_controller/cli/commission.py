@@ -56,10 +56,8 @@ from blf_dsc_controller.configuration.nodes import (
     read,
 )
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.numerics.digits import largest_error
 from blf_dsc_controller.progress import announce_reading, print_notice, steps
-from blf_dsc_controller.supervision.digits import largest_error
-from blf_dsc_controller.supervision.expected_errors import expected_errors
 
 Runs = list[tuple[str, Measured]]
 """Runs with their names."""
@@ -98,7 +96,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         lags=_lags(path),
     )
     if _in_motors(path) and (options.robot or options.ros or not options.bags):
-        _check_in_motors(config)
+        _warn_in_motors()
     if options.write:
         _write_motions(options, path, commissioning)
         return 0
@@ -251,22 +249,11 @@ def _lags(path: Path) -> Sequence[float]:
     return () if _in_motors(path) else LAGS
 
 
-def _check_in_motors(config: ControllerConfig) -> None:
-    """Warn that a feedback which motors close is measured over the bus.
-
-    Raises BlfDscError if no arm would bear its gains there.
-    """
-    over_bus = 'but a commissioning measures with torques over the bus'
-    if expected_errors(config, settings_of_config(config)).is_endless:
-        raise BlfDscError(
-            f'drive.feedback: got motor, {over_bus}, where these gains make errors grow from '
-            'sample to sample, and would shake the arm. Motors bear more: keep the gains that the '
-            f'maker runs in them, without a commissioning; or lower feedback.stiffness, to measure '
-            'what the arm bears over the bus'
-        )
+def _warn_in_motors() -> None:
+    """Warn that a feedback which motors close is measured over the bus."""
     print_notice(
-        f'warning: drive.feedback is motor, {over_bus}, and chooses gains that the arm bears '
-        'there: motors bear more'
+        'warning: drive.feedback is motor, but a commissioning measures with torques over the bus, '
+        'and chooses gains that the arm bears there: motors bear more'
     )
 
 

@@ -42,9 +42,9 @@ from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.numerics.digits import largest_error
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import unit_of_all
-from blf_dsc_controller.supervision.digits import largest_error
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -241,7 +241,10 @@ def _of_repeats(
         f'where friction damps a joint more than its gains do, likewise, with swings of {swings} '
         f'{unit}, and friction, which keep all joints sliding'
     )
-    yield 'where the arm nearly oscillates, likewise, with half of the gains of the file'
+    yield (
+        'where the arm oscillates, it stops, and goes on with half of the gains of the file, as '
+        'often as needed'
+    )
     if commissioning.anew_left:
         yield (
             'of this arm only the URDF is known: where friction hides an inertia, posture 1 is '

@@ -33,8 +33,8 @@ from blf_dsc_controller.drive.drivers import is_in_network
 from blf_dsc_controller.drive.motor_feedback import as_in_motors
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
-from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.table import config_warnings
 
 _NEEDED = ('numpy', 'scipy', 'numba', 'mcap', 'rosbags', 'matplotlib')
 _EXTRAS = {

@@ -32,14 +32,14 @@ from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
-from blf_dsc_controller.drive.motor_feedback import as_in_motors
+from blf_dsc_controller.drive.motor_feedback import as_in_motors, closed_in_motors
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints
-from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.expected_errors import expectation
-from blf_dsc_controller.supervision.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.expected_errors import expectation
+from blf_dsc_controller.warnings.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.table import config_warnings
 
 CODES = {
     End.DURATION: 0,
@@ -60,6 +60,8 @@ def drive(options: Namespace) -> int:
     if ignored := ignored_in(path, (CONTROLLER, DRIVE)):
         print_notice(f'warning: {ignored}')
     _say_before(config, driver)
+    if driver.config.feedback == 'motor':
+        config = closed_in_motors(config)
     with ExitStack() as ending:
         expect_folder(options.out)
         ending.callback(discard_unbegun)

@@ -37,9 +37,9 @@ from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints, plan_start
 from blf_dsc_controller.reference.turns import reference_near
 from blf_dsc_controller.simulation.loop import simulate_into_bag
-from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.expected_errors import expectation
 from blf_dsc_controller.supervision.supervisor import Reason
+from blf_dsc_controller.warnings.expected_errors import expectation
+from blf_dsc_controller.warnings.table import config_warnings
 
 STOPPED = 5
 """Exit code if the controller stopped before the end."""
@@ -142,8 +142,14 @@ def _show_expectations(given: str, config: LoopConfig) -> None:
         StartError: the controller would not take over at the true start.
         MotionError: no approach from there keeps the limits.
     """
-    for warning in _unused(given):
-        print_notice(f'warning: {warning}')
+    path = locate(given)
+    if ignored := ignored_in(path, (PLANT, CONTROLLER)):
+        print_notice(f'warning: {ignored}')
+    if load(path, DRIVE, DriveConfig).feedback == 'motor':
+        raise BlfDscError(
+            'drive.feedback is motor, and over a bus, which this simulates, its gains may shake '
+            f'the arm: blf_dsc drive --robot simulated --config {given} simulates the motors'
+        )
     controller = config.controller
     if turned := _turned_reference(config):
         print(f'the reference {turned}')
@@ -170,18 +176,6 @@ def _turned_reference(config: LoopConfig) -> str:
     )
     plan_start(controller, np.array(law_gains(controller).initial_bound), q, dq)
     return reference_near(controller, q)[1]
-
-
-def _unused(given: str) -> Iterator[str]:
-    """Yield what a file says that this command does not use."""
-    path = locate(given)
-    if ignored := ignored_in(path, (PLANT, CONTROLLER)):
-        yield ignored
-    if load(path, DRIVE, DriveConfig).feedback == 'motor':
-        yield (
-            f'{path}: drive.feedback is motor, but this simulates torques over the bus, with the '
-            f'same gains; blf_dsc drive --robot simulated --config {given} simulates the motors'
-        )
 
 
 def notes_on_ideal_arm(config: LoopConfig) -> Iterator[str]:

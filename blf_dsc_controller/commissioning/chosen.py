@@ -22,7 +22,7 @@ from blf_dsc_controller.configuration.tool_bound import (
 )
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.supervision.expected_errors import ENDLESS, expected_errors
+from blf_dsc_controller.warnings.expected_errors import expected_errors
 
 Floats = NDArray[np.float64]
 
@@ -177,7 +177,7 @@ def _check_bound(config: ControllerConfig, least: Floats) -> None:
     ):
         if needed > most:
             far = f'by up to {needed / _EXCESS:.2g} {unit}'
-            if needed > ENDLESS:
+            if np.isinf(needed):
                 far = 'without end'
             raise BlfDscError(
                 f'the gains that have the margin are too soft for any bound: {joint} would be off '

@@ -40,7 +40,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig, design
 from blf_dsc_controller.configuration.schema import Value
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.ripple import Ripples
-from blf_dsc_controller.supervision.digits import two_digits
+from blf_dsc_controller.numerics.digits import two_digits
 
 Floats = NDArray[np.float64]
 

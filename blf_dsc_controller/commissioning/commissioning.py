@@ -21,8 +21,13 @@ from blf_dsc_controller.commissioning.better_known import (
     is_known_by_urdf_only,
 )
 from blf_dsc_controller.commissioning.choice import LAGS
+from blf_dsc_controller.commissioning.chosen import with_gains
 from blf_dsc_controller.commissioning.commissioned import Commissioned, commissioned
-from blf_dsc_controller.commissioning.measurement import Measured, measured_in
+from blf_dsc_controller.commissioning.measurement import (
+    Measured,
+    measured_in,
+    oscillation_in,
+)
 from blf_dsc_controller.commissioning.motion import SLOW_TONES
 from blf_dsc_controller.commissioning.planned import (
     TORQUE,
@@ -30,6 +35,7 @@ from blf_dsc_controller.commissioning.planned import (
     Planned,
     plan,
     postures_of,
+    softer,
 )
 from blf_dsc_controller.commissioning.ripple import ripples_in
 from blf_dsc_controller.commissioning.slow_motion import is_slow_motion
@@ -37,13 +43,17 @@ from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.ripple import Ripples
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import Run
+from blf_dsc_controller.warnings.stability import refuse_unstable
 
 REPEATS = 2
 """How often a posture is measured again at most: softer, with swings, or with more torque."""
 
-_SOFTER = 0.5  # of the gains, with which an arm is measured that nearly oscillates
+_SOFTER = 0.5  # of the gains, with which an arm that oscillates is measured again
+_SOFTEST = 1.0 / 64.0  # of the gains: 14 N m/rad instead of 900, as for an unknown arm
 _WORTHWHILE = 1.2  # times the amplitude, from which a posture is measured again
 
 
@@ -96,12 +106,14 @@ class Commissioning:
         Raises:
             BlfDscError: torque or travel is not above 0.
             ConfigurationError: with all problems of the file.
+            StartError: no arm bears its gains.
         """
         for name, given in (('torque', torque), ('travel', travel)):
             if not 0.0 < given < inf:
                 raise BlfDscError(f'{name}: got {given:g}, but it must be above 0')
         if not isinstance(config, ControllerConfig):
             config = load(locate(config), CONTROLLER, ControllerConfig)
+        refuse_unstable(config, settings_of_config(config))
         self.config = config
         self.margin = margin
         self._lags = lags
@@ -111,6 +123,7 @@ class Commissioning:
         self.anew_left = MOST_ANEW if is_known_by_urdf_only(config) else 0
         self._postures = postures
         self.torque = torque
+        self._weakest = torque
         self._most = MOST * torque
         self._travel = travel
 
@@ -160,20 +173,23 @@ class Commissioning:
     ) -> Planned | None:
         """Plan and return the motion that measures a posture again; None: the run shows enough.
 
-        It has more torque, if noise hides much; swings, if friction damps a joint more than its
-        gains do; half of the gains, if the arm nearly oscillates with them.  The next postures
-        begin with all of this (`go_on_with`).  It is around `posture` (n,) [rad], or that of the
+        It has half of the gains, if the arm oscillates, or nearly; more torque, if noise hides
+        much; swings, if friction damps a joint more than its gains do.  The next postures begin
+        with all of this (`go_on_with`).  It is around `posture` (n,) [rad], or that of the
         motion.  None also if the travel of the tool and the speeds permit no larger motion.
 
         Raises:
-            BlfDscError: the run does not show the response.
+            BlfDscError: the run does not show the response, or the arm oscillates with any gains.
         """
         slid = motion.excitation.sliding
+        around = motion.posture if posture is None else posture
+        if why := oscillation_in(run):
+            self.soften(why)
+            return self._motion(around, self.torque, sliding=slid, share=self.share)
         shown = shown_by(run, motion.config)
         sliding = slid or shown.rubs
         if shown.factor == 1.0 and sliding == slid:
             return None
-        around = motion.posture if posture is None else posture
         again = self._motion(
             around,
             min(shown.factor * motion.torque, self._most),
@@ -186,6 +202,32 @@ class Commissioning:
             return None
         self.go_on_with(again)
         return again
+
+    def soften(self, why: str) -> None:
+        """Halve the gains of moves and motions from now on; `why` says how the arm oscillated.
+
+        Motions then have at most half of the torque, too, but not less than a first one.
+
+        Raises BlfDscError if they are very soft already.
+        """
+        if self.share <= _SOFTEST:
+            raise BlfDscError(
+                f'with 1/{1.0 / self.share:.0f} of the gains, too: {why}. Gains are not the cause: '
+                'look for a loose joint or base, and for late or coarse positions, velocities and '
+                'torques'
+            )
+        self.share *= _SOFTER
+        self._most = max(0.5 * self._most, self._weakest)
+        self.torque = min(self.torque, self._most)
+        print_notice(
+            f'the arm has oscillated, and goes on with 1/{1.0 / self.share:.0f} of the gains: {why}'
+        )
+
+    @property
+    def held_with(self) -> ControllerConfig:
+        """The configuration of moves to a posture: with the gains of the motions."""
+        gains = softer(self.measured_with, self.share)
+        return with_gains(self.measured_with, gains) if gains else self.measured_with
 
     def go_on_with(self, motion: Planned) -> None:
         """Let the first motions of the next postures have what this one needed.

@@ -57,10 +57,10 @@ class Driven(PostureByPosture):
                 feedback='host',  # what moves the arm is the torque alone, as recorded
             )
             if self._requests:
-                raise self._ended(name, End.REQUESTED, '')
+                raise self._ended(name, End.REQUESTED, '', None)
             outcome = self._loop.run()
             self._loop = None
         if outcome.end is not End.DURATION:
-            raise self._ended(name, outcome.end, outcome.text)
+            raise self._ended(name, outcome.end, outcome.text, controller.guard)
         if controller.output_problem:
             raise self._not_whole(name)

@@ -15,6 +15,7 @@ from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run
+from blf_dsc_controller.supervision.supervisor import Reason
 
 
 class Measured(NamedTuple):
@@ -35,6 +36,18 @@ def measured_in(bag: str | Path, config: ControllerConfig | None = None) -> Meas
     if config is not None:
         check_joints(str(bag), recorded.joints, config)
     return Measured(recorded_run(content, np.asarray), recorded)
+
+
+OSCILLATES = Reason.OSCILLATION, Reason.VELOCITY
+"""Reasons of the stop of an arm that oscillates: it may be too fast before it is found."""
+
+
+def oscillation_in(run: Run) -> str:
+    """Return how the arm oscillated when it stopped; empty if it did not."""
+    for stop in run.stops:
+        if stop.reason in OSCILLATES:
+            return stop.text
+    return ''
 
 
 @contextmanager

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
 from blf_dsc_controller.commissioning.commissioning import Commissioning
-from blf_dsc_controller.commissioning.motion import is_motion
 from blf_dsc_controller.commissioning.postures import (
     Answer,
     Given,
@@ -145,13 +144,11 @@ class OverRos(PostureByPosture):
         self, config: ControllerConfig, duration: float, bag: Path, name: str
     ) -> None:
         if self._requests:
-            raise self._ended(name, End.REQUESTED, '')
+            raise self._ended(name, End.REQUESTED, '', None)
         node = self._node
         if not node.guard or not node.guard.commanding:
             self._others = node.others
         recorder, disturbed = TopicRecorder(bag, in_background=True), _Disturbed()
-        # a motion shakes the arm itself
-        node.log.warns_of_oscillations = not is_motion(config)
         guard = node.begin(config, (recorder, disturbed))
         try:
             end, text = self._until_over(guard, disturbed, duration)
@@ -162,7 +159,7 @@ class OverRos(PostureByPosture):
         if guard.starting.error is not None:
             raise BlfDscError(f'{name}: {guard.starting.error}')
         if end is not End.DURATION:
-            raise self._ended(name, end, text)
+            raise self._ended(name, end, text, guard)
         if node.outputs.problem:
             raise self._not_whole(name)
 

@@ -20,9 +20,9 @@ from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.numerics.digits import two_digits
 from blf_dsc_controller.run import unit_of_all
-from blf_dsc_controller.supervision.digits import two_digits
-from blf_dsc_controller.supervision.expected_errors import expectation
+from blf_dsc_controller.warnings.expected_errors import expectation
 
 _DECIMALS = 6  # of a position
 _SOFTER = 0.8  # of the stiffness of the measurement, from which it is said

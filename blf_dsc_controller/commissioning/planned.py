@@ -22,7 +22,7 @@ from blf_dsc_controller.configuration.plausibility import hint_at_degrees
 from blf_dsc_controller.configuration.schema import Value, change
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import SLIDING, TURNING, JointUnits
-from blf_dsc_controller.supervision.reference_load import along
+from blf_dsc_controller.warnings.reference_load import along
 
 Floats = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def plan(
             f'feedback.inertia: got {config.feedback.inertia}, but an arm is measured with '
             'gains of its joints, each on its own: give none'
         )
-    gains = _softer(config, share)
+    gains = softer(config, share)
     arm = with_gains(config, gains) if gains else config
     planned = []
     for posture in postures:
@@ -121,7 +121,7 @@ def plan(
     return planned
 
 
-def _softer(config: ControllerConfig, share: float) -> dict[str, Value]:
+def softer(config: ControllerConfig, share: float) -> dict[str, Value]:
     """Return a share of the gains of the measurement, by dotted name: none, if it is all."""
     if share == 1.0:
         return {}

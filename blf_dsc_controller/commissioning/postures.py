@@ -22,7 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
-from blf_dsc_controller.commissioning.measurement import Measured, measured_in, named
+from blf_dsc_controller.commissioning.measurement import (
+    OSCILLATES,
+    Measured,
+    measured_in,
+    named,
+)
 from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import (
@@ -44,6 +49,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.turns import short_way
+from blf_dsc_controller.supervision.guard import Guard
 
 Floats = NDArray[np.float64]
 Given = ParamSpec('Given')
@@ -59,10 +65,16 @@ _PAUSE = 0.2  # s, in which an arm at rest does not move
 
 
 class EndedError(BlfDscError):
-    """A run ended before its time; the message says why, and what is left."""
+    """A run ended before its time; the message says why, and what is left.
 
-    def __init__(self, end: End, message: str) -> None:
+    Attributes:
+        end: why, in short.
+        oscillation: how the arm oscillated; empty if it did not.
+    """
+
+    def __init__(self, end: End, message: str, oscillation: str = '') -> None:
         self.end = end
+        self.oscillation = oscillation
         super().__init__(message)
 
 
@@ -224,8 +236,7 @@ class PostureByPosture(ABC):
         """
         for k, posture in enumerate(postures, 1):
             name = f'posture {k}'
-            way = self.aside(move, self._config, self.position(), posture)
-            self._run(way.config, way.duration, f'move {k}')
+            self._move_to(posture, f'move {k}')
             planned, bag = self._measure(name)
             while k == 1:
                 with named(name):
@@ -242,9 +253,7 @@ class PostureByPosture(ABC):
 
     def _measure(self, name: str) -> tuple[Planned, Path]:
         """Measure the arm where it rests, repeatedly if need be; return the last motion and bag."""
-        with named(name):
-            planned = self.aside(self._commissioning.motion, self.position())
-        bag = self._run(planned.config, planned.duration, name)
+        planned, bag = self._run_motion(name)
         for _ in range(REPEATS):
             with named(name):
                 again = self.aside(
@@ -257,13 +266,43 @@ class PostureByPosture(ABC):
             if again is None:
                 return planned, bag
             _set_aside(bag, 'weak')
-            planned = again
             # `plan_repeat` has set it, but of a copy if another process has computed it
             self._commissioning.go_on_with(again)
-            bag = self._run(planned.config, planned.duration, name)
+            planned, bag = self._run_motion(name)
         with named(name):
             self.aside(check, bag)
         return planned, bag
+
+    def _run_motion(self, name: str) -> tuple[Planned, Path]:
+        """Shake the arm where it rests, softer if it oscillates; return the motion and its bag."""
+        while True:
+            with named(name):
+                planned = self.aside(self._commissioning.motion, self.position())
+            bag = self._run_calmly(planned.config, planned.duration, name)
+            if bag is not None:
+                return planned, bag
+
+    def _move_to(self, posture: Floats, name: str) -> None:
+        """Move slowly to a posture (n,) [rad], softer if the arm oscillates."""
+        bag = None
+        while bag is None:
+            held = self._commissioning.held_with
+            way = self.aside(move, held, self.position(), posture)
+            bag = self._run_calmly(way.config, way.duration, name)
+
+    def _run_calmly(
+        self, config: ControllerConfig, duration: float, name: str
+    ) -> Path | None:
+        """Return the bag of a run as `_run`; None, with half of the gains, if it oscillated."""
+        try:
+            return self._run(config, duration, name)
+        except EndedError as error:
+            if not error.oscillation:
+                raise
+            _set_aside(self._bag(name), 'shaken')
+            with named(name):
+                self._commissioning.soften(error.oscillation)
+            return None
 
     def proof(
         self, steps: Sequence[Step]
@@ -301,14 +340,19 @@ class PostureByPosture(ABC):
 
     def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:
         """Control the robot for so long [s]; return the bag."""
-        bag = self._folder / name.replace(' ', '_').replace('%', '')
+        bag = self._bag(name)
         self._control(config, duration, bag, name)
         return bag
 
-    def _ended(self, name: str, end: End, text: str) -> EndedError:
+    def _bag(self, name: str) -> Path:
+        return self._folder / name.replace(' ', '_').replace('%', '')
+
+    def _ended(self, name: str, end: End, text: str, guard: Guard | None) -> EndedError:
         """Return the error of a run that ended for this reason, with what is left."""
         reason = f': {text}' if text else ''
-        return EndedError(end, f'{name}: {end}{reason}. {self._what_is_left()}')
+        message = f'{name}: {end}{reason}. {self._what_is_left()}'
+        is_shaken = guard is not None and guard.supervisor.reason in OSCILLATES
+        return EndedError(end, message, text if is_shaken else '')
 
     def _not_whole(self, name: str) -> BlfDscError:
         """Return the error of a run whose bag is not whole; why was told when it happened."""

@@ -31,7 +31,7 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
 from blf_dsc_controller.run import Run
-from blf_dsc_controller.supervision.expected_errors import expected_errors
+from blf_dsc_controller.warnings.expected_errors import expected_errors
 
 Floats = NDArray[np.float64]
 

@@ -32,7 +32,7 @@ def shaking_parameters(
         | {
             'learning.enabled': False,
             'limits.acceleration': limit.tolist(),
-            'safety.oscillation': 'warn',  # it is measured again with half of the gains
+            'safety.oscillation': 'warn',  # below VIOLENT tones of the motion look alike
         }
     )
 
@@ -46,6 +46,7 @@ def undisturbed_parameters(config: ControllerConfig) -> dict[str, object]:
     wide = np.maximum(law_gains(config).initial_bound, _WIDE_BOUND)
     values: dict[str, object] = {
         'barrier.bound': wide.tolist(),
+        'safety.oscillation': 'stop',
         'disturbance.gain': _slow_integral(config).tolist(),
     }
     if config.barrier.bounds_tool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
-from blf_dsc_controller.commissioning.measurement import Measured
+from blf_dsc_controller.commissioning.measurement import Measured, oscillation_in
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import cycles_of
 from blf_dsc_controller.commissioning.slow_motion import SlowMotion
@@ -36,12 +36,25 @@ class Proof(NamedTuple):
     cycles: list[LimitCycle]  # of an arm that does not stop
 
 
-def measured(planned: Planned, plant: PlantConfig, payload: float = 0.0) -> Measured:
+def measured(
+    planned: Planned,
+    plant: PlantConfig,
+    payload: float = 0.0,
+    *,
+    oscillates: bool = False,
+) -> Measured:
     """Return a run of a motion, of an arm with a payload [kg] that its law does not know.
 
-    Raises BlfDscError if the arm stopped.
+    Raises BlfDscError if the arm stopped, unless it may oscillate, and did.
     """
-    return _run(planned.config, plant, planned.duration, planned.posture, payload)
+    return _run(
+        planned.config,
+        plant,
+        planned.duration,
+        planned.posture,
+        payload,
+        oscillates=oscillates,
+    )
 
 
 def _run(
@@ -50,10 +63,12 @@ def _run(
     duration: float,
     begin: Floats,
     payload: float = 0.0,
+    *,
+    oscillates: bool = False,
 ) -> Measured:
     """Return a run from `begin` (n,) [rad]; events of the plant are left out.
 
-    Raises BlfDscError if the arm stopped.
+    Raises BlfDscError if the arm stopped, unless it may oscillate, and did.
     """
     loaded = [payload] if payload else []
     arm = {
@@ -62,7 +77,8 @@ def _run(
     } | pick_ups([0.0] * len(loaded), loaded)
     run = simulate(config, change(plant, arm)).run()
     for stop in run.stops:
-        raise BlfDscError(f'the simulated arm stopped: {stop.text}')
+        if not (oscillates and oscillation_in(run)):
+            raise BlfDscError(f'the simulated arm stopped: {stop.text}')
     return Measured(run, config)
 
 
@@ -120,10 +136,14 @@ def _measure(
 ) -> tuple[Planned, Measured]:
     """Measure around a posture (n,) [rad], again if need be; return the last motion and its run."""
     planned = commissioning.motion(posture)
-    seen = measured(planned, plant)
-    for _ in range(REPEATS):
+    repeats = 0
+    while True:
+        seen = measured(planned, plant, oscillates=True)
+        if not oscillation_in(seen.run):
+            repeats += 1
+        if repeats > REPEATS:
+            return planned, seen
         again = commissioning.plan_repeat(planned, seen.run)
         if again is None:
-            break
-        planned, seen = again, measured(again, plant)
-    return planned, seen
+            return planned, seen
+        planned = again

@@ -7,9 +7,10 @@ with the torque that makes it little, as far as `MOST` allows.  Where friction d
 more than its gains do, it is measured again with swings that keep its joints sliding.  A joint
 that sticks shows damping by friction that a steady motion does not have.
 
-An arm that nearly oscillates with the gains of its measurement makes noise that no torque
-overcomes, and the controller reports an oscillation.  The arm is measured again with half of
-these gains: its response does not depend on them.
+An arm that oscillates with the gains of its measurement stops before it does so with a quarter of
+its torque limits (`law.oscillation.VIOLENT`).  One that nearly oscillates makes noise that no
+torque overcomes, and the controller reports an oscillation.  Either is measured again with half of
+these gains, as often as needed: its response does not depend on them.
 """
 
 from __future__ import annotations

@@ -24,6 +24,7 @@ from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.run import joint_units
 
 CHECKED = (
+    'feedback.stiffness',
     'torque.limit',
     'safety.velocity_limit',
     'limits.velocity',
@@ -43,7 +44,7 @@ CHECKED = (
     'sensor.position_noise',
     'actuator.time_constant',
 )
-"""Parameters whose values are compared with the arm."""
+"""Parameters whose values are compared with the arm; gains, at the start."""
 
 _ROUNDED = 1.001  # defaults have four digits
 _BROKEN = 10.0  # times the speed of the fastest joint: no measurement

@@ -29,8 +29,9 @@ from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.warnings.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.stability import refuse_unstable
 
 Vector = NDArray[np.float64]
 
@@ -106,6 +107,7 @@ class ArmController:
         Raises:
             ArgumentTypeError: it is none of these.
             ConfigurationError: with all problems of the file.
+            StartError: no arm bears the gains.
             BagError: there is such a folder.
         """
         check_type(
@@ -119,6 +121,7 @@ class ArmController:
         self.config = config
         self.joints = config.joints
         self._loop = GuardedLoop(config)
+        refuse_unstable(config, self._loop.guard.controller.settings)
         self._outputs = LoopOutputs(self._loop, record)
         self._is_on_wall = stamps == 'wall'
         self._shift: int | None = None  # ns, of the stamps

@@ -17,22 +17,32 @@ from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors.frame import Frame, Gains, Motion, Ranges, split
+from blf_dsc_controller.warnings.stability import STIFFNESS
 
 Vector = NDArray[np.float64]
-_OF_MOTORS = 0.001  # s
+# s, with which the gains that the maker of a YAM runs in its motors are stable
+_SAMPLE, _LAG = 0.001, 0.0005
 
 
 def as_in_motors(config: ControllerConfig) -> ControllerConfig:
     """Return a configuration whose margins are those of its feedback inside the motors.
 
-    They close it at 10 kHz or more, without a bus.  A sample and a lag of at most 1 ms
-    each leave room for how they find their velocities.
+    They close it at 10 kHz or more, without a bus.  A sample of at most 1 ms and a lag of half of
+    one leave room for how they find their velocities.
     """
     fast = {
-        'sample_time': min(config.sample_time, _OF_MOTORS),
-        'robot.lag': min(config.robot.lag, _OF_MOTORS),
+        'sample_time': min(config.sample_time, _SAMPLE),
+        'robot.lag': min(config.robot.lag, _LAG),
     }
     return change(config, fast)
+
+
+def closed_in_motors(config: ControllerConfig) -> ControllerConfig:
+    """Return a configuration whose gains are not those of a loop over the bus.
+
+    They are as high as the motors bear.
+    """
+    return change(config, {'insist': (*config.insist, STIFFNESS)})
 
 
 class MotorFeedback:

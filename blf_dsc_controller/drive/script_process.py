@@ -31,13 +31,13 @@ from blf_dsc_controller.drive.beside import LinkLog
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.drive.motor_feedback import as_in_motors
+from blf_dsc_controller.drive.motor_feedback import as_in_motors, closed_in_motors
 from blf_dsc_controller.drive.script import Script
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
-from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.table import config_warnings
 
 _POLL = 0.1  # s
 _PATIENCE = 5.0  # s, for the script to take the last messages
@@ -77,6 +77,8 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
     of_file = ignored_in(path, (CONTROLLER, DRIVE)), unmeasured
     for warning in [*config_warnings(judged), *filter(None, of_file)]:
         log.info(warning)
+    if in_motors:
+        config = closed_in_motors(config)
     record = Path(wanted['record']) if wanted['record'] else None
     with announced_compilation(lambda text: sys.stderr.write(f'{text}\n')):
         controller = ArmController(config, record=record, stamps='wall')

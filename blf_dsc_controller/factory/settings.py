@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,14 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     )
     settings = with_memory(config, settings)
     return settings._replace(friction=friction_settings(settings))
+
+
+settings_in_loop = lru_cache(maxsize=2)(settings_of_config)
+"""`settings_of_config`, computed once before and after a change.
+
+It takes some samples of the loop, in whose thread a change is checked and applied. The
+arrays are for reading only.
+"""
 
 
 def _parts_of_feedback(config: ControllerConfig, p: int, lag: float) -> dict[str, Any]:

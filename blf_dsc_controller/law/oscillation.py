@@ -41,8 +41,11 @@ SOME = 2
 FEW = 3
 """Half waves in a row that tell why an arm stops: an oscillation may grow fast."""
 
-VIOLENT = 0.5
-"""Part of the torque limit, as amplitude of its torque, from which nothing may wait."""
+VIOLENT = 0.2
+"""Part of the torque limit, as amplitude of its torque, from which nothing may wait.
+
+The tones of a commissioning, which calm arms follow, have looked like up to 0.16.
+"""
 
 PATIENCE = 0.25
 """Time [s] from one report to the next, in which an oscillation can die out."""

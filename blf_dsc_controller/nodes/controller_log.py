@@ -11,8 +11,8 @@ from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.process import PlainNode
 from blf_dsc_controller.run import unit_of_all
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.not_commissioned import not_commissioned
 from blf_dsc_controller.supervision.supervisor import STAMPS, Phase, Reason
+from blf_dsc_controller.warnings.not_commissioned import not_commissioned
 
 NOTHING_COMMANDED = 'nothing is commanded'
 """Begins what is logged of a stop before the first torque."""
@@ -25,13 +25,11 @@ class ControllerLog:
 
     Attributes:
         warns_of_gains: whether to warn, once, of gains whose margin nobody has measured.
-        warns_of_oscillations: whether to warn of oscillations, which may be meant.
     """
 
     def __init__(self, node: PlainNode) -> None:
         """Write to the log of a node."""
         self.warns_of_gains = True
-        self.warns_of_oscillations = True
         self._node = node
         self._log = node.get_logger()
         self._phase = Phase.INACTIVE, 0, False, ''  # stops, silenced, text of a stop
@@ -109,8 +107,7 @@ class ControllerLog:
             self._log.warning(contacts.last.text)
         if guard.oscillation.count != self._oscillations:
             self._oscillations = guard.oscillation.count
-            if self.warns_of_oscillations:
-                self._log.warning(guard.oscillation.text)
+            self._log.warning(guard.oscillation.text)
         if guard.findings.untrusted != self._untrusted:
             self._untrusted = guard.findings.untrusted
             if self._untrusted:

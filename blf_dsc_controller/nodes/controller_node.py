@@ -33,11 +33,11 @@ from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.reference.approach import end_of_waypoints
-from blf_dsc_controller.supervision.config_warnings import config_warnings
-from blf_dsc_controller.supervision.gain_limits import worsened
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
 from blf_dsc_controller.supervision.state_check import rate_mismatch
+from blf_dsc_controller.warnings.gains import worsened
+from blf_dsc_controller.warnings.reference_load import ReferenceLoad, reference_load
+from blf_dsc_controller.warnings.table import config_warnings
 
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked

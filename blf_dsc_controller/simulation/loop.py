@@ -44,6 +44,7 @@ from blf_dsc_controller.messages.topics import Message
 from blf_dsc_controller.run import FIRST_STAMP, Run, Series, Stop
 from blf_dsc_controller.simulation.sampled_run import run_of
 from blf_dsc_controller.supervision.guard import Guard
+from blf_dsc_controller.warnings.stability import refuse_unstable
 from sim_plant.plant import plant_of
 from sim_plant.sampled_plant import Plant
 from sim_plant.settings import parameter_names_of, steps_of
@@ -64,9 +65,9 @@ def simulate(
     The plant's duration must not be 0.  If not `supervised`, the law runs alone, past
     its limits too.  A run whose law has been stopped for `after_stop` [s] may end early.
 
-    Raises StartError if the law cannot take over, or stops before its first torque,
-    MotionError if there is no approach within the limits, and ArgumentTypeError if the
-    configurations are others.
+    Raises StartError if no arm bears the gains, or if the law cannot take over or stops before its
+    first torque, MotionError if there is no approach within the limits, and ArgumentTypeError if
+    the configurations are others.
     """
     remedy = 'simulate(loop.controller, loop.plant) runs what load_loop returns'
     check_type('controller_config', controller_config, ControllerConfig, remedy)
@@ -74,6 +75,7 @@ def simulate(
     plant = plant_of(plant_config)
     if supervised:
         guard = Guard(controller_config, lambda: 0, lambda: 0)
+        refuse_unstable(controller_config, guard.controller.settings)
         guard.starting.activate()
         record = new_record(
             guard.controller, controller_config, plant_config, guard.journal

@@ -44,8 +44,4 @@ Loads that are declared to drives: `drive_load` (which steps), `load_declaration
 order).
 
 The process that watches the controller: `torque_watchdog`, `sensor_noise`, `watched_journal`.
-
-Before anything moves, what cannot work well: `config_warnings` has all of `body_warnings`,
-`bound_warnings`, `gear_warnings` and `gain_limits`, by `reference_load` and
-`expected_errors`; `not_commissioned`; `digits` for numbers in sentences.
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reaction to an arm that oscillates: it stops, or is warned of.
 
-An oscillation whose torques reach half of their limits stops the arm in any case, unless
+An oscillation whose torques reach a fifth of their limits stops the arm in any case, unless
 oscillations are ignored.
 """
 
@@ -17,7 +17,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.oscillation import PATIENCE, is_violent, oscillates
 from blf_dsc_controller.law.torque_sensors import NONE
-from blf_dsc_controller.supervision.digits import two_digits
+from blf_dsc_controller.numerics.digits import two_digits
 from blf_dsc_controller.supervision.not_sensors import fault_of
 
 _LOWER = 0.5  # of the present stiffness, which is advised

@@ -11,7 +11,6 @@ whose disturbance gain is 0 has no integrator, so its torque steps.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +18,13 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_traits import PAPER
 from blf_dsc_controller.factory.laws import law_of
-from blf_dsc_controller.factory.settings import settings_of_config
+from blf_dsc_controller.factory.settings import settings_in_loop
 from blf_dsc_controller.law import barrier
 from blf_dsc_controller.law.blf_dsc import shift_surface
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import Settings
 
 Floats = NDArray[np.float64]
-
-settings_in_loop = lru_cache(maxsize=2)(settings_of_config)
-"""`settings_of_config`, computed once before and after a change.
-
-It takes some samples of the loop, in whose thread a change is checked and applied. The
-arrays are for reading only.
-"""
 
 _STABLE = 2.0  # x += -a x diverges for a >= 2
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.factory.settings import settings_in_loop
 from blf_dsc_controller.law.state import Settings
-from blf_dsc_controller.supervision.reference_load import ReferenceLoad
-from blf_dsc_controller.supervision.retuning import settings_in_loop
+from blf_dsc_controller.warnings.reference_load import ReferenceLoad
 
 Floats = NDArray[np.float64]
 

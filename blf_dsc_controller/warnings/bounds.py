@@ -15,10 +15,8 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.run import TURNING, JointUnits
-from blf_dsc_controller.supervision.expected_errors import (
-    ExpectedErrors,
-    guesses_rotors,
-)
+from blf_dsc_controller.warnings.expected_errors import ExpectedErrors
+from blf_dsc_controller.warnings.stability import guesses_rotors
 
 Floats = NDArray[np.float64]
 
@@ -71,12 +69,6 @@ def error_warnings(
 ) -> Iterator[str]:
     """Check that the errors to expect are within the bound (n,) [rad]."""
     if errors.is_endless:
-        yield (
-            f'feedback.stiffness: with a sample time of {config.sample_time:g} s and a '
-            f'robot.lag of {config.robot.lag:g} s these gains make errors grow from sample to '
-            'sample, on rigid gears too: lower it. Gains that the motors of an arm close '
-            'themselves belong there: `blf_dsc drive` with drive.feedback: motor'
-        )
         return
     yield from _of_unmodelled(config, bound, errors.unmodelled)
     yield from _of_pick_up(config, bound, errors.pick_up)

@@ -21,17 +21,22 @@ from blf_dsc_controller.configuration.robot import (
 )
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.state import Settings
-from blf_dsc_controller.supervision.body_warnings import body_warnings
-from blf_dsc_controller.supervision.bound_warnings import (
+from blf_dsc_controller.warnings.bodies import body_warnings
+from blf_dsc_controller.warnings.bounds import (
     error_warnings,
     width_warnings,
 )
-from blf_dsc_controller.supervision.expected_errors import (
+from blf_dsc_controller.warnings.expected_errors import (
     expected_errors,
 )
-from blf_dsc_controller.supervision.gain_limits import exceeded_limits
-from blf_dsc_controller.supervision.gear_warnings import gear_warnings
-from blf_dsc_controller.supervision.reference_load import ReferenceLoad, reference_load
+from blf_dsc_controller.warnings.gains import exceeded_limits
+from blf_dsc_controller.warnings.reference_load import ReferenceLoad, reference_load
+from blf_dsc_controller.warnings.stability import (
+    is_checked,
+    refuse_unstable,
+    soft_gains_warning,
+    stability_warnings,
+)
 
 _FIRST_ERROR = 1.5  # recommended bound over the first error
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
@@ -88,14 +93,16 @@ def config_warnings(
     settings = settings_of_config(config)
     load = load or reference_load(config, settings)
     errors = None
-    if config.model == 'urdf' and config.law in (OWN, PAPER):
+    refuse_unstable(config, settings)
+    if is_checked(config):
         errors = expected_errors(config, settings)
     found = [*_of_units(config), *width_warnings(config, errors), *_of_stop(config)]
     if config.model == 'urdf':
         found += _of_urdf(config, load)
     found += [f'{each.subject} {each.text}' for each in exceeded_limits(config, load)]
     if errors is not None:
-        found += gear_warnings(config, settings)
+        found += stability_warnings(config, settings)
+        found += soft_gains_warning(config, settings)
         found += error_warnings(config, settings.barrier.bound, errors)
     if config.model != 'urdf' and config.law in (OWN, PAPER):
         found += _of_first_error(config, settings, load)

@@ -14,76 +14,62 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.linear_loop import Feedback, Joints, Loop, Timing
+from blf_dsc_controller.arms.linear_loop import Joints, Loop
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.tool_bound import at_reversal
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.state import Settings
-from blf_dsc_controller.supervision.digits import largest_error
-from blf_dsc_controller.supervision.reference_load import along
+from blf_dsc_controller.numerics.digits import largest_error
+from blf_dsc_controller.warnings.reference_load import along
+from blf_dsc_controller.warnings.stability import (
+    guesses_rotors,
+    linear_feedback,
+    timing_of,
+)
 
 Floats = NDArray[np.float64]
 
 _RESPONSE = 20.0  # time constants of the damping, for which the response is followed
 _PEAK = 6.0  # of the surface, likewise; the peak comes before the integral acts
 _MOMENTS = 40  # of the reference
-ENDLESS = 1e3
-"""Error [rad or m] above which errors grow from sample to sample: the loop is unstable."""
+_LOOKED_AT = 8  # of them, every so many, for a loop that is stable
 
 
-def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedback:
-    """Return the law at small errors, with its inertia M0 (k, n, n) [kg m^2] of k postures.
-
-    `stiffness` (n,) [N m/rad] is the slope of the barrier.
-    """
-    one = np.broadcast_to(np.eye(settings.n), M0.shape)
-    acting = (
-        M0 / settings.joint_inertia if settings.feedback.follows_inertia == 1 else one
-    )
-    return Feedback(
-        position=acting * stiffness,
-        surface=one * settings.feedback.gain + M0 * settings.feedback.damping_rate,
-        inertia=0.0 * M0 if settings.feedback.decoupled == 1 else M0,
-        integral=acting * settings.disturbance.gain,
-        rate=settings.surface.gain / 2.0 + settings.surface.mu,
-        time_constant=settings.surface.time_constant,
-        known_rate=settings.surface.known_rate == 1,
-        damping_lag=settings.feedback.damping_lag,
-    )
-
-
-def linear_loop(
-    settings: Settings, T: float, lag: float, M: Floats, feedback: Feedback
-) -> Loop:
-    """Return the loop of a law and a rigid arm with inertias M (k, n, n) [kg m^2].
-
-    T [s] is the sample time, `lag` [s] that of velocity filter and drives together.
-    """
-    nothing = np.zeros(settings.n)
-    timing = Timing(T, drive_lag=0.5 * lag, velocity_lag=0.5 * lag)
-    return Loop(M, Joints(motors=nothing, viscous=nothing), timing, feedback)
-
-
-def _peak_errors(
-    config: ControllerConfig, settings: Settings, M: Floats, M0: Floats, torque: Floats
-) -> Floats:
+def _peak_errors(loop: Loop, settings: Settings, torque: Floats) -> Floats:
     """Return the largest errors (k, n) [rad] after a torque step d (k, n) [N m]."""
-    T = config.sample_time
-    feedback = linear_feedback(settings, M0, settings.barrier.weight)
-    A, B = linear_loop(settings, T, config.robot.lag, M, feedback).transition()
+    T = loop.timing.period
+    A, B = loop.transition()
     push = (B @ torque[..., None])[..., 0]
     x = np.zeros_like(push)
     largest = np.zeros_like(torque)
-    duration = _PEAK / max(float(feedback.rate.min()), 1.0)
+    duration = _PEAK / max(float(loop.feedback.rate.min()), 1.0)
     if settings.feedback.damping_rate > 0.0:
         duration = _RESPONSE / max(settings.feedback.damping_rate, 1.0)
-    with np.errstate(over='ignore', invalid='ignore'):  # of an unstable loop
-        for _ in range(round(duration / T)):
-            x = (A @ x[..., None])[..., 0] + push
-            largest = np.maximum(largest, np.abs(x[:, : settings.n]))
+    for _ in range(round(duration / T)):
+        x = (A @ x[..., None])[..., 0] + push
+        largest = np.maximum(largest, np.abs(x[:, : settings.n]))
     return largest
+
+
+def _stable_loop(
+    config: ControllerConfig, settings: Settings, M0: Floats
+) -> Loop | None:
+    """Return the loop of an arm with rigid gears in k postures; None if it is unstable.
+
+    The law's inertia is M0 (k, n, n) [kg m^2].  Drives are as heavy as guessed, or else as they
+    may be at most.
+    """
+    feedback = linear_feedback(settings, M0, settings.barrier.weight)
+    nothing = np.zeros(settings.n)
+    unknown = config.robot.unknown_rotors(config.robot.chain(config.joints))
+    for drives in (nothing, unknown) if guesses_rotors(config) else (nothing,):
+        joints = Joints(motors=drives, viscous=nothing)
+        loop = Loop(M0, joints, timing_of(config), feedback)
+        if loop.at(slice(None, None, _LOOKED_AT)).is_stable():
+            return loop
+    return None
 
 
 class ExpectedErrors(NamedTuple):
@@ -95,12 +81,11 @@ class ExpectedErrors(NamedTuple):
     @property
     def is_endless(self) -> bool:
         """Whether they grow from sample to sample."""
-        largest = max(float(each.max()) for each in self)
-        return not largest < ENDLESS  # or NaN
+        return bool(np.isinf(self.pick_up).any())
 
 
 def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErrors:
-    """Return the expected errors of an arm from a URDF, by the linear loop."""
+    """Return the expected errors of an arm from a URDF, infinite if its loop is unstable."""
     model, robot = settings.model, config.robot
     chain = robot.chain(config.joints)
     if config.reference.type == 'hold':  # at rest anywhere
@@ -112,9 +97,14 @@ def expected_errors(config: ControllerConfig, settings: Settings) -> ExpectedErr
     P0 = settings.initial_estimate[: settings.p]
     load = robot.payload * parameters_of(robot, chain).load
     M0, M = (inertia_matrices(model, P, q) for P in (P0, P0 + load))
-    unmodelled = _peak_errors(config, settings, M0, M0, _unmodelled(config, ddq))
+    loop = _stable_loop(config, settings, M0)
+    if loop is None:
+        endless = np.full(settings.n, np.inf)
+        return ExpectedErrors(endless, endless)
+    unmodelled = _peak_errors(loop, settings, _unmodelled(config, ddq))
+    loaded = loop._replace(links=M)
     pick_up = _peak_errors(
-        config, settings, M, M0, regressors_at(model, q, dq, dq, ddq) @ load
+        loaded, settings, regressors_at(model, q, dq, dq, ddq) @ load
     )
     return ExpectedErrors(unmodelled.max(axis=0), pick_up.max(axis=0))
 
@@ -133,12 +123,6 @@ def _unmodelled(config: ControllerConfig, ddq: Floats) -> Floats:
     floor = np.array(config.learning.residual_floor) + at_reversal(known, friction)
     unseen = measured.unseen_inertia or tuple(robot.unknown_rotors(chain))
     return np.asarray(floor + np.abs(ddq) * np.array(unseen))
-
-
-def guesses_rotors(config: ControllerConfig) -> bool:
-    """Whether the drives may be heavier than the inertia that is guessed for them."""
-    unknown = config.robot.unknown_rotors(config.robot.chain(config.joints))
-    return not config.commissioning.unseen_inertia and bool(unknown.any())
 
 
 def _causes(config: ControllerConfig) -> str:
