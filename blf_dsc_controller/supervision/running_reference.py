@@ -48,23 +48,11 @@ class PreparedStart(NamedTuple):
             return False
         if np.abs(dq).max() > AT_REST:
             return False
-        return can_take_over(config, bound, q, dq, self.motion.vector, 0.0)
-
-
-def can_take_over(
-    config: ControllerConfig,
-    bound: Vector,
-    q: Vector,
-    dq: Vector,
-    reference_vector: Vector,
-    t: float,
-) -> bool:
-    """Whether the law can take over at time t [s]: `check_takeover` as an answer."""
-    try:
-        check_takeover(config, bound, q, dq, reference_vector, t)
-    except StartError:
-        return False
-    return True
+        try:
+            check_takeover(config, bound, q, dq, self.motion.vector, 0.0)
+        except StartError:
+            return False
+        return True
 
 
 class RunningReference:
@@ -125,30 +113,23 @@ class RunningReference:
             return prepared.motion
         return plan_start(config, bound, q, dq, again=again)
 
-    def plan_resumption(
-        self, config: ControllerConfig, reading: Reading
+    def way_back(
+        self, config: ControllerConfig, reading: Reading, *, as_planned: bool = False
     ) -> BlendedReference | None:
-        """Return the way back to the reference, None if the arm is too far from it."""
-        if reading.stamp <= self.last_stamp:
-            return None
-        t = self.time_of(reading.stamp)
-        bound = self._controller.bound_at(t)
-        vector = self._controller.reference_vector
-        try:
-            return plan_resumption(config, bound, reading.q, reading.dq, vector, t)
-        except (StartError, MotionError):
-            return None
+        """Return the way back to the reference, None if the arm is too far from it.
 
-    def as_planned(
-        self, config: ControllerConfig, reading: Reading
-    ) -> BlendedReference | None:
-        """Return the reference as it is, None if the arm is too far from it."""
+        `as_planned`: it is the reference as it is.
+        """
         if reading.stamp <= self.last_stamp:
             return None
         t = self.time_of(reading.stamp)
-        bound = self._controller.bound_at(t)
-        vector = self._controller.reference_vector
-        if not can_take_over(config, bound, reading.q, reading.dq, vector, t):
+        bound, vector = self._controller.bound_at(t), self._controller.reference_vector
+        at = config, bound, reading.q, reading.dq, vector, t
+        try:
+            if not as_planned:
+                return plan_resumption(*at)
+            check_takeover(*at)
+        except (StartError, MotionError):
             return None
         return BlendedReference(vector, self.settled)
 

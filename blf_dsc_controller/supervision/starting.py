@@ -168,7 +168,7 @@ class Starting:
         try:
             motion = None
             if reference.resumable:
-                motion = reference.plan_resumption(config, reading)
+                motion = reference.way_back(config, reading)
             resumed = motion is not None
             if motion is None:
                 again = commanded is not None
@@ -202,8 +202,9 @@ class Starting:
             return True
         reference = command.reference
         has_just_planned = law.samples == 1
-        way = reference.as_planned if has_just_planned else reference.plan_resumption
-        motion = way(command.config, reading)
+        motion = reference.way_back(
+            command.config, reading, as_planned=has_just_planned
+        )
         if motion is not None:
             law.begin(Start.AFTER_GAP)
             self._follow(motion, reading, resumed=True)
