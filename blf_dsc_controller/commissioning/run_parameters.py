@@ -32,7 +32,7 @@ def shaking_parameters(
         | {
             'learning.enabled': False,
             'limits.acceleration': limit.tolist(),
-            'safety.oscillation': 'warn',  # below VIOLENT tones of the motion look alike
+            'safety.oscillation': 'warn',  # up to a fifth of a limit tones look alike
         }
     )
 

@@ -8,7 +8,7 @@ more than its gains do, it is measured again with swings that keep its joints sl
 that sticks shows damping by friction that a steady motion does not have.
 
 An arm that oscillates with the gains of its measurement stops before it does so with a quarter of
-its torque limits (`law.oscillation.VIOLENT`).  One that nearly oscillates makes noise that no
+its torque limits (`safety.oscillation: warn`).  One that nearly oscillates makes noise that no
 torque overcomes, and the controller reports an oscillation.  Either is measured again with half of
 these gains, as often as needed: its response does not depend on them.
 """

@@ -41,11 +41,8 @@ SOME = 2
 FEW = 3
 """Half waves in a row that tell why an arm stops: an oscillation may grow fast."""
 
-VIOLENT = 0.2
-"""Part of the torque limit, as amplitude of its torque, from which nothing may wait.
-
-The tones of a commissioning, which calm arms follow, have looked like up to 0.16.
-"""
+VIOLENT = 0.5
+"""Part of the torque limit, as amplitude of its torque, from which nothing may wait."""
 
 PATIENCE = 0.25
 """Time [s] from one report to the next, in which an oscillation can die out."""

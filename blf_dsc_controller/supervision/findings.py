@@ -52,7 +52,7 @@ class Findings:
     def check_oscillation(self) -> Fault | None:
         """Return the fault of an arm that oscillates, or record what it is warned of."""
         command, check = self._command, self._command.oscillation
-        if not command.controller.flags & OSCILLATES:
+        if not (command.controller.flags & OSCILLATES or check.only_warns):
             return None
         before = check.count
         if check.must_stop(command.reference.time):
