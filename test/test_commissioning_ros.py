@@ -21,7 +21,6 @@ from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import (
     over_ros,
 )
-from blf_dsc_controller.commissioning.motion import is_motion
 from blf_dsc_controller.commissioning.over_ros import OverRos
 from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.configuration.schema import flatten
@@ -77,7 +76,8 @@ class Rig:
         guard = self.node.guard
         if guard is None or not guard.supervisor.running:
             return ''
-        return 'motion' if is_motion(guard.config) else 'move'
+        is_shaken = guard.config.reference.type == 'sinusoids'
+        return 'motion' if is_shaken else 'move'
 
     def passed(self):
         """Return since when the law has followed the reference of this part [s]."""

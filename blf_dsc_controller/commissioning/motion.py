@@ -131,15 +131,6 @@ def lines_in(config: ControllerConfig) -> Lines:
     return Lines(period, by_joint[:, :-SLOW_TONES], by_joint[:, -SLOW_TONES:])
 
 
-def is_motion(config: ControllerConfig) -> bool:
-    """Whether a configuration has a motion of a commissioning, which shakes the arm."""
-    try:
-        lines_in(config)
-    except BlfDscError:
-        return False
-    return True
-
-
 _OTHER_MOTION = (
     'the reference of this run is not the motion of a commissioning: run the parameters that '
     '`blf_dsc commission --write` writes'
