@@ -160,7 +160,7 @@ class InCommand:
         self.clean = True
         self.readings.restart()
         if self.readings.last.age >= FADE_TIME:
-            # else a torque may have to fade, which a driver must not hold
+            # else a damping torque may have to fade, which a driver must not hold
             self.watchdog.wait()
 
     def stop(self, reason: Reason, text: str) -> None:
@@ -204,8 +204,8 @@ class InCommand:
     def withdraw_after_silence(self, gap: float) -> None:
         """Stay silent after a long silence in which the law was not in command.
 
-        By then the safe torque has faded to zero, and whoever restarted the driver may
-        not expect another. `gap` [s] is the time since the state before.
+        Whoever restarted the driver meanwhile may not expect a torque.  `gap` [s] is the time
+        since the state before.
         """
         faded = self.readings.last.age >= FADE_TIME
         if not self.silenced and faded and self.commanding and gap > LONG_SILENCE:
