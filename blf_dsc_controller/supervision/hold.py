@@ -2,9 +2,9 @@
 """The torque that holds an arm without its law, and ramps to it.
 
 It is zero, damping -D v, or damping with gravity H(q, 0, 0, 0) P^ and a load, as `safety.torque`
-says, less what the drives add.  Only trusted states enter it.  Without one, the damping fades
-within half a second, and so does a load that the arm has not shown to carry: what is left is the
-torque that held the arm where it was last.
+says, less what the drives add.  Only trusted states enter it.  Without one there is no velocity
+to damp, and a load that the arm has not shown to carry fades within half a second: what is left
+is the torque that held the arm where it was last.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from blf_dsc_controller.supervision.swing import Swing
 Vector = NDArray[np.float64]
 
 FADE_TIME = 0.5
-"""Time [s] in which damping fades, and a load that is not sure, while no state is trusted."""
+"""Time [s] in which a load that is not sure fades while no state is trusted."""
 
 _RESTED = 10.0 / OBSERVER[1]  # s at rest, in which the observed load settles
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
@@ -238,17 +238,16 @@ class Hold:
         of `braking_matrix`, and smaller while states have gaps (`within_gap`).
         """
         settings, last = self._settings, self._last
-        left = max(0.0, 1.0 - last.age / FADE_TIME)
+        kept = 1.0 if self.carries else max(0.0, 1.0 - last.age / FADE_TIME)
         damping = self._swing.share * np.maximum(self.scale, _LIGHTEST) * damping
         torque = np.zeros(settings.n)
         with np.errstate(over='ignore', invalid='ignore'):  # the caller limits it
             if kind == 'damping':
                 borne = within_gap(settings, damping, last.q, last.gap)
-                torque -= left * (borne * last.slow)
+                torque -= borne * last.slow
             if kind == 'hold_gravity':
                 D = braking_matrix(settings, damping, last.q, last.gap)
-                torque -= left * (D @ last.slow)
-                kept = 1.0 if self.carries else left
+                torque -= D @ last.slow
                 torque += self.gravity(self._estimate) + kept * self.load
                 torque -= added_torque(settings.torque, last.q)
         return torque

@@ -26,8 +26,8 @@ class TorqueWatchdog:
     Times are those [s] of a steady clock. It commands when no torque of the controller
     has been seen for `timeout` while joint states went on by half of that, by their
     stamps: a plant in lock-step, which waits for a torque, is left alone. It ends with
-    the next torque of the controller, or when load and damping have faded because the
-    states stopped, too: the drives then keep the gravity of where the arm was.
+    the next torque of the controller, or once the states have stopped for as long as
+    a load in doubt takes to fade: the drives then keep the gravity of where the arm was.
 
     It then waits for the next torque of the controller before it watches again, as it
     does after a silence of the states of LONG_SILENCE, and after the controller has
