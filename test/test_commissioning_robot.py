@@ -362,7 +362,7 @@ def test_gains_are_proven_in_three_steps_and_errors_compared(arm, capsys, monkey
 @pytest.mark.parametrize(
     ('address', 'factor', 'code', 'printed'),
     [
-        ('plant', '9', 5, ['way with 50% of the gains: the controller', 'oscillates']),
+        ('plant', '5', 5, ['way with 50% of the gains: the controller', 'oscillates']),
         (
             'interrupt@300',
             '',
@@ -374,7 +374,7 @@ def test_gains_are_proven_in_three_steps_and_errors_compared(arm, capsys, monkey
 def test_gains_that_are_not_proven_are_told(
     address, factor, code, printed, arm, capsys
 ):
-    """With 96 times the stiffness and damping of the arm; or ended by somebody."""
+    """With tens of times the stiffness and damping of the arm; or ended by somebody."""
     gains = {name: factor + value for name, value in CHOSEN.items()}
     assert prove(arm, address, gains) == code
     told = capsys.readouterr().err
