@@ -251,7 +251,7 @@ class Readings:
             return Doubt.NOT_FINITE
         elapsed = (stamp - last.stamp) * NANOSECOND
         step = max(T, (stamp - self._arrived) * NANOSECOND)
-        limit = 2.0 * self.fastest * step
+        limit = 2.0 * self.fastest * step + self._least_step
         if (np.abs(q - self._at) > limit).any():
             self._alone_since = stamp
         if last.age == inf:
@@ -272,8 +272,13 @@ class Readings:
         age = (stamp - self._new_at) * NANOSECOND
         if age < BRIDGED * self._sample_time or not self._equals(measurement):
             return False
-        least = _STEPS * np.maximum(self.sensor.resolution, _FINEST)
-        return bool((np.abs(measurement[n : 2 * n]) * age > least).any())
+        moved = np.abs(measurement[n : 2 * n]) * age
+        return bool((moved > self._least_step).any())
+
+    @property
+    def _least_step(self) -> Vector:
+        """Motion (n,) [rad] that the steps of the sensor show."""
+        return np.asarray(_STEPS * np.maximum(self.sensor.resolution, _FINEST))
 
     def _equals(self, measurement: Vector) -> bool:
         return bool((measurement[: self._read.size] == self._read).all())
