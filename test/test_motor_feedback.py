@@ -24,6 +24,7 @@ from blf_dsc_controller.motors.frame import (
 from sim_plant.motors import MotorPlant
 
 SLOW = 0.004  # s
+IN_MOTORS = {'insist': ['feedback.stiffness']}  # no loop over the bus
 
 
 def test_motion_by_hand_sends_motors_the_torque_that_a_bag_records(
@@ -59,7 +60,7 @@ def run(loop, feedback, duration, dies_after=2.0, loses=0):
     Every `loses`-th frame is lost.
     """
     period = loop.controller.sample_time
-    controller = blf.ArmController(loop.controller)
+    controller = blf.ArmController(blf.change(loop.controller, IN_MOTORS))
     plant = MotorPlant(loop.plant, RANGES)
     motor = MotorFeedback(controller, RANGES, loop.plant.actuator.delay * period)
     worst = 0.0
@@ -123,7 +124,7 @@ def test_yam_of_the_preset_takes_up_its_rated_payload_with_the_gains_of_its_make
     )
     ranges = damiao.ranges_of(limits_of(config, 6))
     plant = MotorPlant(loop.plant, ranges, rate=2000.0)
-    controller = blf.ArmController(loop.controller)
+    controller = blf.ArmController(blf.change(loop.controller, IN_MOTORS))
     motor = MotorFeedback(controller, ranges, SLOW)
     of_motors, of_links = np.zeros((2, 5000, 6))
     for k in range(5000):

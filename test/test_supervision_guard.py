@@ -527,7 +527,7 @@ def test_samples_past_the_bound_are_counted_where_they_do_not_stop_the_arm():
 
 def test_arm_that_stands_still_under_noise_is_not_taken_for_braked():
     """Noise makes the torque chatter although nothing moves."""
-    given = {'reference.type': 'hold', 'safety.oscillation': 'warn'}
+    given = {'reference.type': 'hold', 'safety.oscillation': 'ignore'}
     arm = arm_of(KNOWN | given)
     draw = np.random.default_rng(0)
     noise = changed(dq=lambda dq: dq + 0.04 * draw.normal(size=2))

@@ -128,7 +128,7 @@ def test_arm_that_oscillates_is_stopped_with_the_load_that_it_carries():
 
 
 def test_oscillation_that_is_warned_of_stops_the_arm_once_it_is_violent(tmp_path):
-    """Joint 6 begins; 80 ms later another has half of its torque limit."""
+    """Joint 6 begins; another then has a fifth of its torque limit."""
     warn = {'safety.oscillation': 'warn'}
     loop = loop_of('panda', gain=2.0, law=warn, duration=1.0)
     record = blf.simulate(loop.controller, loop.plant)
@@ -148,7 +148,8 @@ def test_oscillation_that_is_warned_of_stops_the_arm_once_it_is_violent(tmp_path
     assert stop.stamp > found.stamp
     joint, amplitude = stop.text.split("'")[1], stop.text.split('+-')[1].split()[0]
     i = run.joints.index(joint)
-    assert float(amplitude) > 0.49 * loop.controller.torque.limit[i]  # two digits
+    part = float(amplitude) / loop.controller.torque.limit[i]
+    assert 0.19 < part < 0.4
     write_bag(tmp_path / 'bag', record)
     result = blf.verify(tmp_path / 'bag')
     assert (result.difference, result.remarks) == (None, ())

@@ -37,6 +37,8 @@ STIFFNESS = 'feedback.stiffness'
 LEAST_MARGIN = 0.2
 """Modulus margin below which gains are warned of."""
 
+# radius from which errors grow: an integrator without gain has 1, as exactly as it is computed
+_GROWS = 1.0 + 1e-6
 _POSTURES = 3
 _SOFTER = 0.8  # of the damping, until joints that are coupled are stable, too
 _TRIALS = 10
@@ -118,10 +120,10 @@ def _loops(config: ControllerConfig, settings: Settings) -> list[Loop]:
 
 def _oscillation(loop: Loop) -> Oscillation | None:
     """Return what grows fastest in a loop; None if it is stable."""
-    if loop.is_stable():
-        return None
     A, _ = loop.transition()
     values, vectors = np.linalg.eig(A)
+    if np.abs(values).max() < _GROWS:
+        return None
     k, i = np.unravel_index(int(np.abs(values).argmax()), values.shape)
     n = len(loop.joints.motors)
     inertia = np.diagonal(loop.links[k]) + loop.joints.motors
@@ -135,9 +137,16 @@ def is_checked(config: ControllerConfig) -> bool:
     return config.model == 'urdf' and config.law in (OWN, PAPER)
 
 
+def _adapts_to_drives(config: ControllerConfig) -> bool:
+    """Whether the law measures the inertia of the drives, and takes down its gains."""
+    return config.feedback.inertia == 'whole'
+
+
 def refuse_unstable(config: ControllerConfig, settings: Settings) -> None:
     """Raise StartError if no arm bears these gains, unless they are insisted on."""
-    if not is_checked(config) or STIFFNESS in config.insist:
+    if not is_checked(config) or _adapts_to_drives(config):
+        return
+    if STIFFNESS in config.insist:
         return
     loops = _loops(config, settings)
     found = [_oscillation(each) for each in loops]
@@ -145,15 +154,17 @@ def refuse_unstable(config: ControllerConfig, settings: Settings) -> None:
     if first is None or None in found:
         return
     problem = (
-        f'{STIFFNESS}: {_grows(config, first)}{_advice(config, loops[0])}. Gains that the motors '
-        'of an arm close themselves belong there: `blf_dsc drive` with drive.feedback: motor. If '
-        f'these are meant, list {STIFFNESS} in insist'
+        f'{STIFFNESS}: {_grows(config, first)}{_advice(config, loops[0])}. If the motors of the '
+        'arm close this loop themselves, keep the gains that the maker runs in them: `blf_dsc '
+        f'drive` with drive.feedback: motor. If these are meant, list {STIFFNESS} in insist'
     )
     raise StartError(problem)
 
 
 def stability_warnings(config: ControllerConfig, settings: Settings) -> Iterator[str]:
     """Warn of gains that some of the arms that are possible do not bear."""
+    if _adapts_to_drives(config):
+        return
     loops = _loops(config, settings)
     found = next(filter(None, map(_oscillation, loops)), None)
     if found is not None:
