@@ -65,6 +65,14 @@ def test_states_that_have_thrown_an_arm_do_not(case, moves):
     assert not (np.abs(record.torque) > arm.config.torque.limit).any()
 
 
+def test_same_pose_without_velocities_beside_the_arm_does_not_throw_it():
+    """0.1 ms later, to 11 rad/s; the law itself uses these velocities until it oscillates."""
+    play = Play('of another', 0.0, 1, 1, 1)
+    _, record, faster = played('panda', play, moves=True)
+    assert faster < 0.5
+    assert record.speed[-1].max() < 0.1
+
+
 def test_states_of_another_are_named():
     arm, _, _ = played('fr3', Play('of another', 0.5, 3, 5, 1), moves=False)
     assert arm.controller.phase is blf.Phase.SAFE_STOP

@@ -34,6 +34,9 @@ Vector = NDArray[np.float64]
 ALONE = 0.5
 """Time [s] after which states that follow from each other are trusted, wherever they began."""
 
+# of a sample time: of two states in less, one is a copy, or of another sender, and their
+# difference shows no acceleration
+_AT_ONCE = 0.5
 _STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
 _FINEST = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
 
@@ -47,7 +50,7 @@ class Doubt(Enum):
     """Why a state is not trusted."""
 
     NOT_FINITE = 'positions are not finite'
-    COPY = 'the stamp of the last one'
+    COPY = 'the stamp of the last one, or hardly a later one'
     REPEATED = 'the same values, although they say that the arm moves'
     OUT_OF_REACH = 'positions that an arm does not reach from the last ones'
 
@@ -264,7 +267,7 @@ class Readings:
         is_alone = (stamp - self._alone_since) * NANOSECOND >= ALONE
         if not is_alone and (np.abs(q - last.q) > reach).any():
             return Doubt.OUT_OF_REACH
-        return None
+        return Doubt.COPY if 0.0 < elapsed < _AT_ONCE * T else None
 
     def _is_repeated(self, stamp: int, measurement: Vector) -> bool:
         """Whether a state is an old reading for too long, of an arm that it says moves."""
