@@ -101,9 +101,8 @@ class LastState:
         usable = np.where(np.abs(dq) <= fastest, dq, 0.0)
         if not is_next:
             self.slow[:] = usable
-        if (
-            not is_usable
-        ):  # differenced twice, positions show the noise of their encoders
+        if not is_usable:
+            # differenced twice, positions would show the noise of their encoders
             usable = self.slow
         is_known = is_next and is_usable == self.is_measured
         self.is_measured = is_usable

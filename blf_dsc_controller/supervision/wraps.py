@@ -51,9 +51,8 @@ class Wraps:
         step = q - self._last
         fault = None
         self._next = self._offset
-        if (
-            not hypot(*step.tolist()) <= pi
-        ):  # as a rule; not if a position is not finite
+        # as a rule it is less; not if a position is not finite
+        if not hypot(*step.tolist()) <= pi:
             fault = self._count_on(measurement, step, gap, fastest)
             q = measurement[:n] + self._next
         if not self._is_off and self._next is self._offset:

@@ -12,7 +12,7 @@ def not_commissioned(config: ControllerConfig, *, in_motors: bool = False) -> st
 
     It is for robots: nobody measures a simulated arm, or the two links of the paper.
     Gains of an arm of which nothing is known are warned of in any case
-    (`gear_warnings`).  A commissioning measures no feedback that is `in_motors`.
+    (`stability`).  A commissioning measures no feedback that is `in_motors`.
     """
     feedback = config.feedback
     if config.model != 'urdf' or config.law not in (OWN, PAPER):

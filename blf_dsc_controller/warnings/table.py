@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warnings about a configuration that is valid but cannot work well.
 
-Those on gains are in `gain_limits` and `gear_warnings`, those on the bound in `bound_warnings`;
-here are the others, and all of them together. doc/tuning.md derives them.
+Those on gains are in `gains` and `stability`, those on the bound in `bounds`; here are the
+others, and all of them together. doc/tuning.md derives them.
 """
 
 from __future__ import annotations
