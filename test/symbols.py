@@ -6,6 +6,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+from blf_dsc_controller.law import columns
 from blf_dsc_controller.law.state import Settings
 
 _PARTS = {
@@ -14,9 +15,7 @@ _PARTS = {
     'feedback': 'gain=Kp robust_gain=d2 damping_rate follows_inertia decoupled',
     'disturbance': 'gain=gamma leakage=eta',
     'torque': 'limit=torque_limit rate_limit drive',
-    'columns': (
-        'bias viscous coulomb coulomb_velocity load_friction frequencies ripple_cycles'
-    ),
+    'columns': 'coulomb_velocity',
     'row': 'filter_pole=pole motion_scale lag row_weight',
     'window': 'length=window row_interval interval prior_weight regularization=rho',
     'excitation': (
@@ -45,10 +44,24 @@ def replaced(settings: Settings, **changes: Any) -> Settings:
     return settings
 
 
+def _blocks(of: columns.Settings) -> dict[str, Any]:
+    """Return which disturbance columns there are."""
+    blocks = list(zip(of.kinds, of.rates, strict=True))
+    return {
+        'bias': columns.BIAS in of.kinds,
+        'viscous': columns.VISCOUS in of.kinds,
+        'coulomb': columns.COULOMB in of.kinds,
+        'load_friction': columns.LOAD_FRICTION in of.kinds,
+        'frequencies': [w for kind, w in blocks if kind == columns.SINE],
+        'ripple_cycles': [N for kind, N in blocks if kind == columns.RIPPLE_SINE],
+    }
+
+
 def by_symbol(settings: Settings) -> SimpleNamespace:
     """Return the settings by their symbols."""
     return SimpleNamespace(
         **settings._asdict()
+        | _blocks(settings.columns)
         | {
             symbol: getattr(getattr(settings, part) if part else settings, field)
             for symbol, (part, field) in _FIELDS.items()

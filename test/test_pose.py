@@ -40,7 +40,9 @@ def test_tip_moves_along_a_line_and_turns_evenly(turn, tmp_path):
         pinocchio.framesForwardKinematics(model, data, np.append(q, [0.0, 0.0]))
         poses.append(data.oMf[tip].copy())
     first = poses[0]
-    way = there - first.translation  # the arm is not quite at its reference when it begins
+    way = (
+        there - first.translation
+    )  # the arm is not quite at its reference when it begins
     for pose in poses:
         moved = pose.translation - first.translation
         done = moved @ way / (way @ way)

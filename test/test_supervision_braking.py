@@ -9,8 +9,7 @@ import pytest
 from blf_dsc_controller import ControllerConfig, change, load_loop
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law.columns import fill_columns
-from blf_dsc_controller.law.load_friction import fill_measured
+from blf_dsc_controller.law import columns
 from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
 from blf_dsc_controller.supervision.model_torque import friction_torque
 
@@ -88,17 +87,20 @@ def test_without_an_estimate_each_joint_brakes_alone():
 def test_friction_in_a_stop_is_what_the_columns_of_the_law_have_besides_those_at_rest():
     """Where a column was forgotten, 5 N m of friction were held as a load."""
     settings = settings_of_config(load_loop('ur5e').controller)
-    assert settings.columns.load_friction == 1
+    of = settings.columns
+    assert columns.LOAD_FRICTION in of.kinds
     draw = np.random.default_rng(0)
     dq, tau = draw.uniform(-1.0, 1.0, (2, settings.n))
     estimate = draw.uniform(0.1, 1.0, settings.m)
 
-    def columns(velocity):
+    def torque(velocity):
         row = np.zeros((settings.n, settings.m))
-        fill_columns(settings.columns, 0.3, velocity, row)
-        fill_measured(settings.columns, tau, velocity, row)
+        for i in range(settings.n):
+            sign = np.tanh(velocity[i] / of.coulomb_velocity)
+            at = columns.Point(0.3, 0.0, velocity[i], sign, tau[i])
+            columns.fill(of, columns.ALL, i, at, row)
         return row @ estimate
 
-    expected = columns(dq) - columns(np.zeros(settings.n))
+    expected = torque(dq) - torque(np.zeros(settings.n))
     found = friction_torque(settings, estimate, dq, tau)
     np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -19,11 +19,11 @@ from blf_dsc_controller.arms.model import ArmModel, arm_model, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION, parameters_of
 from blf_dsc_controller.configuration.two_link import two_link
+from blf_dsc_controller.law import columns
 from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.run import LearnedArm
 
 _MOST_FRICTION = 3.0  # times its initial estimate
-_LOAD_FRICTION = 'load_friction'
 _SHARE, _MOST_SHARE = 0.05, 0.2  # of the torque in a gear: standard deviation, and most
 _RIPPLE = 0.01  # standard deviation of a torque ripple, of the rated torque
 
@@ -36,6 +36,14 @@ def model_of(config: ControllerConfig) -> ArmModel:
         return deepcopy(base.model)  # has working memory
     given = two_link(config)
     return arm_model(given.l1, given.gravity)
+
+
+class Block(NamedTuple):
+    """A block of disturbance columns, one for each joint: see `law.columns`."""
+
+    name: str
+    kind: int
+    rate: float = 0.0  # of a sine or cosine: rad/s, or periods per turn
 
 
 class Column(NamedTuple):
@@ -51,7 +59,7 @@ class Column(NamedTuple):
 
 
 def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
-    """Return the disturbance columns, in the order of `columns`, `load_friction` and `ripple`.
+    """Return the disturbance columns, in the order of `blocks_of`.
 
     The standard deviation is half the initial estimate, or 5 % of the rated torque
     where that is zero, for `viscous` at the largest velocity of the reference.  Ripple
@@ -64,48 +72,45 @@ def columns_of(config: ControllerConfig) -> tuple[Column, ...]:
     if config.model == 'urdf':
         known = config.robot.friction(config.robot.chain(config.joints))
     return tuple(
-        _column(config, block, i, known[block][i] if block in known else 0.0)
-        for block in _column_blocks(config)
+        _column(config, block, i, known[block.name][i] if block.name in known else 0.0)
+        for block in blocks_of(config)
         for i in range(len(config.joints))
     )
 
 
-def switched_blocks(config: ControllerConfig) -> dict[str, bool]:
-    """Return which disturbances are learned: friction of an arm from a URDF, or a constant."""
-    has_friction = config.model == 'urdf'
-    return {
-        'bias': not has_friction and two_link(config).bias,
-        'viscous': has_friction,
-        'coulomb': has_friction,
-        _LOAD_FRICTION: config.learns_load_friction,
-    }
+def blocks_of(config: ControllerConfig) -> tuple[Block, ...]:
+    """Return the blocks of disturbance columns: friction of a URDF, or what disturbs two links."""
+    if config.model == 'urdf':
+        blocks = [
+            Block('viscous', columns.VISCOUS),
+            Block('coulomb', columns.COULOMB),
+        ]
+        tones: tuple[float, ...] = ()
+    else:
+        given = two_link(config)
+        blocks = [Block('bias', columns.BIAS)] if given.bias else []
+        tones = given.frequencies
+    if config.learns_load_friction:
+        blocks.append(Block('load_friction', columns.LOAD_FRICTION))
+    for w in tones:
+        blocks.append(Block(f'sin {w:g} rad/s', columns.SINE, w))
+        blocks.append(Block(f'cos {w:g} rad/s', columns.COSINE, w))
+    for N in config.learning.ripple_cycles:
+        blocks.append(Block(f'sin {N:g} q', columns.RIPPLE_SINE, N))
+        blocks.append(Block(f'cos {N:g} q', columns.RIPPLE_COSINE, N))
+    return tuple(blocks)
 
 
-def disturbance_frequencies(config: ControllerConfig) -> tuple[float, ...]:
-    """Return the frequencies [rad/s] of sinusoidal disturbances: of the two links alone."""
-    return () if config.model == 'urdf' else two_link(config).frequencies
-
-
-def _column_blocks(config: ControllerConfig) -> list[str]:
-    """Return the names of the blocks of columns, each with a column per joint."""
-    learning = config.learning
-    blocks = [name for name, is_on in switched_blocks(config).items() if is_on]
-    for w in disturbance_frequencies(config):
-        blocks += [f'sin {w:g} rad/s', f'cos {w:g} rad/s']
-    for cycles in learning.ripple_cycles:
-        blocks += [f'sin {cycles:g} q', f'cos {cycles:g} q']
-    return blocks
-
-
-def _column(config: ControllerConfig, block: str, i: int, initial: float) -> Column:
+def _column(config: ControllerConfig, block: Block, i: int, initial: float) -> Column:
     """Return the column of a block for joint i, with its initial estimate."""
-    name = f'{block} {config.joints[i]}'
-    if block == _LOAD_FRICTION:
+    name = f'{block.name} {config.joints[i]}'
+    if block.kind == columns.LOAD_FRICTION:
         return Column(name, '1', 0.0, _SHARE, 0.0, _MOST_SHARE, is_friction=False)
-    is_viscous = block == 'viscous'
-    is_friction = block in {'viscous', 'coulomb'}
+    is_viscous = block.kind == columns.VISCOUS
+    is_friction = block.kind in {columns.VISCOUS, columns.COULOMB}
+    is_ripple = block.kind in {columns.RIPPLE_SINE, columns.RIPPLE_COSINE}
     velocity = config.limits.velocity[i] if is_viscous else 1.0
-    share = _RIPPLE if block.endswith(' q') else UNKNOWN_FRICTION
+    share = _RIPPLE if is_ripple else UNKNOWN_FRICTION
     usual = share * config.torque.limit[i] / velocity
     return Column(
         name=name,
@@ -144,15 +149,15 @@ def doubting_covariance(config: ControllerConfig) -> np.ndarray:
 
 def _covariance(config: ControllerConfig, relative: float) -> np.ndarray:
     """Return a covariance (m, m) of theta, with a `relative` deviation of the drives' inertias."""
-    columns = columns_of(config)
+    learned = columns_of(config)
     if config.model != 'urdf':
-        return np.eye(model_of(config).p + len(columns))
+        return np.eye(model_of(config).p + len(learned))
     robot = config.robot
     chain = config.robot.chain(config.joints)
     rotors = robot.rotors(chain)
     unsure = np.where(rotors > 0.0, relative * rotors, UNKNOWN_ROTOR)
     L = prior_factor(chain, parameters_of(robot, chain), robot.payload, unsure)
-    covariance = np.diag([0.0] * len(L) + [column.deviation**2 for column in columns])
+    covariance = np.diag([0.0] * len(L) + [column.deviation**2 for column in learned])
     covariance[: len(L), : len(L)] = product(L, L.T)
     return covariance
 

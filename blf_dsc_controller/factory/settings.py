@@ -26,12 +26,11 @@ from blf_dsc_controller.configuration.robot import (
 )
 from blf_dsc_controller.factory.estimate import (
     Column,
+    blocks_of,
     columns_of,
-    disturbance_frequencies,
     doubting_covariance,
     model_of,
     prior_covariance,
-    switched_blocks,
 )
 from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.inertia import joint_inertia
@@ -159,7 +158,7 @@ def _parts_of_learning(
         'excitation': _excitation(config),
         'adaptation': _adaptation(config, p, learned, covariance),
         'motors': motor_friction.Settings(
-            size=p + len(config.joints) * (of.bias + of.viscous),
+            size=columns.first_column(of, columns.COULOMB, len(config.joints)),
             filter_pole=row.filter_pole,
             length=sliding.length,
             period=sliding.row_interval * config.sample_time,
@@ -255,18 +254,13 @@ def _torque(config: ControllerConfig) -> torque.Settings:
 
 def _columns(config: ControllerConfig, p: int) -> columns.Settings:
     """Return which disturbance columns there are."""
-    learning = config.learning
-    blocks = switched_blocks(config)
-    tones = disturbance_frequencies(config)
-    return filled(
-        columns.Settings,
-        learning,
+    blocks = blocks_of(config)
+    return columns.Settings(
         first=p,
-        **{name: int(is_on) for name, is_on in blocks.items()},
+        blocks=len(blocks),
         coulomb_velocity=_coulomb_velocity(config),
-        tones=len(tones),
-        frequencies=np.array(tones),
-        ripples=len(learning.ripple_cycles),
+        kinds=np.array([float(block.kind) for block in blocks]),
+        rates=np.array([block.rate for block in blocks]),
     )
 
 
@@ -385,21 +379,16 @@ def friction_settings(settings: Settings) -> friction.Settings:
     """Return what is known of friction, by all other settings."""
     n = settings.n
     of, adapts = settings.columns, settings.adaptation
-    viscous = settings.p + n * of.bias
-    coulomb = viscous + n * of.viscous
-    own = slice(coulomb, coulomb + n)
+    coulomb = columns.first_column(of, columns.COULOMB, n)
+    has_coulomb = coulomb < settings.m
 
     def of_coulomb(values: np.ndarray) -> np.ndarray:
-        return values[own] if of.coulomb else np.zeros(n)
+        return values[coulomb : coulomb + n] if has_coulomb else np.zeros(n)
 
     return friction.Settings(
-        viscous=of.viscous,
-        coulomb=of.coulomb,
-        first_viscous=viscous,
+        coulomb=int(has_coulomb),
         first_coulomb=coulomb,
-        learns=of.coulomb,
         coulomb_velocity=of.coulomb_velocity,
-        lag=settings.row.lag,
         pole=settings.row.filter_pole,
         reversals=reversals.Settings(
             unmodelled=settings.external.unmodelled,

@@ -18,13 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blf_dsc_controller.arms.friction import slidings
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.factory.estimate import prior_covariance
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.clearance import Clearance
+from blf_dsc_controller.law import columns
 from blf_dsc_controller.progress import steps
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.reference.terms import pack, sampled, sinusoids_term
@@ -161,21 +161,13 @@ class ExcitationProblem:
 
     def _rows(self, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
         """Return [H(q, dq, dq, ddq) | D] (k, n, m) of a motion, as `law.columns` describes D."""
-        given = self._settings.columns
-        ones = np.ones_like(dq)
-        t = self._times[:, np.newaxis]
-        columns = [ones] * given.bias + [dq] * given.viscous
-        rubs = slidings(dq, given.coulomb_velocity)
-        columns += [rubs] * given.coulomb
-        H = regressors_at(self._settings.model, q, dq, dq, ddq)
-        if given.load_friction:
-            tau = H @ self._settings.initial_estimate[: given.first]
-            columns.append(np.abs(tau) * rubs)
-        waves = (np.sin, np.cos)
-        columns += [wave(w * t) * ones for w in given.frequencies for wave in waves]
-        columns += [wave(c * q) for c in given.ripple_cycles for wave in waves]
-        D = [column[:, :, np.newaxis] * np.eye(self.n) for column in columns]
-        return np.concatenate((H, *D), axis=2)
+        settings = self._settings
+        H = regressors_at(settings.model, q, dq, dq, ddq)
+        tau = H @ settings.initial_estimate[: settings.p]
+        rows = np.zeros((len(q), self.n, settings.m))
+        rows[:, :, : settings.p] = H
+        columns.fill_motion(settings.columns, self._times, q, dq, tau, rows)
+        return rows
 
     def _relative_excitation(self, dq: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return L^T Phi L (m, m), R^-1 = L L^T; its eigenvalues are those of Phi relative to R."""

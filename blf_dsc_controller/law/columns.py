@@ -1,62 +1,141 @@
 # SPDX-License-Identifier: Apache-2.0
 """Disturbance columns D, whose coefficients d are learned with the parameters P.
 
-    tau_dist = D d,    D = [ I | diag(dq) | diag(tanh(dq / v_c)) | I sin(w t) | I cos(w t) | ... ]
+    tau_dist = D d,    D_k = diag(a_k)                                                 [N m]
 
-for each block that is configured, and those of `load_friction` and `ripple`.  (22)-(24) instead
-subtract the estimate d^3 from the torque, which hides the parameter error.
+Each block k of D has a column per joint, with the entry a_k of its kind:
+
+    kind                      entry a_k             compensated
+    BIAS                      1                     by d^3
+    SINE, COSINE              sin w t, cos w t      by d^3
+    RIPPLE_SINE, _COSINE      sin N q, cos N q      at the reference
+    VISCOUS                   dq                    at the reference
+    LOAD_FRICTION             |tau_L| s(dq)         at the reference
+    COULOMB                   s(dq)                 by `friction`, with s(v) = tanh(v / v_c)
+
+A kind is one entry here, and one of `factory.estimate` with its name, unit and prior.  (22)-(24)
+instead subtract the estimate d^3 from the torque, which hides the parameter error.
+
+*Torque ripple.*  Strain-wave gears and motors with poles disturb a joint by a torque that repeats
+N times in each turn of it.
+
+*Friction that grows with the load.*  The teeth of a gear rub the more, the more torque it carries:
+of the torque tau_L that the learned model has along the reference, a share is lost.  The measured
+torque in place of tau_L would explain itself.  Of Coulomb friction, reversals show the sum of both
+where they happen to be.  What varies with posture and load along the motion is left to this column.
 """
 
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.arms.friction import sliding
-from blf_dsc_controller.compiled.jit import inner
+from blf_dsc_controller.compiled.jit import inner, kernel
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.numerics.elementary import cos, sin
 
+BIAS = 0
+SINE, COSINE = 1, 2
+RIPPLE_SINE, RIPPLE_COSINE = 3, 4
+VISCOUS = 5
+LOAD_FRICTION = 6
+COULOMB = 7
+
+# first and last kind
+ALL = BIAS, COULOMB
+COMPENSATED = RIPPLE_SINE, LOAD_FRICTION
+FRICTION = VISCOUS, COULOMB
+
 
 class Settings(NamedTuple):
-    """The parameters `learning.*` that say which columns there are."""
+    """The blocks of columns, in the order that they have in theta."""
 
     first: int  # index of the first column in theta: p
-    bias: int  # 1: a constant column per joint
-    viscous: int  # 1: a column dq_i per joint
-    coulomb: int  # 1: a column tanh(dq_i / coulomb_velocity) per joint
-    coulomb_velocity: float  # rad/s
-    load_friction: int  # 1: the column of `load_friction` per joint
-    tones: int  # number of frequencies, each with a sine and a cosine column per joint
-    # number of ripple cycles, each with a sine and a cosine column per joint
-    ripples: int
-    # of the sine and cosine columns, rad/s
-    frequencies: Annotated[Array, 'columns.tones']
-    ripple_cycles: Annotated[Array, 'columns.ripples']  # periods per turn
+    blocks: int  # their number
+    coulomb_velocity: float  # v_c, rad/s
+    kinds: Annotated[Array, 'columns.blocks']
+    # of sines and cosines: w in rad/s, or N per turn
+    rates: Annotated[Array, 'columns.blocks']
+
+
+class Point(NamedTuple):
+    """Where and when the entries of one joint are taken."""
+
+    t: float  # s
+    q: float  # rad
+    dq: float  # rad/s
+    sign: float  # s(dq)
+    load: float  # tau_L, N m
 
 
 @inner
-def set_block(Yr: Array, at: int, i: int, value: float) -> None:
-    """Set entry (i, i) of the block that starts at column `at`; zero the others of its row."""
-    for k in range(Yr.shape[0]):
-        Yr[i, at + k] = 0.0
-    Yr[i, at + i] = value
+def entry(kind: int, rate: float, at: Point) -> float:
+    """Return the entry of a joint in its column of a block."""
+    if kind >= VISCOUS:
+        return friction_entry(kind, at)
+    if kind == BIAS:
+        return 1.0
+    angle = rate * (at.t if kind <= COSINE else at.q)
+    return sin(angle) if kind in (SINE, RIPPLE_SINE) else cos(angle)
 
 
 @inner
-def fill_columns(settings: Settings, t: float, dq: Array, Yr: Array) -> None:
-    """Fill D, the last columns of [Yr | D] (n, m), at time t [s] and velocity dq (n,) [rad/s]."""
-    n = dq.size
-    for i in range(n):
-        at = settings.first
-        if settings.bias == 1:
-            set_block(Yr, at, i, 1.0)
-            at += n
-        if settings.viscous == 1:
-            set_block(Yr, at, i, dq[i])
-            at += n
-        if settings.coulomb == 1:
-            set_block(Yr, at, i, sliding(dq[i], settings.coulomb_velocity))
-            at += n
-        at += n * settings.load_friction
-        for k in range(settings.tones):
-            set_block(Yr, at, i, sin(settings.frequencies[k] * t))
-            set_block(Yr, at + n, i, cos(settings.frequencies[k] * t))
-            at += 2 * n
+def friction_entry(kind: int, at: Point) -> float:
+    """Return `entry` of a kind of friction."""
+    if kind == VISCOUS:
+        return at.dq
+    return at.sign if kind == COULOMB else abs(at.load) * at.sign
+
+
+@inner
+def fill(
+    settings: Settings, kinds: tuple[int, int], i: int, at: Point, H: Array
+) -> None:
+    """Fill row i of the blocks of some kinds, in a regressor H (n, m)."""
+    n = H.shape[0]
+    for k in range(settings.blocks):
+        kind = int(settings.kinds[k])
+        if kinds[0] <= kind <= kinds[1]:
+            begin = settings.first + k * n
+            for j in range(begin, begin + n):
+                H[i, j] = 0.0
+            H[i, begin + i] = entry(kind, settings.rates[k], at)
+
+
+@kernel
+def fill_motion(
+    settings: Settings, t: Array, q: Array, dq: Array, load: Array, rows: Array
+) -> None:
+    """Fill D of rows [H | D] (k, n, m) at times t (k,) of a motion q, dq (k, n).
+
+    `load` (k, n) is tau_L [N m].
+    """
+    for k in range(t.size):
+        for i in range(q.shape[1]):
+            sign = sliding(dq[k, i], settings.coulomb_velocity)
+            at = Point(t[k], q[k, i], dq[k, i], sign, load[k, i])
+            fill(settings, ALL, i, at, rows[k])
+
+
+@inner
+def torque_of(
+    settings: Settings,
+    kinds: tuple[int, int],
+    i: int,
+    at: Point,
+    estimate: Array,
+    n: int,
+) -> float:
+    """Return the torque of joint i by its columns of some kinds, with theta (m,) [N m]."""
+    torque = 0.0
+    for k in range(settings.blocks):
+        kind = int(settings.kinds[k])
+        if kinds[0] <= kind <= kinds[1]:
+            learned = estimate[settings.first + k * n + i]
+            torque += learned * entry(kind, settings.rates[k], at)
+    return torque
+
+
+def first_column(settings: Settings, kind: int, n: int) -> int:
+    """Return the index in theta of the first column of a kind; m if there is none."""
+    kinds = settings.kinds.tolist()
+    blocks = kinds.index(kind) if kind in kinds else len(kinds)
+    return settings.first + n * blocks

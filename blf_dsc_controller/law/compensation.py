@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import apparent_inertia, feedback, friction
+from blf_dsc_controller.law import apparent_inertia, columns, feedback, friction
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -70,20 +70,28 @@ def compute_regressors_at_state(
 
 
 @inner
-def fill_friction(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Write the known friction at dqr to `signals.friction`, and its columns to H."""
-    friction.fill_compensation(
-        settings.friction,
-        state.friction,
-        signals.friction,
-        state.estimate,
-        signals.dqr,
-        signals.ddqr,
-        signals.H,
-        dt,
-    )
+def fill_learned(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Write the known friction to `signals.friction`, and what is linear in theta to H.
+
+    Both are taken where the reference is when the torque acts, 1.5 samples and half of
+    `robot.lag` late.  The measured velocity would feed its noise, and chatter at rest,
+    into the torque.  The p first columns of H are those along the reference.
+    """
+    lead = 1.5 * dt + 0.5 * settings.row.lag
+    H, work = signals.H, signals.friction
+    for i in range(settings.n):
+        dqr, ddqr = signals.dqr[i], signals.ddqr[i]
+        velocity = dqr + lead * ddqr
+        friction.compensate(
+            settings.friction, state.friction, work, state.estimate, velocity, i
+        )
+        load = 0.0
+        for j in range(settings.p):
+            load += H[i, j] * state.estimate[j]
+        signals.gear_torque[i] = load
+        position = signals.qr[i] + lead * (dqr + 0.5 * lead * ddqr)
+        at = columns.Point(0.0, position, velocity, work.sign[i], load)
+        columns.fill(settings.columns, columns.COMPENSATED, i, at, H)
 
 
 @inner
@@ -93,7 +101,7 @@ def fill_known_torque(
     """Write H(q, dq, v, a) P^(0) and the known friction at dqr to `signals.model_torque` [N m]."""
     H = signals.H
     settings.model.regressor(signals.q, signals.dq, v, a, H)
-    fill_friction(settings, state, signals, dt)
+    fill_learned(settings, state, signals, dt)
     for i in range(settings.n):
         signals.model_torque[i] = signals.friction.torque[i]
         for j in range(settings.m):

@@ -45,16 +45,11 @@ _MOVING = 0.9  # of |s|: below it a joint reverses
 
 
 class Settings(NamedTuple):
-    """Columns of friction in theta, and what is known of Coulomb friction."""
+    """The columns of Coulomb friction in theta, and what is known of it."""
 
-    viscous: int  # 1: theta has a column of viscous friction per joint
     coulomb: int  # 1: theta has a column of Coulomb friction per joint
-    first_viscous: int  # index of the first such column
-    first_coulomb: int
-    # 1: there are columns of Coulomb friction, and rows that show its steps
-    learns: int
+    first_coulomb: int  # index of the first such column
     coulomb_velocity: float  # v_c, rad/s
-    lag: float  # of measured velocities and applied torques together, s
     pole: float  # p of the row filters, rad/s
     reversals: reversals.Settings
     gain: Annotated[Array, 'n']  # Gamma kappa of its columns, 1/s
@@ -100,7 +95,7 @@ def begin(settings: Settings, state: State) -> None:
 def is_coulomb(settings: Settings, j: int) -> bool:
     """Whether entry j of theta is Coulomb friction that reversals show, not the window."""
     at = j - settings.first_coulomb
-    return bool(settings.learns == 1 and 0 <= at < settings.reversals.initial.size)
+    return bool(settings.coulomb == 1 and 0 <= at < settings.reversals.initial.size)
 
 
 @inner
@@ -110,7 +105,7 @@ def coulomb_torque(
     """Return the compensation C(v) s(v) of joint i [N m], with c^ `learned` [N m]."""
     low = learned
     high = learned
-    if settings.learns == 1:
+    if settings.coulomb == 1:
         band = settings.reversals.unmodelled[i]
         shown = state.reversals.shown.coulomb
         for evidence in (
@@ -128,33 +123,20 @@ def coulomb_torque(
 
 
 @inner
-def fill_compensation(
+def compensate(
     settings: Settings,
     state: State,
     work: Work,
     estimate: Array,
-    dqr: Array,
-    ddqr: Array,
-    H: Array,
-    dt: float,
+    velocity: float,
+    i: int,
 ) -> None:
-    """Compute the friction at the velocity that the reference has when the torque acts.
-
-    Torques act 1.5 samples and half of `robot.lag` late.  The measured velocity would
-    feed its noise, and chatter at rest, into the torque.  Viscous friction is linear in
-    theta, the `estimate` (m,), and goes to its columns in H (n, m); that of Coulomb's
-    goes to `work.torque`.
-    """
-    lead = 1.5 * dt + 0.5 * settings.lag
-    for i in range(dqr.size):
-        velocity = dqr[i] + lead * ddqr[i]
-        if settings.viscous == 1:
-            H[i, settings.first_viscous + i] = velocity
-        if settings.coulomb == 1:
-            work.sign[i] = sliding(velocity, settings.coulomb_velocity)
-            work.stribeck[i] = fading(velocity, STRIBECK_SPEED)
-            learned = estimate[settings.first_coulomb + i]
-            work.torque[i] = coulomb_torque(settings, state, work, learned, i)
+    """Compute C(v) s(v) of joint i, at the `velocity` v [rad/s]; `estimate` (m,) is theta^."""
+    if settings.coulomb == 1:
+        work.sign[i] = sliding(velocity, settings.coulomb_velocity)
+        work.stribeck[i] = fading(velocity, STRIBECK_SPEED)
+        learned = estimate[settings.first_coulomb + i]
+        work.torque[i] = coulomb_torque(settings, state, work, learned, i)
 
 
 @inner
@@ -184,7 +166,7 @@ def follow_observer(state: State, work: Work, i: int, step: float) -> None:
 @inner
 def follow_motion(settings: Settings, state: State, work: Work) -> None:
     """Find the joints that begin to reverse, and those that have reversed: delta is zero again."""
-    if settings.learns == 0:
+    if settings.coulomb == 0:
         return
     drift = state.observer_drift
     extremes = state.drift_extremes
@@ -204,7 +186,7 @@ def follow_motion(settings: Settings, state: State, work: Work) -> None:
 @inner
 def filter_shapes(settings: Settings, state: State, dq: Array, dt: float) -> None:
     """Pass s and b of the last interval, at the velocity dq (n,), through the poles of the row."""
-    if settings.learns == 0:
+    if settings.coulomb == 0:
         return
     gain = filter_gain(1.0 / settings.pole, dt)
     lags = state.shape_lags
@@ -291,7 +273,7 @@ def return_estimate(
     settings: Settings, state: State, active: Array, estimate: Array
 ) -> None:
     """Set c^, in theta^ (m,), and k^ to what reversals show, if it is learned and `active` (m,)."""
-    if settings.learns == 0:
+    if settings.coulomb == 0:
         return
     of = settings.reversals
     for i in range(of.initial.size):
@@ -316,7 +298,7 @@ def follow_reversals(
 
     Entries of theta^ that are not `active` stay.
     """
-    if settings.learns == 0:
+    if settings.coulomb == 0:
         return
     of = settings.reversals
     for i in range(of.initial.size):
@@ -334,7 +316,7 @@ def follow_reversals(
 @inner
 def adapt_breakaway(settings: Settings, state: State, work: Work, dt: float) -> None:
     """Advance k^ by `dt` [s]: k^' = Gamma kappa (k - k^)."""
-    if settings.learns == 0:
+    if settings.coulomb == 0:
         return
     for i in range(settings.gain.size):
         rate = settings.gain[i] * work.breakaway_error[i]

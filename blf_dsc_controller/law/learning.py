@@ -3,8 +3,7 @@
 
 `observe`, before the torque is known:
 
-columns, ripple   the columns of what is learned besides P
-load_friction     those of friction that grows with the load
+columns           the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
 joint_sensors     what joint torque sensors show, where there are any
 window            sums of the rows over tau_d
@@ -20,6 +19,7 @@ disturbance       the step of d^3, which gives up what is learned
 
 from __future__ import annotations
 
+from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import (
@@ -31,15 +31,13 @@ from blf_dsc_controller.law import (
     external_torque,
     friction,
     joint_sensors,
-    load_friction,
     load_observer,
     motor_friction,
     prediction,
     reversals,
-    ripple,
     window,
 )
-from blf_dsc_controller.law.compensation import compute_regressors, fill_friction
+from blf_dsc_controller.law.compensation import compute_regressors, fill_learned
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.law.window import Window
@@ -51,9 +49,9 @@ def observe(
 ) -> None:
     """Compute the regressors; add the row of the last interval; check the excitation when due."""
     compute_regressors(settings, state, signals)
-    fill_friction(settings, state, signals, dt)
+    fill_learned(settings, state, signals, dt)
     friction.follow_motion(settings.friction, state.friction, signals.friction)
-    fill_columns(settings, state, signals, t, dt)
+    fill_columns(settings, signals, t)
     form_row(settings, state, signals, dt)
     friction.filter_shapes(settings.friction, state.friction, signals.dq, dt)
     if state.samples[0] == 0.0:
@@ -102,22 +100,18 @@ def check_excitation(
 
 
 @inner
-def fill_columns(
-    settings: Settings, state: State, signals: Signals, t: float, dt: float
-) -> None:
-    """Fill the disturbance columns of H, along the reference, and of [Yr | D], for the row."""
+def fill_columns(settings: Settings, signals: Signals, t: float) -> None:
+    """Fill the columns D of [Yr | D] for the row, at the measured motion.
+
+    The row's torque has passed the velocity filter, half of the lag, but positions have not.
+    """
     of = settings.columns
-    lag = settings.row.lag
-    q, dq = signals.q, signals.dq
-    qr, dqr, ddqr = signals.qr, signals.dqr, signals.ddqr
-    ripple.fill_compensated_ripple(of, lag, qr, dqr, ddqr, dt, signals.H)
-    columns.fill_columns(of, t, dq, signals.row.Yr)
-    ripple.fill_measured_ripple(of, lag, q, dq, signals.row.Yr)
-    if of.load_friction == 1:
-        tau = signals.gear_torque
-        load_friction.fill_gear_torque(settings.p, signals.H, state.estimate, tau)
-        load_friction.fill_compensated(of, tau, signals.friction.sign, signals.H)
-        load_friction.fill_measured(of, tau, dq, signals.row.Yr)
+    for i in range(settings.n):
+        q, dq = signals.q[i], signals.dq[i]
+        position = q - 0.5 * settings.row.lag * dq
+        sign = sliding(dq, of.coulomb_velocity)
+        at = columns.Point(t, position, dq, sign, signals.gear_torque[i])
+        columns.fill(of, columns.ALL, i, at, signals.row.Yr)
 
 
 @inner
@@ -161,7 +155,7 @@ def measure_reversals(
     when these are those of the window, and once a full window is known to be of one arm or
     this one is half full; with fewer rows they are too uncertain.
     """
-    if settings.friction.learns == 0:
+    if settings.friction.coulomb == 0:
         return
     latch, rows = state.latch, state.window.rows[0]
     length = settings.window.length

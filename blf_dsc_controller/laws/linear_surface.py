@@ -12,7 +12,7 @@ from blf_dsc_controller.compiled.views import part
 from blf_dsc_controller.law import adaptation
 from blf_dsc_controller.law.compensation import (
     compute_regressors_at_state,
-    fill_friction,
+    fill_learned,
     follow_rotors,
 )
 from blf_dsc_controller.law.state import Settings, Signals, State
@@ -38,7 +38,7 @@ def follow(
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
         signals.feedback.restoring[i] = -weight * signals.xi1[i]
     compute_regressors_at_state(settings, state, signals)
-    fill_friction(settings, state, signals, dt)
+    fill_learned(settings, state, signals, dt)
     follow_rotors(settings, state, signals, dt)
 
 

@@ -15,7 +15,7 @@ from blf_dsc_controller.law.blf_dsc import advance_surface, compute_surface
 from blf_dsc_controller.law.compensation import (
     compensated,
     compute_regressors_at_state,
-    fill_friction,
+    fill_learned,
     follow_rotors,
 )
 from blf_dsc_controller.law.state import Settings, Signals, State
@@ -43,7 +43,7 @@ class ModelBased(NamedTuple):
         """Compute the torque (16)."""
         compute_surface(settings, state, signals, dt)
         compute_regressors_at_state(settings, state, signals)
-        fill_friction(settings, state, signals, dt)
+        fill_learned(settings, state, signals, dt)
         follow_rotors(settings, state, signals, dt)
         known = self.constant + self.amplitude * sin(self.frequency * t + self.phase)
         for i in range(settings.n):

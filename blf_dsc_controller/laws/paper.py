@@ -26,7 +26,7 @@ from blf_dsc_controller.law.blf_dsc import (
 from blf_dsc_controller.law.compensation import (
     compensated,
     compute_regressors_at_state,
-    fill_friction,
+    fill_learned,
     follow_rotors,
 )
 from blf_dsc_controller.law.state import Settings, Signals, State
@@ -126,7 +126,7 @@ class Paper(NamedTuple):
         """Compute the torque (28)."""
         compute_surface(settings, state, signals, dt)
         compute_regressors_at_state(settings, state, signals)
-        fill_friction(settings, state, signals, dt)
+        fill_learned(settings, state, signals, dt)
         observe(settings, state, signals, self.omega, t, dt)
         follow_rotors(settings, state, signals, dt)
         begins = state.samples[0] == 0.0

@@ -16,6 +16,7 @@ from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, view_of
 from blf_dsc_controller.configuration.schema import positive
+from blf_dsc_controller.law import columns
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -31,14 +32,10 @@ memory_of = view_of(Memory)
 @inner
 def known_friction(settings: Settings, i: int, velocity: float) -> float:
     """Return the friction of joint i [N m] that the initial estimate has at a velocity."""
-    friction = 0.0
-    if settings.columns.viscous == 1:
-        viscous = settings.initial_estimate[settings.friction.first_viscous + i]
-        friction += viscous * velocity
-    if settings.columns.coulomb == 1:
-        coulomb = settings.friction.reversals.initial[i]
-        friction += coulomb * sliding(velocity, settings.columns.coulomb_velocity)
-    return friction
+    of, known = settings.columns, settings.initial_estimate
+    sign = sliding(velocity, of.coulomb_velocity)
+    at = columns.Point(0.0, 0.0, velocity, sign, 0.0)
+    return columns.torque_of(of, columns.FRICTION, i, at, known, settings.n)
 
 
 class ComputedTorque(NamedTuple):

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.friction import sliding
 from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.law import columns
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
 
@@ -37,18 +38,11 @@ def friction_torque(
     It is that at dq (n,) [rad/s], of gears that carry tau (n,) [N m].
     """
     of, n = settings.columns, settings.n
-    signs = np.array([sliding(v, of.coulomb_velocity) for v in dq])
-    shapes = (
-        (of.viscous, dq),
-        (of.coulomb, signs),
-        (of.load_friction, np.abs(tau) * signs),
-    )
-    at = settings.p + n * of.bias
     torque = np.zeros(n)
-    for has_columns, shape in shapes:
-        if has_columns:
-            torque += estimate[at : at + n] * shape
-            at += n
+    for i in range(n):
+        sign = sliding(dq[i], of.coulomb_velocity)
+        at = columns.Point(0.0, 0.0, dq[i], sign, tau[i])
+        torque[i] = columns.torque_of(of, columns.FRICTION, i, at, estimate, n)
     return torque
 
 
