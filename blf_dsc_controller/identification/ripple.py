@@ -5,7 +5,7 @@ A ripple with N periods per turn leaves a torque of the joint's own position,
 
     a sin(N q) + b cos(N q)                                                        [N m]
 
-which `law/ripple.py` compensates.  N is searched on a grid by least squares (the periodogram of
+which `law/columns.py` compensates.  N is searched on a grid by least squares (the periodogram of
 Lomb, Least-squares frequency analysis of unequally spaced data, 1976, over position instead of
 time).  Both sides pass windows of 0.05 s: at a speed v, these leave a share G(N v) of it.
 
