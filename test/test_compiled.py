@@ -120,6 +120,38 @@ def test_kernels_of_another_checkout_or_of_the_package_are_found_and_never_of_ot
     assert sorted(shipped.rglob('*')) == before
 
 
+WAIT = """
+import fcntl
+import numpy as np
+from blf_dsc_controller.arms import model
+from blf_dsc_controller.arms.two_link import TwoLink
+from blf_dsc_controller.compiled import announcement, kernel_cache
+
+(kernel,) = [k for k in kernel_cache.KERNELS if k.__name__ == '_fill_regressors']
+folder = kernel_cache.cache_folder(kernel)
+folder.mkdir(mode=0o700, parents=True)
+held = (folder / '_fill_regressors.lock').open('ab')
+fcntl.flock(held, fcntl.LOCK_EX)
+
+def say(text):
+    print(text)
+    held.close()
+
+with announcement.announced_compilation(say):
+    model.regressors_at(TwoLink(10.0), *np.full((4, 1, 2), 0.5))
+"""
+
+
+@compiling
+def test_who_waits_for_kernels_of_another_process_says_so(tmp_path):
+    environment = os.environ | {'NUMBA_CACHE_DIR': str(tmp_path)}
+    run = finished(sys.executable, '-c', WAIT, env=environment)
+    assert run.stdout.splitlines() == [
+        'compiling kernel fill regressors in another process: waiting for it',
+        'compiling kernel fill regressors, once for this version and kind of arm',
+    ], run.stderr
+
+
 SAMPLE = """
 from blf_dsc_controller.reference.terms import minimum_jerk, pack, sampled
 

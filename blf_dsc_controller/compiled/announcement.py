@@ -10,6 +10,7 @@ from typing import Any
 
 from numba.core import event
 
+from blf_dsc_controller.compiled.file_lock import WAITS
 from blf_dsc_controller.compiled.jit import SLOW
 from blf_dsc_controller.compiled.kernel_cache import KERNELS
 
@@ -24,12 +25,15 @@ _contexts: list[object] = []  # in which compilation is announced
 def announced_compilation(say: Callable[[str], object]) -> Iterator[None]:
     """Call `say` with a notice for each kernel not in the cache that is compiled in this context.
 
-    Only numba knows this: a kernel has a version for each type of arguments. Of those
-    that are loaded, some may not be called.
+    Only numba knows this: a kernel has a version for each type of arguments.  Those that
+    another process compiles are announced, too, since this one waits.
     """
     _contexts.append(say)
     try:
-        with event.install_listener('numba:compile', _Listener(say)):
+        with (
+            event.install_listener('numba:compile', _Compiles(say)),
+            event.install_listener(WAITS, _Waits(say)),
+        ):
             yield
     finally:
         _contexts.remove(say)
@@ -48,20 +52,33 @@ def logged_compilation() -> Iterator[None]:
 class _Listener(event.Listener):  # type: ignore[misc]
     def __init__(self, say: Callable[[str], object]) -> None:
         self._say = say
-        self._count = 0
+
+    def on_end(self, _event: object) -> None:
+        pass
+
+
+class _Compiles(_Listener):
+    def __init__(self, say: Callable[[str], object]) -> None:
+        super().__init__(say)
+        self._warning = SLOW
 
     def on_start(self, started: Any) -> None:
         kernel = started.data['dispatcher']
         if not any(kernel is other for other in KERNELS):
             return
-        if SLOW and self._count == 0:
-            self._say(SLOW)
-        self._count += 1
-        total = max(self._count, len(KERNELS))
-        self._say(
-            f'{COMPILING}{self._count} of at most {total}, once for this version and kind of arm: '
-            f'{kernel.py_func.__name__.strip("_").replace("_", " ")}'
-        )
+        if self._warning:
+            self._say(self._warning)
+            self._warning = ''
+        name = _words(kernel.py_func.__name__)
+        self._say(f'{COMPILING}{name}, once for this version and kind of arm')
 
-    def on_end(self, _event: object) -> None:
-        pass
+
+class _Waits(_Listener):
+    def on_start(self, started: Any) -> None:
+        name = _words(started.data)
+        self._say(f'{COMPILING}{name} in another process: waiting for it')
+
+
+def _words(name: str) -> str:
+    """Return the name of a kernel in words."""
+    return name.strip('_').replace('_', ' ')

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
@@ -17,6 +18,9 @@ except ImportError:  # such as on Windows
     LOCKS = False
 else:
     LOCKS = True
+
+WAITS = 'blf_dsc_controller:wait'
+"""Event of numba when a process begins to wait for a kernel; its data is the kernel's name."""
 
 _PATIENCE = 600.0  # s: a process may have been stopped while it holds the lock
 _POLL = 0.05  # s
@@ -32,18 +36,25 @@ class FileLock:
         self._path = path
         self._file: IO[bytes] | None = None
 
-    def acquire(self) -> None:
-        """Wait until no other process holds the lock, at most ten minutes, and hold it."""
+    def acquire(self, announce: Callable[[], object]) -> None:
+        """Wait until no other process holds the lock, at most ten minutes, and hold it.
+
+        `announce` is called once if another one holds it.
+        """
         if self._file is not None or not LOCKS:
             return
         with suppress(OSError):  # read-only or full
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._path.open('ab')
         end = time.monotonic() + _PATIENCE
+        waits = False
         while self._file is not None and time.monotonic() < end:
             try:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
+                if not waits:
+                    announce()
+                waits = True
                 time.sleep(_POLL)
             else:
                 return

@@ -35,7 +35,7 @@ from typing import Any
 import numba
 from llvmlite import ir
 from llvmlite.binding import parse_assembly, parse_bitcode
-from numba.core import cgutils
+from numba.core import cgutils, event
 from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
@@ -47,7 +47,7 @@ from numba.core.runtime import rtsys
 from numba.core.typed_passes import NativeLowering
 
 from blf_dsc_controller.compiled.dependencies import CHECKED
-from blf_dsc_controller.compiled.file_lock import FileLock
+from blf_dsc_controller.compiled.file_lock import WAITS, FileLock
 from blf_dsc_controller.compiled.own_folder import is_own, make_own
 
 FIRST = (0, 58)
@@ -247,7 +247,8 @@ class KernelCache(_Stored):
         super().__init__(function, path)
         self._folder = path
         self._shipped = _Stored(function, shipped)
-        self._lock = FileLock(path / f'{function.__name__}.lock')
+        self._name = function.__name__
+        self._lock = FileLock(path / f'{self._name}.lock')
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the compiled kernel, or None: then the caller compiles and saves it."""
@@ -255,7 +256,7 @@ class KernelCache(_Stored):
         found = found or self._load_own(signature, context)
         if found is not None or not make_own(self._folder):
             return found
-        self._lock.acquire()
+        self._lock.acquire(partial(event.start_event, WAITS, self._name))
         found = self._load_own(signature, context)
         if found is not None:
             self._lock.release()
