@@ -245,6 +245,7 @@ def shown_by(controller, plant):
     return ripples_in([simulated.slow_run(motion, plant)])
 
 
+@pytest.mark.nightly
 def test_ripple_of_a_ur5e_is_found_in_all_joints_and_none_where_there_is_none():
     """Of 30 periods, and 0.8 % of 150 and 28 N m."""
     found = ur5e(has_ripple=True)

@@ -119,6 +119,7 @@ def largest(text, unit):
     return float(found)
 
 
+@pytest.mark.nightly
 def test_stiff_gantry_gets_stiff_gains_in_newtons(tmp_path, capsys):
     values, text = commission('gantry', tmp_path, capsys)
     # a critically damped mass of 80, 50 or 25 kg at 1 Hz has as much

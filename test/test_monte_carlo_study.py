@@ -179,7 +179,16 @@ FIRST = {
 }
 
 
-@pytest.mark.parametrize('name', FIRST)
+@pytest.mark.parametrize(
+    'name',
+    [
+        'monte_carlo_panda',
+        *(
+            pytest.param(name, marks=pytest.mark.nightly)
+            for name in ('monte_carlo_events', 'monte_carlo_ur5e')
+        ),
+    ],
+)
 def test_learning_breaks_no_bound_that_is_kept_without_it(name):
     """Nor are errors larger than without learning; and the model is found."""
     study = load_study(path_of(name))

@@ -172,6 +172,7 @@ def error_at_phase(preset, phase):
     return run(configured(preset, 60.0, arm=arm)).parameter_error[-1]
 
 
+@pytest.mark.nightly
 def test_parameter_error_depends_on_the_phase_of_the_disturbance_as_documented():
     """0.1 cos t N m on both joints looks like 0.1 / 0.6 kg m^2 of the second parameter."""
     assert error_at_phase('recommended', np.pi / 2) == pytest.approx(
