@@ -27,7 +27,7 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.numerics.algebra import cholesky_solve
 
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
-_ROUNDED = 1.0 + 1e-14
+_LENGTH_ROUNDED = 1.0 + 1e-14
 # of Newton's method; 12 for Gamma spanning eight decades, ten radii outside
 _MOST_STEPS = 20
 
@@ -93,7 +93,7 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
             square += entry * entry
             slope += gain[j] * entry * entry / shrink
         length = sqrt(square)
-        if not (length > _ROUNDED * radius and slope > 0.0):
+        if not (length > _LENGTH_ROUNDED * radius and slope > 0.0):
             break
         nu += (length / radius - 1.0) * length * length / slope
     rounding = min(1.0, radius / length)

@@ -36,13 +36,13 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law.lag import filter_gain
 
-_SMOOTH = 0.5  # upper end of the band, times the sample rate
-_SLOW = 0.06  # lower end, likewise
-_MEMORY = 0.02  # s, of the two powers that are compared
-_CLEAR = 0.1  # their ratio: noise has 0.005, an oscillation 100
+_BAND_END = 0.5  # upper end of the band, times the sample rate
+_BAND_BEGIN = 0.06  # lower end, likewise
+_POWER_TIME = 0.02  # s, of the two powers that are compared
+_POWER_RATIO = 0.1  # their ratio: noise has 0.005, an oscillation 100
 # s (rad/s^2)^2, times the inertia: least sum of z a that shows anything
 _EVIDENCE = 0.05
-_RELEASE = 0.02  # s, in which the arm settles on its first torque
+_RELEASE_TIME = 0.02  # s, in which the arm settles on its first torque
 # times the guess: most that half an oscillation may ask a drive to be lighter
 _POSSIBLE = 2.0
 
@@ -112,9 +112,9 @@ def pass_band(
     """
     lags = state.lags
     late = filter_gain(0.5 * settings.lag, dt) if settings.lag > 0.0 else 1.0
-    smooth = filter_gain(dt / _SMOOTH, dt)
-    slow = filter_gain(dt / _SLOW, dt)
-    brief = filter_gain(_MEMORY, dt)
+    smooth = filter_gain(dt / _BAND_END, dt)
+    slow = filter_gain(dt / _BAND_BEGIN, dt)
+    brief = filter_gain(_POWER_TIME, dt)
     for i in range(dq.size):
         torque = low_pass(lags, _DRIVE, i, late, lags[_HELD, i])
         lags[_HELD, i] = applied[i]
@@ -138,7 +138,7 @@ def pass_band(
 @inner
 def has_settled(samples: float, dt: float) -> bool:
     """Whether the arm has settled on its first torque, after so many samples of `dt` [s]."""
-    return bool(samples * dt >= _RELEASE)
+    return bool(samples * dt >= _RELEASE_TIME)
 
 
 @inner
@@ -149,7 +149,7 @@ def update(
     for i in range(settings.rotor.size):
         if settings.rotor[i] == 0.0:
             continue
-        if state.lags[_POWER, i] <= _CLEAR * state.lags[_NOISE, i]:
+        if state.lags[_POWER, i] <= _POWER_RATIO * state.lags[_NOISE, i]:
             continue
         r = work.torque[i]
         for j in range(Yp.shape[1]):

@@ -28,10 +28,10 @@ from blf_dsc_controller.law.window import Window
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 # ratio of mean squares; larger than the gate's, since a solution extrapolates
-_ALARM = 8.0
+_ALARM_RATIO = 8.0
 # s from one change to the next. A load that comes on may be found twice so soon; the third time,
 # there is no arm that the rows are of
-_SOON, _TWICE = 0.3, 2.0
+_SOON_TIME, _HASTY_TIME = 0.3, 2.0
 
 
 class State(NamedTuple):
@@ -100,7 +100,7 @@ def compare_with_solution(
         return False
     compare_row(state, row, latch.solution, dt, work.innovation)
     least = latch.least_residual[0]
-    allowed = _ALARM * excitation.explained(settings, least, latch.residual[0])
+    allowed = _ALARM_RATIO * excitation.explained(settings, least, latch.residual[0])
     return bool(state.recent_residual[0] > allowed)
 
 
@@ -174,8 +174,8 @@ def count_change(
     of = sliding.settings
     since = sliding.state.rows[0] * of.row_interval * dt
     state.changes[0] += 1.0
-    state.hasty[0] = state.hasty[0] + 1.0 if since < _SOON else 0.0
-    if state.hasty[0] >= _TWICE:
+    state.hasty[0] = state.hasty[0] + 1.0 if since < _SOON_TIME else 0.0
+    if state.hasty[0] >= _HASTY_TIME:
         innovation.raise_noise(state.innovation)
     state.contradiction[0] = state.recent_residual[0]
     state.recent_residual[0] = 0.0

@@ -6,7 +6,7 @@ the tip with phi = D z adds X_L N D z (see `weighing`).  Once r is past h, z ~ (
 from r, and only what is past h of S + X_L N D Cov(z) (X_L N D)^T is a contact: a load follows the
 arm in every posture and acceleration, another force does not.  A load cannot have negative mass: an
 arm that is known to hold no more than what z takes away presses on something.  A contact ends when
-r has stayed below half of h, or when a load has explained it for `_EXPLAINED`.
+r has stayed below half of h, or when a load has explained it for `_EXPLAINED_TIME`.
 
 `perception` calls `update` once r has settled.
 """
@@ -17,11 +17,11 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 
-_LASTING = 0.2  # s, correlation time of r in the load filter
-_FORGETTING = 1.0  # s, in which the filtered load returns to its prior
-_CALM = 0.2  # s below half of the threshold, after which a contact is over
-_EXPLAINED = 0.5  # s, likewise for a load that explains it
-_LIGHTER = 3.0  # standard deviations below zero, from which a mass is negative
+_CORRELATION_TIME = 0.2  # s, correlation time of r in the load filter
+_FORGETTING_TIME = 1.0  # s, in which the filtered load returns to its prior
+_CALM_TIME = 0.2  # s below half of the threshold, after which a contact is over
+_EXPLAINED_TIME = 0.5  # s, likewise for a load that explains it
+_NEGATIVE_SIGMAS = 3.0  # standard deviations below zero, from which a mass is negative
 
 QUIET, EXPLAINED, TOUCHED = range(3)
 """Phases: r is small; it is large, but a load explains it; something touches the arm."""
@@ -136,7 +136,7 @@ def fill_load_columns(work: Work, seen: Seen, load_columns: Array) -> None:
 def filter_load(state: State, work: Work, white: Array, dt: float) -> float:
     """Filter the load from r, which is `white` (n,); return how far r is from what any explains."""
     size = state.load.size
-    fade = min(1.0, dt / _FORGETTING)
+    fade = min(1.0, dt / _FORGETTING_TIME)
     for a in range(size):
         state.load[a] -= fade * state.load[a]
         work.load[a] = state.load[a]
@@ -150,7 +150,7 @@ def filter_load(state: State, work: Work, white: Array, dt: float) -> float:
     absorb(
         work.columns,
         white,
-        _LASTING / dt,
+        _CORRELATION_TIME / dt,
         state.load,
         state.load_covariance,
         work.gain,
@@ -161,7 +161,7 @@ def filter_load(state: State, work: Work, white: Array, dt: float) -> float:
 @inner
 def is_negative_mass(mass: float, variance: float) -> bool:
     """Whether a mass [kg] is below zero beyond doubt, with its variance [kg^2]."""
-    return bool(mass < -_LIGHTER * sqrt(variance))
+    return bool(mass < -_NEGATIVE_SIGMAS * sqrt(variance))
 
 
 @inner
@@ -215,10 +215,10 @@ def next_phase(
     [s]; a load has explained a contact for `explained` [s].
     """
     if is_small(phase, distance, threshold):
-        return TOUCHED if phase == TOUCHED and calm < _CALM else QUIET
+        return TOUCHED if phase == TOUCHED and calm < _CALM_TIME else QUIET
     if remaining > threshold:
         return TOUCHED
-    return TOUCHED if phase == TOUCHED and explained < _EXPLAINED else EXPLAINED
+    return TOUCHED if phase == TOUCHED and explained < _EXPLAINED_TIME else EXPLAINED
 
 
 @inner

@@ -16,33 +16,33 @@ from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import sensor, torque
 
 # of the torque limit: a command that differs by more should have moved something
-_CHANGED = 0.1
+_CHANGED_TORQUE = 0.1
 # of the rms step of the commands, in addition: so much of the chatter by coarse encoders
 # is left in their average
 _CHATTERED = 0.5
-_RECENT = 0.05  # s, past the chatter of encoders' steps in the velocities
-_BEFORE = 1.0  # s
-_CHATTERS = 0.5  # s
-_LASTING = 0.1  # s, for which the efforts have to differ from the commands
+_RECENT_TIME = 0.05  # s, past the chatter of encoders' steps in the velocities
+_EARLIER_TIME = 1.0  # s
+_CHATTER_TIME = 0.5  # s
+_SHORTFALL_TIME = 0.1  # s, for which the efforts have to differ from the commands
 
 
 class State(NamedTuple):
     """What it keeps from past samples."""
 
     last: Annotated[Array, 'n']  # N m, command of the last sample
-    # (N m)^2, mean square step of the commands over _CHATTERS
+    # (N m)^2, mean square step of the commands over _CHATTER_TIME
     chatter: Annotated[Array, 'n']
     at_rest: Cell  # s, since a joint has last moved
     q: Annotated[Array, 'n']  # rad, where it has
     qr: Annotated[Array, 'n']  # rad, the reference of then
-    recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT
-    before: Annotated[Array, 'n']  # N m, average of them over _BEFORE
+    recent: Annotated[Array, 'n']  # N m, average of the commands over _RECENT_TIME
+    before: Annotated[Array, 'n']  # N m, average of them over _EARLIER_TIME
     compares: Cell  # 1: measured efforts are torques, to be compared with the commands
-    # N m, average of commands less efforts over _RECENT
+    # N m, average of commands less efforts over _RECENT_TIME
     shortfall: Annotated[Array, 'n']
     # N m, of it the error of the model of what the drives add
     shortfall_in_motion: Annotated[Array, 'n']
-    usual_shortfall: Annotated[Array, 'n']  # N m, average of it over _BEFORE
+    usual_shortfall: Annotated[Array, 'n']  # N m, average of it over _EARLIER_TIME
     short_for: Cell  # s, for which the shortfall has been too large
 
 
@@ -61,7 +61,7 @@ class Sample(NamedTuple):
 @inner
 def average_steps(state: State, sample: Sample) -> None:
     """Update the mean square step of the commands, which coarse encoders make chatter."""
-    share = min(1.0, sample.dt / _CHATTERS)
+    share = min(1.0, sample.dt / _CHATTER_TIME)
     for i in range(sample.q.size):
         step = 0.0 if sample.begins else sample.command[i] - state.last[i]
         state.chatter[i] += share * (step * step - state.chatter[i])
@@ -94,7 +94,7 @@ def check_effect(
     falls_short = compare_effort(limits, state, sample, moves)
     state.at_rest[0] = 0.0 if moves else state.at_rest[0] + sample.dt
     has_changed = follow_commands(limits, state, sample, moves)
-    has_changed = has_changed and state.at_rest[0] > _RECENT
+    has_changed = has_changed and state.at_rest[0] > _RECENT_TIME
     is_missing = has_changed and is_elsewhere(readings, sample.qr, state.qr)
     is_missing = is_missing and not effort_follows(state, sample.effort)
     return falls_short or is_missing, moves and state.short_for[0] == 0.0
@@ -108,17 +108,17 @@ def follow_commands(
     has_changed = False
     for i in range(sample.q.size):
         command = sample.command[i]
-        smooth = 1.0 if sample.begins else min(1.0, sample.dt / _RECENT)
+        smooth = 1.0 if sample.begins else min(1.0, sample.dt / _RECENT_TIME)
         state.recent[i] += smooth * (command - state.recent[i])
         if moves:
             state.q[i] = sample.q[i]
             state.qr[i] = sample.qr[i]
             state.before[i] = state.recent[i]
         else:
-            slow = min(1.0, sample.dt / _BEFORE)
+            slow = min(1.0, sample.dt / _EARLIER_TIME)
             state.before[i] += slow * (command - state.before[i])
         change = abs(state.recent[i] - state.before[i])
-        least = _CHANGED * limits.limit[i]
+        least = _CHANGED_TORQUE * limits.limit[i]
         least += _CHATTERED * sqrt(state.chatter[i])
         has_changed = has_changed or change > least
     return has_changed
@@ -156,12 +156,12 @@ def compare_effort(
             state.usual_shortfall[i] = state.shortfall[i]
         elif isfinite(shortfall):
             change = shortfall - state.shortfall[i]
-            state.shortfall[i] += min(1.0, sample.dt / _RECENT) * change
+            state.shortfall[i] += min(1.0, sample.dt / _RECENT_TIME) * change
             change = shortfall - state.usual_shortfall[i]
-            state.usual_shortfall[i] += min(1.0, sample.dt / _BEFORE) * change
+            state.usual_shortfall[i] += min(1.0, sample.dt / _EARLIER_TIME) * change
         if moves:
             state.shortfall_in_motion[i] = state.shortfall[i] if is_relative else 0.0
         excess = abs(state.shortfall[i] - state.shortfall_in_motion[i])
-        is_short = is_short or excess > _CHANGED * limits.limit[i]
+        is_short = is_short or excess > _CHANGED_TORQUE * limits.limit[i]
     state.short_for[0] = state.short_for[0] + sample.dt if is_short else 0.0
-    return bool(state.short_for[0] > _LASTING)
+    return bool(state.short_for[0] > _SHORTFALL_TIME)

@@ -39,15 +39,15 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 _WARM = 4  # inverse iterations from the previous direction
 _COLD = 60  # from an arbitrary direction
 _COMPARABLE = 0.95  # fraction of the best lambda_min
-_FORGETTING = 0.1  # fraction of the best lambda_min lost per window
-_GATE = 4.0  # ratio of mean squares: twice the torque
+_LAMBDA_LOST = 0.1  # fraction of the best lambda_min lost per window
+_GATE_RATIO = 4.0  # ratio of mean squares: twice the torque
 # times the smallest residual: the floor, where that is below the configured one
-_QUIET = 4.0
+_QUIET_RATIO = 4.0
 _LEAST_FLOOR = 0.01  # of the configured floor: a tenth of the torque
 # of the residual since the last split; that of a lasting disturbance does not fall
-_FALLEN = 0.5
-_USUAL = 1.25  # times the smallest residual, which varies with the motion
-_DOUBT = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
+_FALLEN_RATIO = 0.5
+_USUAL_RATIO = 1.25  # times the smallest residual, which varies with the motion
+_DOUBT_PULL = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
 _LEAST_INERTIA = 0.1  # fraction of the initial estimate's
 
 
@@ -103,7 +103,7 @@ def explained(settings: Settings, least_residual: float, residual: float) -> flo
     """
     floor = settings.residual_floor
     if least_residual > 0.0:
-        shown = max(_QUIET * least_residual, _LEAST_FLOOR * floor)
+        shown = max(_QUIET_RATIO * least_residual, _LEAST_FLOOR * floor)
         floor = min(floor, shown)
     return max(residual, floor)
 
@@ -147,8 +147,8 @@ def is_in_question(
     if not is_full or state.least_residual[0] > 0.0 or sliding.settings.length == 1:
         return False
     split = state.split_residual[0]
-    is_new = split == 0.0 or residual < _FALLEN * split
-    return bool(is_new and residual > _GATE * settings.residual_floor)
+    is_new = split == 0.0 or residual < _FALLEN_RATIO * split
+    return bool(is_new and residual > _GATE_RATIO * settings.residual_floor)
 
 
 @inner
@@ -200,7 +200,7 @@ def split_window(
     newer = sliding.work.newer
     rows = window.newer_part(sliding.state, newer)
     best = best_part_residual(sliding, prior, state.active, rows)
-    if residual <= _GATE * explained(settings, state.least_residual[0], best):
+    if residual <= _GATE_RATIO * explained(settings, state.least_residual[0], best):
         return False
     state.split_residual[0] = residual
     window.keep_newer(sliding.state, newer, rows)
@@ -237,10 +237,10 @@ def accept_window(
     least = state.least_residual[0]
     if missing <= 0.0 and (least == 0.0 or residual < least):
         least = state.least_residual[0] = residual
-    if residual > _GATE * explained(settings, least, least):
+    if residual > _GATE_RATIO * explained(settings, least, least):
         return False
     pull = settings.anchor_weight * missing
-    pull += _DOUBT * max(0.0, residual - _USUAL * least)
+    pull += _DOUBT_PULL * max(0.0, residual - _USUAL_RATIO * least)
     if pull > 0.0:
         window.pull_to(state.anchor, pull, prior.information, now.Phi, now.b)
         window.solve(sliding.settings, now, prior.information, state.active)
@@ -382,7 +382,7 @@ def update_excitation(
     value = window.find_excitation(sliding, prior, state.active, _WARM)
     state.lambda_min[0] = value
     of = sliding.settings
-    state.best_lambda[0] *= 1.0 - _FORGETTING * of.interval / (
+    state.best_lambda[0] *= 1.0 - _LAMBDA_LOST * of.interval / (
         of.length * of.row_interval
     )
     suffices = value >= settings.excitation_threshold

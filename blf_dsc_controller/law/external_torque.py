@@ -41,19 +41,27 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
-_FIRST = 0.5  # s since the first window, in which theta^ settles and s^2 is measured
+_FIRST_TIME = (
+    0.5  # s since the first window, in which theta^ settles and s^2 is measured
+)
 _REVERSING = 1.5  # `learning.coulomb_velocity`, below which a joint is about to reverse
 _RESTING = 0.005  # `learning.coulomb_velocity`, below which it rests
 # 1/L, for which it still counts as reversing, and does not count as resting
 _AFTER = 3.0
 _SETTLED = 6.0  # 1/L, of rest before a tare
 _LEAST_NOISE = 0.01  # of the mean square of the unmodelled torque
-_ASSUMED = (0.01, 0.1, 0.1)  # of a window, for which the unmodelled torque counts
-_REMEMBERED = (1.0, 4.0, 4.0)  # windows, over which the mean square is taken
+_ASSUMED_WINDOWS = (
+    0.01,
+    0.1,
+    0.1,
+)  # of a window, for which the unmodelled torque counts
+_NOISE_WINDOWS = (1.0, 4.0, 4.0)  # windows, over which the mean square is taken
 _LEAST_FRICTION = (0.0, 0.15, 0.05)  # of Coulomb friction, which is never known better
 _MOST_NOISE = 4.0  # times the mean square: r^2 is clipped at this multiple
 
-_STEADY, _SLOW, _REST = range(3)  # rows of `State.noise` and `State.samples`
+_NOISE_STEADY, _NOISE_SLOW, _NOISE_REST = range(
+    3
+)  # rows of `State.noise` and `State.samples`
 
 
 class Settings(NamedTuple):
@@ -197,8 +205,8 @@ def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) ->
 def regime(settings: Settings, state: State, i: int) -> int:
     """Return the row of the noise of joint i, which depends on how the arm moves."""
     if state.resting[0] * settings.bandwidth > _AFTER:
-        return _REST
-    return _SLOW if state.reversing[i] > 0.0 else _STEADY
+        return _NOISE_REST
+    return _NOISE_SLOW if state.reversing[i] > 0.0 else _NOISE_STEADY
 
 
 @inner
@@ -226,7 +234,7 @@ def tare(state: State, changes: float) -> None:
     for i in range(state.torque.size):
         for j in range(state.tare.shape[1]):
             state.tare[i, j] = state.filtered[i, j]
-        state.tare_noise[i] = state.noise[_REST, i]
+        state.tare_noise[i] = state.noise[_NOISE_REST, i]
         state.offset[i] += state.torque[i]
         state.torque[i] = 0.0
 
@@ -326,7 +334,7 @@ def is_settled(state: State, dt: float) -> bool:
     seen = 0.0
     for k in range(3):
         seen += state.samples[k, 0]
-    return bool(seen * dt >= _FIRST)
+    return bool(seen * dt >= _FIRST_TIME)
 
 
 @inner
@@ -345,10 +353,10 @@ def update_noise(
         k = regime(settings, state, i)
         noise = state.noise[k]
         state.samples[k, i] += 1.0
-        if k == _REST and state.tared[0] == 1.0:
+        if k == _NOISE_REST and state.tared[0] == 1.0:
             continue
-        first = _ASSUMED[k] * window
-        least = 1.0 / (_REMEMBERED[k] * window)
+        first = _ASSUMED_WINDOWS[k] * window
+        least = 1.0 / (_NOISE_WINDOWS[k] * window)
         share = max(least, 1.0 / (first + state.samples[k, i]))
         left = state.torque[i] * state.torque[i] - state.covariance[i, i]
         noise[i] += share * (clip(left, 0.0, _MOST_NOISE * noise[i]) - noise[i])

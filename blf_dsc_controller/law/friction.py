@@ -41,7 +41,7 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.reversals import beyond
 
-_MOVING = 0.9  # of |s|: below it a joint reverses
+_MOVING_SIGN = 0.9  # of |s|: below it a joint reverses
 
 
 class Settings(NamedTuple):
@@ -172,7 +172,7 @@ def follow_motion(settings: Settings, state: State, work: Work) -> None:
     extremes = state.drift_extremes
     for i in range(drift.size):
         sign = work.sign[i]
-        moves = abs(sign) > _MOVING
+        moves = abs(sign) > _MOVING_SIGN
         if moves and sign * state.direction[i] <= 0.0:
             state.direction[i] = 1.0 if sign > 0.0 else -1.0
             extremes[0, i] = min(extremes[0, i], drift[i])

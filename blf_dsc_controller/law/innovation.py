@@ -43,12 +43,14 @@ LASTING = 2.0  # s, in which a floor of s^2 falls to 1 / e
 MEMORY = 0.1  # s of motion, over which the last rows are averaged
 LATE = 0.15  # s, by which a change of the arm is found
 # times s^2: friction is no noise, and reaches what the noise of a sensor never would
-_ALARM = 8.0
+_ALARM_SQUARE = 8.0
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many
 # rows, and ever less until the mean square is of a window
-_ASSUMED, _ASSUMED_ROWS = 0.1, 100.0
-_MOST = 3.0  # times s^2, as which a row counts: those of a change hardly raise it
-_LEAST = 0.001  # of that square, which s^2 is at least
+_ASSUMED_SHARE, _ASSUMED_ROWS = 0.1, 100.0
+_MOST_SQUARE = (
+    3.0  # times s^2, as which a row counts: those of a change hardly raise it
+)
+_LEAST_SQUARE = 0.001  # of that square, which s^2 is at least
 
 
 class Prior(NamedTuple):
@@ -71,7 +73,7 @@ class State(NamedTuple):
 @inner
 def begin(state: State, unmodelled: float) -> None:
     """Begin, with rows in which a mean square of (N m)^2 is `unmodelled`."""
-    state.noise[0] = _ASSUMED * unmodelled
+    state.noise[0] = _ASSUMED_SHARE * unmodelled
     state.mean[0] = 0.0
     state.rows[0] = 0.0
     forget_recent(state)
@@ -146,7 +148,7 @@ def update(
     own = noise_of(state.mean[0], state.rows[0], unmodelled, most)
     state.rows[0] = min(state.rows[0] + share, most)
     if state.rows[0] > 0.0:
-        usual = min(square, _MOST * share * own)
+        usual = min(square, _MOST_SQUARE * share * own)
         state.mean[0] += (usual - share * state.mean[0]) / state.rows[0]
     state.floor[0] *= 1.0 - period / LASTING
     own = noise_of(state.mean[0], state.rows[0], unmodelled, most)
@@ -163,7 +165,7 @@ def alarm(state: State, period: float, most: float) -> float:
     rows = state.rows[0] + _ASSUMED_ROWS * (1.0 - state.rows[0] / most)
     excess = _excess(rows * period / CORRELATION)
     usual = _excess(most * period / CORRELATION)
-    return float(_ALARM * state.noise[0] * max(1.0, excess / usual))
+    return float(_ALARM_SQUARE * state.noise[0] * max(1.0, excess / usual))
 
 
 @inner
@@ -175,7 +177,7 @@ def _excess(rows: float) -> float:
 
         (nu + n) / 2 log(1 + n F / nu) = 8 n / 2
     """
-    return float(rows * (exp(_ALARM / (rows + 1.0)) - 1.0))
+    return float(rows * (exp(_ALARM_SQUARE / (rows + 1.0)) - 1.0))
 
 
 @inner
@@ -183,5 +185,5 @@ def noise_of(mean: float, count: float, unmodelled: float, most: float) -> float
     """Return s^2 by the `mean` square of `count` rows, and what is assumed before any."""
     assumed_rows = _ASSUMED_ROWS * (1.0 - count / most)
     share = assumed_rows / (assumed_rows + count)
-    noise = mean + share * (_ASSUMED * unmodelled - mean)
-    return max(noise, _LEAST * unmodelled)
+    noise = mean + share * (_ASSUMED_SHARE * unmodelled - mean)
+    return max(noise, _LEAST_SQUARE * unmodelled)

@@ -22,8 +22,8 @@ a pole L below that of the drives leaves no phase for a light one.  |r| is at mo
 a half of the torque limit, as for a load in the safe torque; beyond that, r takes over what is
 learned no longer, until it needs less.
 
-*Bias.*  In the first `_SETTLING` / L, r is zero.  What is seen then is subtracted; it fades
-within 10 / L if the prior explains it.  A joint whose sensor shows more than `_SIGMAS`
+*Bias.*  In the first `_SETTLING_TIMES` / L, r is zero.  What is seen then is subtracted; it fades
+within 10 / L if the prior explains it.  A joint whose sensor shows more than `_PRIOR_SIGMAS`
 deviations keeps it: it has an offset, or the arm holds something.  It is also kept if the
 law continues with a d^3 of its own, which may have that already.
 
@@ -44,16 +44,16 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
-_SETTLING = 4.0  # 1/L, until r is that of the arm
-_RELEASED = 10.0  # 1/L, in which a plausible bias fades
-_SIGMAS = 3.0  # of what the prior explains
-_MOST = 0.5  # of the torque limit
-_STEADY = 0.02  # s: oscillations have 8 Hz or more
+_SETTLING_TIMES = 4.0  # 1/L, until r is that of the arm
+_BIAS_RELEASE = 10.0  # 1/L, in which a plausible bias fades
+_PRIOR_SIGMAS = 3.0  # of what the prior explains
+_MOST_LOAD = 0.5  # of the torque limit
+_STEADY_TIME = 0.02  # s: oscillations have 8 Hz or more
 
 
 def most_load(limit: Array) -> Array:
     """Return the largest |r| (n,) [N m] with a torque limit (n,) [N m]."""
-    return _MOST * limit
+    return _MOST_LOAD * limit
 
 
 class Settings(NamedTuple):
@@ -105,7 +105,7 @@ class Work(NamedTuple):
 @inner
 def has_settled(settings: Settings, state: State) -> bool:
     """Whether the filters have settled, so that r is that of the arm."""
-    return bool(state.elapsed[0] * settings.observer_bandwidth >= _SETTLING)
+    return bool(state.elapsed[0] * settings.observer_bandwidth >= _SETTLING_TIMES)
 
 
 @inner
@@ -182,14 +182,14 @@ def update(
 
     The `information` (m, m) is the inverse covariance of the prior of theta.
     """
-    settling = _SETTLING / settings.observer_bandwidth
+    settling = _SETTLING_TIMES / settings.observer_bandwidth
     before = state.elapsed[0]
     state.elapsed[0] = before + dt
     if before < settling <= state.elapsed[0]:
         find_bias(settings, state, work, links, information)
     release_bias(settings, state, dt)
     passed = filter_gain(1.0 / settings.observer_bandwidth, dt)
-    steadied = filter_gain(_STEADY, dt)
+    steadied = filter_gain(_STEADY_TIME, dt)
     for i in range(state.torque.size):
         state.handover[i] -= passed * state.handover[i]
         shown = residual(state, i, links) - state.bias[i]
@@ -202,7 +202,7 @@ def update(
 @inner
 def release_bias(settings: Settings, state: State, dt: float) -> None:
     """Let the bias fade where it is not kept."""
-    share = filter_gain(_RELEASED / settings.observer_bandwidth, dt)
+    share = filter_gain(_BIAS_RELEASE / settings.observer_bandwidth, dt)
     for i in range(state.bias.size):
         if state.keeps_bias[i] == 0.0:
             state.bias[i] -= share * state.bias[i]
@@ -225,7 +225,7 @@ def find_bias(
             work.row[j] = state.filtered[i, j] if j < p else 0.0
         f = settings.unmodelled[i]
         variance = whiten(work.factor, work.row) + f * f
-        if abs(state.bias[i]) > _SIGMAS * sqrt(variance):
+        if abs(state.bias[i]) > _PRIOR_SIGMAS * sqrt(variance):
             state.keeps_bias[i] = 1.0
 
 

@@ -15,7 +15,8 @@ friction, and what X describes of it, are
 
 as for the rows of `innovation`, one each T, with s^2 the mean square of what they leave of g: a
 torque that they do not describe, as of a motor that drags, makes P_f small.  The rows are
-those of the window, but fade over `_WINDOWS` of it in motion, as friction outlasts what is carried.
+those of the window, but fade over `_MEAN_WINDOWS` of it in motion, as friction outlasts what is
+carried.
 
 P^ - P_f - P_r describes the links: by it `load_observer` sees what acts on them.  d^ is this d,
 in place of that of the window, and outlasts changes of the arm; P_f and d^ follow while P^
@@ -30,8 +31,8 @@ from blf_dsc_controller.law.innovation import CORRELATION
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
-_WINDOWS = 3.0  # of the learning; by choice, not derived
-_NOTHING = 0.1  # of that: rows of zeros before the first
+_MEAN_WINDOWS = 3.0  # of the learning; by choice, not derived
+_EMPTY_ROWS = 0.1  # of that: rows of zeros before the first
 
 
 class Settings(NamedTuple):
@@ -89,9 +90,9 @@ def fade(settings: Settings, state: State, moving: float) -> float:
 
     Return its share of them.
     """
-    most = _WINDOWS * settings.length
+    most = _MEAN_WINDOWS * settings.length
     state.rows[0] = min(state.rows[0] + moving, most)
-    share = 1.0 / (_NOTHING * most + state.rows[0])
+    share = 1.0 / (_EMPTY_ROWS * most + state.rows[0])
     kept = 1.0 - moving * share
     state.square[0] *= kept
     for a in range(state.b.size):

@@ -47,21 +47,21 @@ VIOLENT = 0.5
 PATIENCE = 0.25
 """Time [s] from one report to the next, in which an oscillation can die out."""
 
-_LOWEST = 8.0  # Hz
-_LONGEST = 0.5 / _LOWEST  # s, half period
-_FAST = 20.0  # Hz, from which a velocity may lag far behind its positions
-_STRONG = 0.05  # of the torque limit, amplitude of its torque
-_TURNED = 0.25  # of a half wave, by which p turns back at its end
+_LOWEST_FREQUENCY = 8.0  # Hz
+_LONGEST_HALF_WAVE = 0.5 / _LOWEST_FREQUENCY  # s, half period
+_FAST_FREQUENCY = 20.0  # Hz, from which a velocity may lag far behind its positions
+_LEAST_AMPLITUDE = 0.05  # of the torque limit, amplitude of its torque
+_TURNED_BACK = 0.25  # of a half wave, by which p turns back at its end
 # a half wave that is longer is one of the arm: standard deviations of the sensor's
 # noise, which the loop makes larger, and steps of the sensor
-_CLEAR = 10.0
-_STEPS = 2.0
-_REGULAR = 1.6  # ratio of two half periods
-_LASTING = 0.85  # of the half wave four earlier
-_EARLIER = 4
-_GROWS = 1.25  # times the half wave two earlier, of the same sign
-_GROWN = 2.0  # half waves in a row
-_AVERAGED = 4.0  # half periods
+_NOISE_SIGMAS = 10.0
+_SENSOR_STEPS = 2.0
+_REGULAR_RATIO = 1.6  # ratio of two half periods
+_LASTING_RATIO = 0.85  # of the half wave four earlier
+_WAVES_EARLIER = 4
+_GROWING_RATIO = 1.25  # times the half wave two earlier, of the same sign
+_GROWING_WAVES = 2.0  # half waves in a row
+_AVERAGED_WAVES = 4.0  # half periods
 
 
 class State(NamedTuple):
@@ -103,7 +103,7 @@ def watch(
     `limit` (n,) [N m] are those of the torques; `noise` [rad^2] is the mean square of
     the sensor's noise, `resolution` [rad] its step.
     """
-    share = 1.0 - exp(-2.0 * pi * _LOWEST * dt)
+    share = 1.0 - exp(-2.0 * pi * _LOWEST_FREQUENCY * dt)
     for i in range(limit.size):
         first = error[i] - now.slow[0, i]
         now.slow[0, i] += share * first
@@ -116,7 +116,7 @@ def watch(
         now.span[i] += dt
         now.since[i] += dt
         now.calm[i] += dt
-        if now.since[i] > 1.5 * _LONGEST:  # with the quarter to turn back
+        if now.since[i] > 1.5 * _LONGEST_HALF_WAVE:  # with the quarter to turn back
             forget(now, i, p)
         ahead = now.direction[i] * (p - now.farthest[i])
         if ahead >= 0.0:
@@ -125,10 +125,10 @@ def watch(
             if now.direction[i] == 0.0:
                 now.direction[i] = 1.0
             continue
-        least = max(_CLEAR * sqrt(noise[i]), _STEPS * resolution[i])
+        least = max(_NOISE_SIGMAS * sqrt(noise[i]), _SENSOR_STEPS * resolution[i])
         travel = abs(now.farthest[i] - now.turn[i])
-        if -ahead > max(least, _TURNED * travel):
-            end_half_wave(now, i, travel, travel > least, _STRONG * limit[i])
+        if -ahead > max(least, _TURNED_BACK * travel):
+            end_half_wave(now, i, travel, travel > least, _LEAST_AMPLITUDE * limit[i])
             now.farthest[i] = p
             now.farthest_at[i] = now.since[i]
 
@@ -154,7 +154,7 @@ def oscillates(now: State, i: int) -> bool:
 @inner
 def grows(now: State, i: int) -> bool:
     """Whether the last half waves of joint i grow."""
-    return bool(now.grown[i] >= _GROWN)
+    return bool(now.grown[i] >= _GROWING_WAVES)
 
 
 @inner
@@ -231,17 +231,22 @@ def end_half_wave(
     half = now.farthest_at[i]
     now.amplitude[i] = end_span(now, i)
     k = int(now.waves[i])
-    counts = is_clear and half < _LONGEST and now.amplitude[i] > strong
+    counts = is_clear and half < _LONGEST_HALF_WAVE and now.amplitude[i] > strong
     ratio = half / now.half[i] if k > 0 else 1.0
-    is_regular = 1.0 / _REGULAR < ratio < _REGULAR
-    lasts = k < _EARLIER or travel > _LASTING * now.travel[k % _EARLIER, i]
+    is_regular = 1.0 / _REGULAR_RATIO < ratio < _REGULAR_RATIO
+    lasts = (
+        k < _WAVES_EARLIER
+        or travel > _LASTING_RATIO * now.travel[k % _WAVES_EARLIER, i]
+    )
     if not (counts and is_regular and lasts):
         k = 0
-    grows = k > 1 and travel > _GROWS * now.travel[(k - 2) % _EARLIER, i]
+    grows = k > 1 and travel > _GROWING_RATIO * now.travel[(k - 2) % _WAVES_EARLIER, i]
     now.grown[i] = now.grown[i] + 1.0 if grows else 0.0
-    now.travel[k % _EARLIER, i] = travel
+    now.travel[k % _WAVES_EARLIER, i] = travel
     now.half[i] = (
-        half if k == 0 else now.half[i] + (half - now.half[i]) / min(k + 1.0, _AVERAGED)
+        half
+        if k == 0
+        else now.half[i] + (half - now.half[i]) / min(k + 1.0, _AVERAGED_WAVES)
     )
     now.waves[i] = k + 1.0 if counts else 0.0
     if now.waves[i] >= FEW:
@@ -254,4 +259,4 @@ def end_half_wave(
 @inner
 def is_fast(now: State, i: int) -> bool:
     """Whether joint i seems to oscillate so fast that a filtered velocity lags far behind."""
-    return bool(now.waves[i] >= SOME and now.half[i] < 0.5 / _FAST)
+    return bool(now.waves[i] >= SOME and now.half[i] < 0.5 / _FAST_FREQUENCY)

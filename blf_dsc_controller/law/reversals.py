@@ -10,17 +10,17 @@ high pass that only a step passes (index h; `friction` has the filters):
     min  p int (e_h - c s_h - c k b_h)^2 dt + l (c - c_0)^2 + l_b (c k)^2
 
 with s the direction of the motion and b what breakaway has in excess.  The sums forget once they
-contain `_ENERGY`, some eight reversals.  If the last two reversals both contradict them by
+contain `_MEMORY_ENERGY`, some eight reversals.  If the last two reversals both contradict them by
 more than the unmodelled torque f, they overrule what is older.
 
 What pushes the arm as a joint reverses, or a load that comes on, leaves steps of its own in e_h,
 earlier or later than that of friction.  So a reversal counts by
 
-    1 / (1 + (d / a)^2),    d^2 p int (g s)_h^2 dt = p int (e_h - c_1 (g s)_h)^2 - `_CHANCE` n^2 dt
+    1 / (1 + (d / a)^2),    d^2 p int (g s)_h^2 dt = p int (e_h - c_1 (g s)_h)^2 - C n^2 dt
 
 where d is the friction whose step would be as large as what the friction c_1 of this reversal
-leaves of the torque around it, n the rms of e_h away from reversals, its noise, and a what the
-shape g s is wrong by: a part of f, and of c.
+leaves of the torque around it, n the rms of e_h away from reversals, its noise, C the
+`_CHANCE_RATIO`, and a what the shape g s is wrong by: a part of f, and of c.
 
 If the arm has changed, what reversals have shown since some 0.2 s before that was found
 is taken back: a load that comes on in a reversal looks like the step of friction.
@@ -34,15 +34,17 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.innovation import LATE
 from blf_dsc_controller.law.lag import filter_gain
 
-_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
-_SHOWN = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
-_PRIOR = 0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
+_MEMORY_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
+_SHOWN_ENERGY = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
+_COULOMB_PRIOR = (
+    0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
+)
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
-_NEAR = 0.1  # s around a reversal in which its torque is compared with friction's
-_USUAL = 4.0  # s, of what is away from reversals: its noise
-_CHANCE = 2.0  # times its mean square
-# of p int s_h^2 dt, faded by `_NEAR`, from which on the joint reverses
+_NEAR_TIME = 0.1  # s around a reversal in which its torque is compared with friction's
+_QUIET_TIME = 4.0  # s, of what is away from reversals: its noise
+_CHANCE_RATIO = 2.0  # times its mean square
+# of p int s_h^2 dt, faded by `_NEAR_TIME`, from which on the joint reverses
 _TOUCHED = 0.004
 _ALLOWED_F, _ALLOWED_C = 0.5, 2.0  # a over f, and over c
 
@@ -89,9 +91,9 @@ class State(NamedTuple):
     earlier: Shown  # some `LATE` ago or less
     earliest: Shown  # one to two times as long ago
     since_kept: Cell  # s
-    # p int of s_h^2, e_h^2 [(N m)^2] and 1 dt, faded by `_NEAR`
+    # p int of s_h^2, e_h^2 [(N m)^2] and 1 dt, faded by `_NEAR_TIME`
     recent: Annotated[Array, 3, 'n']
-    # p int of e_h^2 dt and dt away from reversals, faded by `_USUAL`
+    # p int of e_h^2 dt and dt away from reversals, faded by `_QUIET_TIME`
     usual: Annotated[Array, 2, 'n']
 
 
@@ -138,7 +140,7 @@ def add_row(
 
 @inner
 def add_torque(state: State, i: int, row: Row, dt: float) -> None:
-    """Add e_h^2 of joint i to the torque around its reversal, from `_NEAR` before it to after it.
+    """Add e_h^2 of joint i to the torque around its reversal, `_NEAR_TIME` before and after it.
 
     Away from reversals e_h is noise.
     """
@@ -147,12 +149,12 @@ def add_torque(state: State, i: int, row: Row, dt: float) -> None:
     ee = row.e * row.e
     recent, usual, shown = state.recent, state.usual, state.shown
     reversed_before = recent[0, i] > _TOUCHED
-    fade(recent, i, _NEAR, dt)
+    fade(recent, i, _NEAR_TIME, dt)
     recent[0, i] += weight * ss
     recent[1, i] += weight * ee
     recent[2, i] += weight
     if recent[0, i] <= _TOUCHED:
-        fade(usual, i, _USUAL, dt)
+        fade(usual, i, _QUIET_TIME, dt)
         usual[0, i] += weight * ee
         usual[1, i] += weight
     elif reversed_before:
@@ -209,9 +211,9 @@ def trust(settings: Settings, state: State, i: int, k: float) -> float:
     torque = shown.present[_SE, i] + k * shown.present[_BE, i]
     misfit = shown.torque[i] - torque * torque / of_friction
     if usual[1, i] > 0.0:
-        misfit -= _CHANCE * shown.span[i] * usual[0, i] / usual[1, i]
+        misfit -= _CHANCE_RATIO * shown.span[i] * usual[0, i] / usual[1, i]
     f = settings.unmodelled[i]
-    pull = _PRIOR * f * f / settings.variance[i]
+    pull = _COULOMB_PRIOR * f * f / settings.variance[i]
     c = shown.past[_SE, i] + pull * settings.initial[i]
     c /= shown.past[_SS, i] + pull
     allowed = (_ALLOWED_F * f) ** 2 + (_ALLOWED_C * c) ** 2
@@ -222,7 +224,7 @@ def trust(settings: Settings, state: State, i: int, k: float) -> float:
 def counted(settings: Settings, state: State, i: int, k: float) -> float:
     """Return how much the present reversal of joint i counts; 0 until it shows its friction."""
     share = trust(settings, state, i, k)
-    return share if share * energy(state.shown, i, k) > _SHOWN else 0.0
+    return share if share * energy(state.shown, i, k) > _SHOWN_ENERGY else 0.0
 
 
 @inner
@@ -236,7 +238,7 @@ def close(settings: Settings, state: State, i: int, k: float) -> None:
     share = counted(settings, state, i, k)
     if share == 0.0:
         return
-    excess = sums[_SS, i] + share * latest[_SS, i] - _ENERGY
+    excess = sums[_SS, i] + share * latest[_SS, i] - _MEMORY_ENERGY
     keep = 1.0
     if excess > 0.0:
         keep = max(0.0, 1.0 - excess / sums[_SS, i])
@@ -271,7 +273,7 @@ def learned(
 ) -> tuple[float, float]:
     """Return c [N m] and k of joint i by all sums, k within its limits; `k_now` is k^."""
     f = settings.unmodelled[i]
-    pull = _PRIOR * f * f / settings.variance[i]
+    pull = _COULOMB_PRIOR * f * f / settings.variance[i]
     sums = state.shown.past
     latest = state.shown.present
     share = counted(settings, state, i, k_now)
@@ -310,7 +312,7 @@ def take_back(state: State, breakaway: Array) -> None:
     shown = state.shown
     copy(state.earliest, shown)
     for i in range(breakaway.size):
-        if energy(shown, i, breakaway[i]) <= _SHOWN:
+        if energy(shown, i, breakaway[i]) <= _SHOWN_ENERGY:
             for row in range(5):
                 shown.present[row, i] = 0.0
             shown.torque[i] = shown.span[i] = 0.0

@@ -28,16 +28,16 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import oscillation
 
-_NOISE = 0.5  # s, over which the noise is averaged
-_SIGMAS = 3.0  # of a filtered value
+_NOISE_TIME = 0.5  # s, over which the noise is averaged
+_FILTERED_SIGMAS = 3.0  # of a filtered value
 # of a reading: two readings differ by as much only once in a day, at 1 kHz
 _MOVED = 8.0
-_STEPS = 1.5  # a reading between two steps of the sensor flickers by one
+_FLICKER_STEPS = 1.5  # a reading between two steps of the sensor flickers by one
 FILTER = 0.03
 """Time constant tau [s] of the filtered velocities."""
-_POWER = 0.1  # s, over which the mean squares are
-_WRONG = 0.5  # of the larger mean square
-_LATE = 0.9  # of the larger mean square: a first-order lag has less than 1
+_SQUARE_TIME = 0.1  # s, over which the mean squares are
+_WRONG_POWER = 0.5  # of the larger mean square
+_LATE_POWER = 0.9  # of the larger mean square: a first-order lag has less than 1
 _SECOND = 2.0  # readings before that of a second difference
 _ROW = 0.01  # s: up to here, the ends of an interval show the velocity within it
 LONG_GAP = 2.5  # samples: states are missing in an interval that is longer than this
@@ -69,7 +69,7 @@ def restart(state: State) -> None:
 def position_changed(state: State, i: int, change: float) -> bool:
     """Whether noise and steps of the sensor of joint i do not explain a change [rad]."""
     noise = _MOVED * sqrt(state.noise[i])
-    return bool(abs(change) > max(noise, _STEPS * state.resolution[i]))
+    return bool(abs(change) > max(noise, _FLICKER_STEPS * state.resolution[i]))
 
 
 @inner
@@ -77,7 +77,7 @@ def measure_noise(state: State, dt: float, measurement: Array) -> None:
     """Update noise and resolution by a reading [q, dq, ...], `dt` [s] after the last."""
     n = state.resolution.size
     count = state.readings[0]
-    share = max(min(1.0, dt / _NOISE), 1.0 / max(1.0, count - 1.0))
+    share = max(min(1.0, dt / _NOISE_TIME), 1.0 / max(1.0, count - 1.0))
     for i in range(2 * n):
         reading = measurement[i]
         if count >= _SECOND:
@@ -109,7 +109,7 @@ def compare_velocities(
     begins = state.readings[0] == 0.0
     state.readings[0] += 1.0
     share = min(1.0, dt / FILTER)
-    slow = min(1.0, dt / _POWER)
+    slow = min(1.0, dt / _SQUARE_TIME)
     is_gap = dt > max(_ROW, LONG_GAP * sample_time)
     is_wrong = False
     for i in range(n):
@@ -140,7 +140,7 @@ def is_contradicted(
 
     `share` is that of a reading in a filtered velocity.
     """
-    least = max(_WRONG * state.speed[i], unseen(state, i, share))
+    least = max(_WRONG_POWER * state.speed[i], unseen(state, i, share))
     is_lag = oscillation.is_fast(shaking, i) and is_late(state, i)
     return bool(state.mismatch[i] > least and not is_lag)
 
@@ -151,13 +151,15 @@ def is_late(state: State, i: int) -> bool:
 
     One that is stuck has a mean square difference of 1, one of the wrong sign 4.
     """
-    return bool(state.mismatch[i] < _LATE * state.speed[i])
+    return bool(state.mismatch[i] < _LATE_POWER * state.speed[i])
 
 
 @inner
 def unseen(state: State, i: int, share: float) -> float:
     """Return the mean square [(rad/s)^2] of the difference that noise and steps explain."""
     n = state.resolution.size
-    position = _SIGMAS * _SIGMAS * state.noise[i] + state.resolution[i] ** 2
-    velocity = _SIGMAS * _SIGMAS * state.noise[n + i] * 0.5 * share
+    position = (
+        _FILTERED_SIGMAS * _FILTERED_SIGMAS * state.noise[i] + state.resolution[i] ** 2
+    )
+    velocity = _FILTERED_SIGMAS * _FILTERED_SIGMAS * state.noise[n + i] * 0.5 * share
     return float(SLOW * SLOW + position / (FILTER * FILTER) + velocity)

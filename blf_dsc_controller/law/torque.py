@@ -41,7 +41,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
 
-_RELEASED = 0.5  # r
+_RELEASED_RATE = 0.5  # r
 
 LEVEL_CUT = 1.0
 RATE_CUT = 2.0
@@ -121,7 +121,7 @@ def added_torque(settings: Settings, q: Array) -> Array:
 @inner
 def slow_down(demand: float, last: float, held: float, step: float) -> float:
     """Return the torque [N m] for a demand, by at most `step` from `last`, less what is `held`."""
-    released = clip(held, -_RELEASED * step, _RELEASED * step)
+    released = clip(held, -_RELEASED_RATE * step, _RELEASED_RATE * step)
     return clip(demand - (held - released), last - step, last + step)
 
 

@@ -20,7 +20,7 @@ are stable only with an L of some rad/s.  So r fades out for good where
 - *it oscillates* (`oscillation`, of r instead of the error), or the arm does: r is left out before
   the arm is said to oscillate, unless that is violent.
 - *efforts do not follow*: drives with a loop around sensors make of them what is commanded,
-  whatever load or contact is behind.  An effort that is off by `_OFF` of the torque limit
+  whatever load or contact is behind.  An effort that is off by `_OFF_TORQUE` of the torque limit
   leaves r out while that lasts, and if it lasts while the arm follows its reference, for
   good: the command has reached the arm.  Otherwise it may not have (`effect`).
 """
@@ -40,11 +40,11 @@ NONE, SHAKES, OFF = range(3)
 _FADE = (
     0.005  # s, with which r is left out or comes back: it may grow threefold in 10 ms
 )
-_NOTHING = 1e-6  # of r
-_STRONG = 0.0125  # of the torque limit: a quarter of an oscillation of r
-_OFF = 0.1  # of the torque limit
-_LASTING = 0.05  # s
-_FOLLOWS = 0.25  # of the speed of the reference
+_FADED = 1e-6  # of r
+_SHAKING_TORQUE = 0.0125  # of the torque limit: a quarter of an oscillation of r
+_OFF_TORQUE = 0.1  # of the torque limit
+_OFF_TIME = 0.05  # s
+_FOLLOWED_SPEED = 0.25  # of the speed of the reference
 
 
 class State(NamedTuple):
@@ -97,7 +97,7 @@ def watch_shaking(
 ) -> None:
     """Find whether r, a `torque` (n,) [N m], oscillates; `limit` (n,) [N m] as configured."""
     for i in range(torque.size):
-        work.clear[i] = _STRONG * limit[i]
+        work.clear[i] = _SHAKING_TORQUE * limit[i]
     oscillation.watch(
         state.shaking, work.zeros, torque, torque, work.zeros, work.clear, dt
     )
@@ -127,13 +127,13 @@ def watch_following(
     for i in range(limit.size):
         late += (dq[i] - dqr[i]) ** 2
         square += dqr[i] ** 2
-    follows = late < _FOLLOWS * _FOLLOWS * square
+    follows = late < _FOLLOWED_SPEED * _FOLLOWED_SPEED * square
     is_off = False
     for i in range(limit.size):
-        is_one = abs(work.differences[i]) > _OFF * limit[i]
+        is_one = abs(work.differences[i]) > _OFF_TORQUE * limit[i]
         is_off = is_off or is_one
         state.lasted[i] = state.lasted[i] + dt if is_one and follows else 0.0
-        if state.lasted[i] > _LASTING:
+        if state.lasted[i] > _OFF_TIME:
             note_fault(state, OFF, i)
     return is_off
 
@@ -150,5 +150,5 @@ def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
     aim = 1.0 if is_off or state.fault[0] != NONE else 0.0
     if faded[0] != aim:
         faded[0] += filter_gain(_FADE, dt) * (aim - faded[0])
-        if abs(faded[0] - aim) < _NOTHING:
+        if abs(faded[0] - aim) < _FADED:
             faded[0] = aim

@@ -47,11 +47,11 @@ from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.prediction import SETTLED, moving_share, moving_square
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
-_FEWEST = 0.5  # s of motion that a part has
-_CHANGING = 20.0  # s, until the variance of e has grown
+_FEWEST_MOTION = 0.5  # s of motion that a part has
+_CHANGING_TIME = 20.0  # s, until the variance of e has grown
 # rad/s or m/s, below which friction is least like its columns, and rows count less
-_SLOW = 0.1
-_NOTHING, _LESS = 2.0, 4.0  # standard deviations: within, and below minus
+_SLOW_SPEED = 0.1
+_NOTHING_SIGMAS, _LESS_SIGMAS = 2.0, 4.0  # standard deviations: within, and below minus
 
 # rows before, of two halves since, and of the two parts that are kept apart
 BEFORE, OLDER, NEWER, RECENT, LATEST = range(5)
@@ -208,7 +208,7 @@ def extend_row(sample: Sample, held: Array, row: Array) -> None:
 def weight_row(row: Array, dqr: Array) -> None:
     """Let the rows of slow joints count little."""
     for i in range(row.shape[0]):
-        weight = abs(dqr[i]) / sqrt(dqr[i] ** 2 + _SLOW**2)
+        weight = abs(dqr[i]) / sqrt(dqr[i] ** 2 + _SLOW_SPEED**2)
         for j in range(row.shape[1]):
             row[i, j] *= weight
 
@@ -222,7 +222,7 @@ def counted_share(dqr: Array, motion_scale: float) -> float:
         share += (
             moving_square(dqr[i], motion_scale)
             * square
-            / (square + _SLOW**2)
+            / (square + _SLOW_SPEED**2)
             / dqr.size
         )
     return share
@@ -313,7 +313,7 @@ def end_part(
     """Something else is held: close the part, without its latest rows, and begin another."""
     clear_part(state, RECENT)
     clear_part(state, LATEST)
-    fewest = _FEWEST / period
+    fewest = _FEWEST_MOTION / period
     if not is_first(state):
         move_rows(state, OLDER, NEWER)
         if state.rows[NEWER] >= fewest:
@@ -339,11 +339,11 @@ def compare_with_nothing(
     mass = state.load[MASS]
     deviation = state.load[DEVIATION]
     is_full = state.rows[BEFORE] >= settings.window
-    if mass < -_LESS * deviation:
+    if mass < -_LESS_SIGMAS * deviation:
         state.age[0] = 0.0
         clear_part(state, BEFORE)
         move_rows(state, NEWER, BEFORE)
-    elif abs(mass) < _NOTHING * deviation and not is_full:
+    elif abs(mass) < _NOTHING_SIGMAS * deviation and not is_full:
         move_rows(state, NEWER, BEFORE)
 
 
@@ -453,7 +453,7 @@ def solve(
         else:
             sums.add(work.since, 1.0, parts[part], work.since)
     a = innovation.row_variance(state.innovation, period)
-    grown = min(1.0, max(state.age[0], period) / _CHANGING)
+    grown = min(1.0, max(state.age[0], period) / _CHANGING_TIME)
     fill_equations(settings, state, work, prior, a, grown)
     cholesky_factor(state.factor)
     cholesky_solve(state.factor, state.solution)

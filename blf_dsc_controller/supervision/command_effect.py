@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-_SETTLING = 0.01  # s, for which the velocities lag behind the stop
-_AVERAGED = 0.02  # s, against their noise
-_NOTICED = 0.05  # of the torque limit
-_CHANGED = 0.2  # of it: a command that changes by more would have accelerated the arm
-_PATIENCE = 0.1  # s, for which commands may have no effect
+_SETTLING_TIME = 0.01  # s, for which the velocities lag behind the stop
+_SPEED_TIME = 0.02  # s, against their noise
+_NOTICED_TORQUE = 0.05  # of the torque limit
+_CHANGED_COMMAND = (
+    0.2  # of it: a command that changes by more would have accelerated the arm
+)
+_EFFECT_TIME = 0.1  # s, for which commands may have no effect
 
 
 class CommandEffect:
@@ -37,12 +39,12 @@ class CommandEffect:
     def update(self, accelerating: Vector, limit: Vector, dt: float) -> None:
         """Take the torque (n,) [N m] that has accelerated the arm for `dt` [s]."""
         self._elapsed += dt
-        if self._elapsed < _SETTLING:
+        if self._elapsed < _SETTLING_TIME:
             return
-        share = min(1.0, dt / _AVERAGED)
+        share = min(1.0, dt / _SPEED_TIME)
         self._average += share * (accelerating - self._average)
         largest = float((np.abs(self._average) / limit).max())
-        self.is_proven = self.is_proven or largest > _NOTICED
+        self.is_proven = self.is_proven or largest > _NOTICED_TORQUE
 
     def await_effect(self, change: Vector, limit: Vector, dt: float) -> bool:
         """Wait for an effect of commands that changed by these torques (n,) [N m].
@@ -50,8 +52,8 @@ class CommandEffect:
         Return whether the wait has just been too long, once.  `dt` [s] is the time since
         the last call.  Call it until an effect is proven.
         """
-        has_changed = bool((np.abs(change) > _CHANGED * limit).any())
-        if not has_changed or self._without_effect > _PATIENCE:
+        has_changed = bool((np.abs(change) > _CHANGED_COMMAND * limit).any())
+        if not has_changed or self._without_effect > _EFFECT_TIME:
             return False
         self._without_effect += dt
-        return self._without_effect > _PATIENCE
+        return self._without_effect > _EFFECT_TIME

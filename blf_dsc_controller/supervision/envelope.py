@@ -36,7 +36,7 @@ from blf_dsc_controller.supervision.observed_load import OBSERVER, ObservedLoad
 Array = NDArray[np.float64]
 
 _FAR = 1e3  # rad, rad/s: farther away no limit acts
-_RELIEF = 4  # samples that make up for one in which a law asks for too much
+_RELIEF_SAMPLES = 4  # samples that make up for one in which a law asks for too much
 _TOWARDS = np.array([[-1.0], [1.0]])  # the lower and the upper end
 _NOTABLE = 0.01  # of the torque limit: cutting less counts as nothing
 
@@ -115,7 +115,7 @@ class Envelope:
     @property
     def asking(self) -> float:
         """Samples in which too much was asked for, less a quarter of those in which it was not."""
-        return self._asking / _RELIEF
+        return self._asking / _RELIEF_SAMPLES
 
     def brake(self, now: Motion, whole: Array, estimate: Array, dt: float) -> Array:
         """Return the whole torque (n,) [N m] that is allowed now; itself if it is.
@@ -146,7 +146,7 @@ class Envelope:
             beyond = np.abs(change) * self.limits.braking_time / self.limits.velocity
             self.joint = int(beyond.argmax())
             if (np.abs(allowed - whole) > _NOTABLE * limit).any():
-                self._asking += 1 + _RELIEF
+                self._asking += 1 + _RELIEF_SAMPLES
         self._last = allowed, now.dq.copy()
         return allowed
 

@@ -15,13 +15,13 @@ from blf_dsc_controller.supervision.envelope import Body, Envelope, Limits
 Array = NDArray[np.float64]
 
 _POSTURES = 20
-_ROUNDED = 1.0 + 1e-9  # the law computes its own steps with what the drives add
-_NEAR = 0.9  # of the velocity limit: braked from below it
-_DELAYS = 4.0  # of the loop, in T_v
+_STEP_ROUNDED = 1.0 + 1e-9  # the law computes its own steps with what the drives add
+_BRAKED_SPEED = 0.9  # of the velocity limit: braked from below it
+_LOOP_DELAYS = 4.0  # of the loop, in T_v
 _APPROACH = 2.0  # T_v, in T_q
-_REACH = 0.06  # s, at the velocity limit, of the largest error without a barrier
-_LEFT = 0.2  # of the torque limit, at least, besides gravity ...
-_USED = 0.5  # ... and of what is left, to stop at the end of the range
+_REACH_TIME = 0.06  # s, at the velocity limit, of the largest error without a barrier
+_LEFT_TORQUE = 0.2  # of the torque limit, at least, besides gravity ...
+_USED_TORQUE = 0.5  # ... and of what is left, to stop at the end of the range
 
 
 def envelope_of(config: ControllerConfig, settings: Settings) -> Envelope:
@@ -52,22 +52,24 @@ def limits_of(config: ControllerConfig, settings: Settings) -> tuple[Limits, Bod
     gravity = np.abs((regressors_at(model, q, rest, rest, rest) * P).sum(axis=-1))
     torque, rate = np.array((config.torque.limit, config.torque.rate_limit))
     rate = np.where(rate > 0.0, rate, np.inf)
-    left = np.maximum(torque - gravity.max(axis=0), _LEFT * torque)
-    delay = _DELAYS * loop_delay(config.sample_time, config.robot.lag)
+    left = np.maximum(torque - gravity.max(axis=0), _LEFT_TORQUE * torque)
+    delay = _LOOP_DELAYS * loop_delay(config.sample_time, config.robot.lag)
     k_position, k_velocity = _soft_limits(config)
     braking_time = np.maximum(delay, inertia / k_velocity)
     reserve = np.where(turns, np.inf, config.barrier.bound)
     any_error = settings.has_barrier == 1 or config.safety.error_ratio == 0.0
-    error = config.safety.error_ratio * _REACH * np.array(config.safety.velocity_limit)
+    error = (
+        config.safety.error_ratio * _REACH_TIME * np.array(config.safety.velocity_limit)
+    )
     limits = Limits(
         torque=torque,
-        step=_ROUNDED * rate * config.sample_time,
-        velocity=_NEAR * np.array(config.safety.velocity_limit),
+        step=_STEP_ROUNDED * rate * config.sample_time,
+        velocity=_BRAKED_SPEED * np.array(config.safety.velocity_limit),
         ends=np.array((lower - reserve, upper + reserve)),
         error=np.full(settings.n, np.inf) if any_error else error,
         braking_time=braking_time,
         approach_time=np.maximum(_APPROACH * braking_time, 1.0 / k_position),
-        deceleration=_USED * left / inertia,
+        deceleration=_USED_TORQUE * left / inertia,
         jerk=rate / inertia,
     )
     return limits, Body(model, P, is_known and settings.has_barrier != 1)

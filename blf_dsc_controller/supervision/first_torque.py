@@ -25,9 +25,11 @@ Vector = NDArray[np.float64]
 MATTERS = 0.05
 """Share of the torque limit from which a torque of gravity matters."""
 
-_SLOW = 0.05  # rad/s: below it efforts are those of rest, which encoder steps interrupt
-_NOTICED = 0.02  # of the torque of gravity; a few amperes for some fifty N m
-_ALIKE = 0.9  # cosine of the angle between two torques
+_RESTING_SPEED = (
+    0.05  # rad/s: below it efforts are those of rest, which encoder steps interrupt
+)
+_NOTICED_GRAVITY = 0.02  # of the torque of gravity; a few amperes for some fifty N m
+_ALIKE_COSINE = 0.9  # cosine of the angle between two torques
 _SEND = 'safety.first_torque: send'
 _DRIVER = (
     '. A driver of `blf_dsc drive` knows robot.drive_compensates and robot.effort of its robot, '
@@ -130,8 +132,8 @@ def is_like(torque: Vector, gravity: Vector) -> bool:
     """Whether a torque (n,) has the direction and magnitude of gravity."""
     sizes = float(np.linalg.norm(torque)), float(np.linalg.norm(gravity))
     return (
-        sizes[0] > _NOTICED * sizes[1]
-        and float(torque @ gravity) > _ALIKE * sizes[0] * sizes[1]
+        sizes[0] > _NOTICED_GRAVITY * sizes[1]
+        and float(torque @ gravity) > _ALIKE_COSINE * sizes[0] * sizes[1]
     )
 
 
@@ -145,7 +147,9 @@ def _check_gravity(
     """Raise StartError if the arm would get gravity twice, or not at all."""
     worst = int(np.argmax(np.abs(gravity)))
     matters = np.abs(gravity[worst]) > MATTERS * config.torque.limit[worst]
-    if not (matters and np.abs(dq).max() <= _SLOW and np.isfinite(effort).all()):
+    if not (
+        matters and np.abs(dq).max() <= _RESTING_SPEED and np.isfinite(effort).all()
+    ):
         return
     if config.robot.drive_compensates == 'none':
         _check_not_twice(config, effort, gravity, torque)
@@ -193,7 +197,7 @@ def _check_compensated(
             'none. If the effort contains what the drives add, set robot.effort to whole. If a '
             f'torque of another controller holds the arm, set {_SEND}{_DRIVER}'
         )
-    noticed = _NOTICED * np.linalg.norm(gravity)
+    noticed = _NOTICED_GRAVITY * np.linalg.norm(gravity)
     if not is_commanded and np.linalg.norm(effort) <= noticed:
         raise StartError(
             f'{no_gravity} with an effort of {effort[worst]:.4g} {unit} where the drives should '

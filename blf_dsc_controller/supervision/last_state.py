@@ -22,8 +22,8 @@ from blf_dsc_controller.supervision.recent_motion import is_gap
 
 Vector = NDArray[np.float64]
 
-_REMEMBERED = 250_000_000  # ns, for which the next gap may be as long as one before
-_LONGEST = 0.25  # s: after a longer one the arm is braked all the same
+_REMEMBERED_NS = 250_000_000  # ns, for which the next gap may be as long as one before
+_LONGEST_GAP = 0.25  # s: after a longer one the arm is braked all the same
 
 
 class LastState:
@@ -135,9 +135,9 @@ class LastState:
         `period` [s] is the usual time between two states.
         """
         gap = (stamp - self.stamp) * 1e-9
-        if stamp - self._gap_ended > _REMEMBERED:
+        if stamp - self._gap_ended > _REMEMBERED_NS:
             self.gap = 0.0
         if self.stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
-            self.gap = min(gap, _LONGEST)
+            self.gap = min(gap, _LONGEST_GAP)
             self._gap_ended = stamp
         self.stamp = stamp

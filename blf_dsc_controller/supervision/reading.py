@@ -37,13 +37,13 @@ ALONE = 0.5
 # of a sample time: of two states in less, one is a copy, or of another sender, and their
 # difference shows no acceleration
 _AT_ONCE = 0.5
-_STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
-_FINEST = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
+_MOVED_STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
+_FINEST_STEP = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
 
 
-_MOVING = 3e-4  # rad in a sample: three counts of an encoder of 16 bits
+_REPEAT_MOTION = 3e-4  # rad in a sample: three counts of an encoder of 16 bits
 # ns without states, after which the arm is at rest, as at the start
-_PAUSE = 1_000_000_000
+_PAUSE_NS = 1_000_000_000
 
 
 class Doubt(Enum):
@@ -106,12 +106,12 @@ class Velocity:
     def replace(self, stamp: int, measurement: Vector) -> None:
         """Overwrite dq in [q, dq, torque] (3n,) with a stamp [ns]."""
         q, dq, _ = measurement.reshape(3, -1)
-        if self._stamp < 0 or not 0 <= stamp - self._stamp < _PAUSE:
+        if self._stamp < 0 or not 0 <= stamp - self._stamp < _PAUSE_NS:
             self._dq[:] = 0.0
         elif stamp > self._seen:
             step = (stamp - self._stamp) * 1e-9
             self._seen = stamp
-            is_moving = float(np.abs(self._dq).max()) * step > _MOVING
+            is_moving = float(np.abs(self._dq).max()) * step > _REPEAT_MOTION
             self._repeated = (
                 is_moving and not self._repeated and bool((q == self._q).all())
             )
@@ -281,7 +281,9 @@ class Readings:
     @property
     def _least_step(self) -> Vector:
         """Motion (n,) [rad] that the steps of the sensor show."""
-        return np.asarray(_STEPS * np.maximum(self.sensor.resolution, _FINEST))
+        return np.asarray(
+            _MOVED_STEPS * np.maximum(self.sensor.resolution, _FINEST_STEP)
+        )
 
     def _equals(self, measurement: Vector) -> bool:
         return bool((measurement[: self._read.size] == self._read).all())

@@ -19,14 +19,14 @@ from blf_dsc_controller.supervision.model_torque import needed_torque
 
 Array = NDArray[np.float64]
 
-_GAP = 0.03  # s, in which an arm that another commands leaves its reference
-_AVERAGED = 0.1  # s: the noise of a difference of velocities over it is small
+_GAP_TIME = 0.03  # s, in which an arm that another commands leaves its reference
+_ACCELERATION_TIME = 0.1  # s: the noise of a difference of velocities over it is small
 _BLOCKS = 10  # of it or some more, each with the mean acceleration in it
 
 
 def is_gap(elapsed: float, sample_time: float) -> bool:
     """Whether the time [s] since the last state is too long to compare the two."""
-    return elapsed >= max(_GAP, LONG_GAP * sample_time)
+    return elapsed >= max(_GAP_TIME, LONG_GAP * sample_time)
 
 
 class RecentMotion:
@@ -35,7 +35,7 @@ class RecentMotion:
     def __init__(self, n: int, sample_time: float) -> None:
         """`sample_time` is T [s]."""
         self._sample_time = sample_time
-        samples = max(1, round(_AVERAGED / sample_time))
+        samples = max(1, round(_ACCELERATION_TIME / sample_time))
         self._step = max(1, samples // _BLOCKS)  # samples in a block
         self._blocks = samples // self._step
         self.size = self._blocks * self._step + 1

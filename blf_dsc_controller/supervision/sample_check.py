@@ -24,12 +24,12 @@ from blf_dsc_controller.tool.errors import in_words
 Vector = NDArray[np.float64]
 # of the torque limit: an effort that is so much below its command, on average and now,
 # explains an error past the bound
-_SHORT, _SHORT_NOW = 0.05, 0.1
-_LIGHT = 0.5  # of the assumed inertia: less is worth saying
-_NOTHING = 0.02  # of it: no drive has so little
-_AGAINST = 0.1  # of the torque limit, beyond the torque of the model at rest
+_SHORT_TORQUE, _SHORT_TORQUE_NOW = 0.05, 0.1
+_LIGHT_INERTIA = 0.5  # of the assumed inertia: less is worth saying
+_NO_INERTIA = 0.02  # of it: no drive has so little
+_AGAINST_TORQUE = 0.1  # of the torque limit, beyond the torque of the model at rest
 # s without saturation that make up for one with it: more than a fifth adds up
-_RELIEF = 4
+_UNSATURATED_RELIEF = 4
 
 
 class SampleCheck:
@@ -58,7 +58,7 @@ class SampleCheck:
         self._cause = StopCause(config, controller, oscillation)
         self.ratio = controller.checks.ratio
         self._estimates = estimates
-        self._saturation = 0  # ns, times _RELIEF
+        self._saturation = 0  # ns, times _UNSATURATED_RELIEF
         self.set_limits(config.safety)
         self.restart()
 
@@ -85,7 +85,7 @@ class SampleCheck:
     @property
     def saturated_time(self) -> float:
         """Time at a torque limit [s], less a quarter of the time without since then."""
-        return self._saturation * 1e-9 / _RELIEF
+        return self._saturation * 1e-9 / _UNSATURATED_RELIEF
 
     def relax(self, duration: float = inf) -> None:
         """Account for some time without saturation [s]."""
@@ -190,7 +190,11 @@ class SampleCheck:
         now -= checks.effect.usual_shortfall
         share = np.abs(shortfall) / settings.torque.limit
         share_now = np.abs(now) / settings.torque.limit
-        is_short = (share > _SHORT) & (share_now > _SHORT_NOW) & (shortfall * now > 0.0)
+        is_short = (
+            (share > _SHORT_TORQUE)
+            & (share_now > _SHORT_TORQUE_NOW)
+            & (shortfall * now > 0.0)
+        )
         if not is_short.any():
             return None
         self._estimates.return_to_consistent()
@@ -232,11 +236,11 @@ class SampleCheck:
         """Return a text if the inertia of a joint's drive is far below the assumed."""
         settings = self._controller.settings
         state = self._controller.state
-        if state.rotors.gain_scale[joint] > _LIGHT:
+        if state.rotors.gain_scale[joint] > _LIGHT_INERTIA:
             return ''
         assumed = settings.rotors.rotor[joint]
         error = state.rotors.error[joint]
-        if assumed + error < _NOTHING * assumed:
+        if assumed + error < _NO_INERTIA * assumed:
             return (
                 '; it moves as if nothing were commanded: release the brakes, and activate the '
                 'effort controller'
@@ -260,7 +264,7 @@ class SampleCheck:
             controller.settings, self._estimates.estimate, q, rest, rest
         )[joint]
         sent, unit = sample.torque[joint], self._units[joint].torque
-        least = _AGAINST * controller.settings.torque.limit[joint]
+        least = _AGAINST_TORQUE * controller.settings.torque.limit[joint]
         is_against = -np.sign(sample.xi1[joint]) * (sent - model) > least
         if not is_against or (sent - model) * model < -least * abs(model):
             return ''
@@ -285,7 +289,7 @@ class SampleCheck:
         worst = int(np.argmax(needed - limit))
         self._cause.take_limited(worst)
         self.saturated += 1
-        self._saturation += _RELIEF * round(dt * 1e9)
+        self._saturation += _UNSATURATED_RELIEF * round(dt * 1e9)
         if self.saturated_time <= self._safety.saturation_time:
             return None
         unit = self._units[worst].torque

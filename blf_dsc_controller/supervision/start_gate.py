@@ -10,11 +10,11 @@ import numpy as np
 from blf_dsc_controller.supervision.state_check import rate_mismatch
 
 _INTERVALS = 10  # between states, measured ...
-_ALIKE = 1.5  # ... which may differ from the sample time by this factor ...
+_RATE_RATIO = 1.5  # ... which may differ from the sample time by this factor ...
 # ... at these quantiles: a busy computer loses states between two others
 _TYPICAL = 0.2, 0.5
 # checks without a newer state (0.2 s), after which a sender waits, or has paused
-_PATIENCE = 25
+_PATIENT_STATES = 25
 
 
 class GateState(Enum):
@@ -71,7 +71,7 @@ class StartGate:
         often, period = 1e-9 * np.quantile(np.diff(self._stamps), _TYPICAL)
         T = self._sample_time
         self.state = GateState.OPEN
-        if period <= T / _ALIKE or often >= T * _ALIKE:
+        if period <= T / _RATE_RATIO or often >= T * _RATE_RATIO:
             self.state = GateState.REFUSED
             self.problem = rate_mismatch(float(period), T)
 
@@ -80,7 +80,7 @@ class StartGate:
         if self.state is not GateState.MEASURING or not self._stamps:
             return False
         self._checks += 1
-        if self._checks < _PATIENCE:
+        if self._checks < _PATIENT_STATES:
             return False
         if len(self._stamps) > 1:
             self.restart()

@@ -20,11 +20,13 @@ from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
 _PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Franka's 30
-_REPEATS = 3  # states in a row with the stamp of the one before that are ignored
-_MOVING = 0.02  # rad/s: a slower motion shows no time
-_LESS = 0.5  # of the time by the stamps
-_CHANGED = 0.5  # of the speed: an arm whose clock was set keeps its own
-_AVERAGED = 1.0  # s, over which missed states are
+_IGNORED_REPEATS = (
+    3  # states in a row with the stamp of the one before that are ignored
+)
+_CLOCK_MOTION = 0.02  # rad/s: a slower motion shows no time
+_CLOCK_RATIO = 0.5  # of the time by the stamps
+_CLOCK_SPEED_RATIO = 0.5  # of the speed: an arm whose clock was set keeps its own
+_MISSED_TIME = 1.0  # s, over which missed states are
 
 SKIP = Fault(Reason.NONE, '')
 """Returned for a state to ignore."""
@@ -121,7 +123,7 @@ class StateCheck:
             return False
         self.repeated += 1
         self._repeats += 1
-        return self._repeats <= _REPEATS
+        return self._repeats <= _IGNORED_REPEATS
 
     def _check_repeats(self) -> Fault:
         if self.ignores(is_copy=True):
@@ -133,7 +135,7 @@ class StateCheck:
         return Fault(Reason.STAMP_REPEATED, text)
 
     def _count_missed(self, safety: Safety, missed: int) -> Fault | None:
-        keep = 1.0 - min(1.0, self._sample_time / _AVERAGED)
+        keep = 1.0 - min(1.0, self._sample_time / _MISSED_TIME)
         self.missed += missed
         self.missed_fraction *= keep
         if missed:
@@ -205,13 +207,13 @@ class StateCheck:
         if gap < LONG_GAP * self._sample_time:
             return None
         mean = 0.5 * (reading.dq + dq)
-        if np.abs(reading.dq - dq).max() > _CHANGED * np.abs(mean).max():
+        if np.abs(reading.dq - dq).max() > _CLOCK_SPEED_RATIO * np.abs(mean).max():
             return None
         speed = float(mean @ mean)
-        if not speed >= _MOVING**2:
+        if not speed >= _CLOCK_MOTION**2:
             return None  # also if it is not finite
         moved_for = float((reading.q - q) @ mean) / speed
-        if not moved_for <= _LESS * gap:
+        if not moved_for <= _CLOCK_RATIO * gap:
             return None
         text = (
             f'the stamp of a joint state is {gap:.4g} s after the last one, but the arm has moved '

@@ -34,17 +34,17 @@ from blf_dsc_controller.law.sensor import FILTER
 
 Vector = NDArray[np.float64]
 
-_TURNED = 0.25  # of a half wave, by which v turns back at its end
-_LASTING = 0.5  # of the half wave before
-_IN_A_ROW = 2
-_LEAST = 0.03  # rad/s, of a half wave
+_SWING_TURNED = 0.25  # of a half wave, by which v turns back at its end
+_SWING_RATIO = 0.5  # of the half wave before
+_SWINGS_IN_A_ROW = 2
+_LEAST_SWING = 0.03  # rad/s, of a half wave
 # likewise, of positions in the time of the low pass: standard deviations of the sensor's
 # noise, and its steps
-_CLEAR = 10.0
-_STEPS = 5.0
+_SWING_SIGMAS = 10.0
+_SWING_STEPS = 5.0
 # of the damping: a fifth of the inertia, behind a drive with a torque loop of gain 4
-_SMALLEST = 0.04
-_LONGEST = pi * FILTER  # s, half period at omega = 1/tau
+_LEAST_DAMPING = 0.04
+_LONGEST_SWING = pi * FILTER  # s, half period at omega = 1/tau
 
 
 class Swing:
@@ -97,15 +97,15 @@ class Swing:
         self._farthest[farther] = v[farther]
         self._farthest_at[farther] = self._since[farther]
         travel = np.abs(self._farthest - self._turn)
-        unsure = np.maximum(_CLEAR * np.sqrt(noise), _STEPS * resolution)
-        least = np.maximum(_LEAST, unsure / FILTER)
+        unsure = np.maximum(_SWING_SIGMAS * np.sqrt(noise), _SWING_STEPS * resolution)
+        least = np.maximum(_LEAST_SWING, unsure / FILTER)
         back = np.abs(v - self._farthest)
-        ends = back > np.maximum(0.5 * least, _TURNED * travel)
+        ends = back > np.maximum(0.5 * least, _SWING_TURNED * travel)
         if ends.any():
             self._end_half_waves(ends, travel, travel > least)
             self._farthest[ends] = v[ends]
             self._farthest_at[ends] = self._since[ends]
-        returns = (self._steady > _LONGEST) & (np.abs(v) > 0.5 * least)
+        returns = (self._steady > _LONGEST_SWING) & (np.abs(v) > 0.5 * least)
         if returns.any():
             self.share[returns] = np.minimum(1.0, 2.0 * self.share[returns])
             self._steady[returns] = 0.0
@@ -126,10 +126,10 @@ class Swing:
         half = np.maximum(self._farthest_at, self._half)
         returns = self._turn * self._farthest < 0.0
         lasts = ends & is_clear & returns & (self._half > 0.0)
-        lasts &= travel > _LASTING * self._travel
+        lasts &= travel > _SWING_RATIO * self._travel
         self._lasting[ends] = np.where(lasts, self._lasting + 1.0, 0.0)[ends]
-        swings = lasts & (self._lasting >= _IN_A_ROW) & (half < _LONGEST)
-        borne = np.maximum(_SMALLEST, self.share * (half / _LONGEST) ** 2)
+        swings = lasts & (self._lasting >= _SWINGS_IN_A_ROW) & (half < _LONGEST_SWING)
+        borne = np.maximum(_LEAST_DAMPING, self.share * (half / _LONGEST_SWING) ** 2)
         self.share[swings] = borne[swings]
         self.has_swung |= swings
         self._lasting[swings] = 0.0

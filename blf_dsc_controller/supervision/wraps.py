@@ -20,8 +20,8 @@ from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
 # s between two states, at most: later, the arm may have been moved by hand
-_IN_A_ROW = 0.1
-_MOST = 1000.0  # turns: a position farther away is not measured
+_WRAP_TIME = 0.1
+_MOST_TURNS = 1000.0  # turns: a position farther away is not measured
 
 
 class Wraps:
@@ -75,9 +75,9 @@ class Wraps:
         if not (np.abs(step) > pi).any():
             return None
         turns = -np.rint(np.nan_to_num(step, posinf=0.0, neginf=0.0) / tau)
-        turns[np.abs(turns) > _MOST] = 0.0
+        turns[np.abs(turns) > _MOST_TURNS] = 0.0
         moved = np.abs(step + tau * turns)
-        is_wrap = 0.0 < gap < _IN_A_ROW and moved <= fastest * gap
+        is_wrap = 0.0 < gap < _WRAP_TIME and moved <= fastest * gap
         at_fault = self._has_range & is_wrap & (turns != 0.0)
         self._next = self._offset + tau * turns * (self._is_free | at_fault)
         if not at_fault.any():
