@@ -45,6 +45,9 @@ RIPPLE = (
     '    actuator: {torque_limit: [60.0, 30.0], ripple: 0.004, ripple_cycles: 40.0}\n'
 )
 SLOW = 15.0  # s
+FILES = ('out', 'rippled')
+"""Of the gains, and of these with the ripple."""
+BAGS = ('proof/slow_motion', 'out_bags/posture_1')
 
 
 def shorten(monkeypatch):
@@ -81,7 +84,7 @@ def at(posture):
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory):
-    """Commission a robot with ripple; return its file, what was found and what was said."""
+    """Commission a robot with ripple, and prove its gains; return its file and what was said."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.syspath_prepend(Path(__file__).parent)
         shorten(monkeypatch)
@@ -90,18 +93,19 @@ def whole(tmp_path_factory):
         monkeypatch.setattr(
             'builtins.print', lambda *words, **_: told.append(' '.join(map(str, words)))
         )
-        chosen = []
-        choose = blf.Commissioning.result
-
-        def noted(*given):
-            chosen.append(choose(*given))
-            return chosen[-1]
-
-        monkeypatch.setattr(blf.Commissioning, 'result', noted)
-        assert commission(arm, '--robot', 'plant', '--ripple', '--yes', *at(NEAR)) == 0
-        (found,) = chosen
+        assert commission(arm, '--robot', 'plant', '--yes', *at(NEAR)) == 0
+        told.clear()
+        assert prove(arm, 'plant', 'proof') == 0
         calls = PlantDriver.last.calls
-    return SimpleNamespace(arm=arm, found=found, told='\n'.join(told), calls=calls)
+    return SimpleNamespace(arm=arm, told='\n'.join(told), calls=calls)
+
+
+def prove(arm, robot, folder):
+    """Prove the gains that were chosen, and look for ripple; return the exit code."""
+    gains = arm.with_name('out.yaml')
+    record = ('--record', str(arm.with_name(folder)))
+    options = ('--prove', '--ripple', '--robot', robot, '--yes', *record)
+    return commission(gains, *options, out='rippled.yaml')
 
 
 @pytest.fixture
@@ -115,93 +119,60 @@ def arm(tmp_path, monkeypatch):
 pytestmark = pytest.mark.usefixtures('blank_pictures')
 
 
-def cycles_of(path):
-    return blf.load_loop(path).controller.learning.ripple_cycles
-
-
-def test_robot_is_measured_proven_and_its_ripple_written(whole):
-    before, _, after = whole.told.partition('0 of 1 postures measured')
-    assert 'slow motion, for 16 s: joint1 -0.' in before
-    assert 'for 1.5 s in all, with 50% of the gains' in before
-    steps = [
-        after.find(each) for each in ('1 of 1 postures', '100% of', 'slow motion, for')
-    ]
-    assert steps == sorted(steps)
-    assert whole.calls == ['connect', *['start', 'finish'] * 10]
-    out = whole.arm.with_name('out.yaml')
-    (cycles,) = cycles_of(out)
+def test_gains_are_proven_and_the_ripple_added_to_their_file(whole):
+    """Once somebody has looked at them; the rest of the file stays."""
+    parts = (
+        *('slow motion, for 16 s: joint1 -0.', '100% of the gains: calm'),
+        *('error  expected', 'slow motion, for', 'is written as learning.ripple'),
+    )
+    at_part = 0
+    for part in parts:
+        at_part = whole.told.index(part, at_part)
+    assert whole.calls == ['connect', *['start', 'finish'] * 8]
+    gains, rippled = (whole.arm.with_name(f'{name}.yaml') for name in FILES)
+    before, after = (blf.load_loop(each).controller for each in (gains, rippled))
+    (cycles,) = after.learning.ripple_cycles
     assert cycles == pytest.approx(40.0, abs=0.5)
+    assert change(before, {'learning.ripple_cycles': [cycles]}) == after
     # the table and how sure it is, in the console and in the file
-    comment = out.read_text().partition('/**:')[0].replace('\n# ', ' ')
-    for text in (after.replace('\n', ' '), comment):
+    comment = rippled.read_text().partition('/**:')[0]
+    assert comment.startswith(gains.read_text().partition('/**:')[0])
+    for text in (whole.told.replace('\n', ' '), comment.replace('\n# ', ' ')):
         assert re.search(r'joint2 +0\.1\d+ \+- 0\.0\d+ N m at (39\.|40)', text)
         assert f'is written as learning.ripple_cycles: [{cycles:g}], by' in text
         assert 'the motion of 2 of 2 joints (joint1, joint2)' in text
-    assert 'is not measured' not in comment
 
 
 def test_bags_give_the_same_and_replay(whole, monkeypatch):
     shorten(monkeypatch)
-    folder = whole.arm.with_name('out_bags')
-    bags = [folder / name for name in ('slow_motion', 'posture_1')]
+    bags = [whole.arm.parent / name for name in BAGS]
     assert commission(whole.arm, *map(str, bags), out='again.yaml') == 0
-    first, again = (
-        blf.load_loop(whole.arm.with_name(name)).controller
-        for name in ('out.yaml', 'again.yaml')
+    proven, again = (
+        blf.load_loop(whole.arm.with_name(f'{name}.yaml')).controller
+        for name in ('rippled', 'again')
     )
-    assert again == first
+    assert again == proven
     assert blf.verify(bags[0]).difference is None
     # it is the motion of a loop of one's own
-    made = whole.found.slow_motion.config
-    assert read_content(bags[0]).controller_config() == made
+    found = blf.Commissioning(whole.arm).result([bags[1]])
+    assert read_content(bags[0]).controller_config() == found.slow_motion.config
 
 
-def test_ctrl_c_in_the_slow_motion_keeps_the_gains(whole, arm, capsys, monkeypatch):
-    """State 17000 is in it; the arm comes to rest."""
-    monkeypatch.setattr(proof, 'SHARES', (1.0,))
-    monkeypatch.setattr(blf.Commissioning, 'result', lambda *_: whole.found)
-    options = ('--robot', 'interrupt@17000', '--ripple', '--yes', *at(NEAR))
-    assert commission(arm, *options) == 130
-    told = capsys.readouterr()
-    out = arm.with_name('out.yaml')
-    assert 'slow motion: ended on request. The gains are proven; bags are' in told.err
-    assert f'Torque ripple was not measured; {out} has all else' in told.err
-    assert PlantDriver.last.calls[-1] == 'finish'
-    assert PlantDriver.last.velocity < 0.01  # rad/s
-    assert 'with a modulus margin' in Path(out).read_text()
-    assert cycles_of(out) == ()
-    comment = out.read_text().replace('\n# ', ' ')
-    assert 'torque ripple is not measured: the slow motion that shows it' in comment
-
-
-def test_gains_of_a_file_are_proven_and_its_ripple_added(whole, capsys, monkeypatch):
-    """Once somebody has looked at them; the rest of the file stays."""
+def test_ctrl_c_in_the_slow_motion_keeps_the_gains(whole, capsys, monkeypatch):
+    """State 9000 is in it; the arm comes to rest."""
     shorten(monkeypatch)
     monkeypatch.setattr(proof, 'SHARES', (1.0,))
     monkeypatch.syspath_prepend(whole.arm.parent)
-    gains = whole.arm.with_name('gains.yaml')
-    text = whole.arm.with_name('out.yaml').read_text()
-    gains.write_text(re.sub(r'.*(torque ripple|ripple_cycles).*\n', '', text))
-    folder = str(whole.arm.with_name('proof'))
-    words = ['--prove', '--ripple', '--robot', 'plant', '--yes', '--record', folder]
-    assert commission(gains, *words, out='gains.yaml') == 1  # exists
-    assert 'exists already' in capsys.readouterr().err
-    assert commission(gains, *words, out='rippled.yaml') == 0
-    told = capsys.readouterr().out
-    assert told.index('slow motion, for 16 s') < told.index('100% of the gains: calm')
-    assert told.index('error  expected') < told.index('is written as learning.ripple')
-    before, after = (
-        blf.load_loop(whole.arm.with_name(name)).controller
-        for name in ('gains.yaml', 'rippled.yaml')
-    )
-    (cycles,) = after.learning.ripple_cycles
-    assert cycles == pytest.approx(40.0, abs=0.5)
-    assert change(before, {'learning.ripple_cycles': [cycles]}) == after
-    comment = whole.arm.with_name('rippled.yaml').read_text().partition('/**:')[0]
-    assert comment.startswith(gains.read_text().partition('/**:')[0])
-    assert (
-        f'# torque ripple is written as learning.ripple_cycles: [{cycles:g}]' in comment
-    )
+    gains, rippled = (whole.arm.with_name(f'{name}.yaml') for name in FILES)
+    rippled.rename(whole.arm.with_name('kept.yaml'))
+    assert prove(whole.arm, 'interrupt@9000', 'ended') == 130
+    assert not rippled.exists()
+    whole.arm.with_name('kept.yaml').rename(rippled)
+    told = capsys.readouterr().err
+    assert 'slow motion: ended on request. The gains are proven; bags are' in told
+    assert f'Torque ripple was not measured; {gains} has all else' in told
+    assert PlantDriver.last.calls[-1] == 'finish'
+    assert PlantDriver.last.velocity < 0.01  # rad/s
 
 
 @pytest.mark.parametrize(
@@ -209,6 +180,7 @@ def test_gains_of_a_file_are_proven_and_its_ripple_added(whole, capsys, monkeypa
     [
         (['--write', 'm.yaml'], 'and --write measures nothing: leave out'),
         (['--robot', 'plant', '--prove'], 'feedback.joint_stiffness is empty: prove'),
+        (['--robot', 'plant'], 'then give --prove --ripple with the file that is'),
         (['bag'], '--ripple makes a motion, and its bag needs no option'),
     ],
 )
@@ -217,7 +189,7 @@ def test_ripple_that_cannot_be_found_so_is_refused(given, told, arm, capsys):
     assert told in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('robot', [[], ['--robot', 'plant', '--yes']])
+@pytest.mark.parametrize('robot', [[], ['--robot', 'plant', '--yes', '--prove']])
 def test_reference_without_tones_is_refused_before_anything_moves(robot, arm, capsys):
     arm.write_text(arm.read_text().replace('{type: sinusoids', '{type: hold'))
     PlantDriver.last = None

@@ -261,8 +261,8 @@ _COMMISSION = Command(
         ),
         option(
             '--ripple',
-            'also prove the gains, find the torque ripple of the drives in a slow motion of a '
-            'minute that does not repeat, and write learning.ripple_cycles; with --prove, to --out',
+            'also find the torque ripple of the drives in a slow motion of a minute that does not '
+            'repeat, and write learning.ripple_cycles to --out; of a robot with --prove',
             action='store_true',
         ),
         option(

@@ -5,15 +5,12 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 from blf_dsc_controller.cli.commission_ripple import (
     after_proof,
-    before_start,
-    on_robot,
     on_simulated,
 )
 from blf_dsc_controller.cli.commission_robot import (
@@ -24,7 +21,7 @@ from blf_dsc_controller.cli.commission_robot import (
     proven,
     robot,
 )
-from blf_dsc_controller.cli.commissioned_file import CommissionedFile, Content
+from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.cli.ros_check import require_ros
@@ -131,58 +128,12 @@ def _by_runs(options: Namespace, path: Path, commissioning: Commissioning) -> in
 def _on_robot(options: Namespace, path: Path, commissioning: Commissioning) -> int:
     """Commission a robot, with the bags that are given, too."""
     runs = _given(options, commissioning.config)
-    after: list[str] = []
-    if options.ripple:
-        after = [*before_start(options, commissioning.config)]
     with _arm(options, path, commissioning) as arm:
-        measured = measured_on(options, arm, commissioning, after)
-        if options.ripple:
-            given = options, path, arm, commissioning, runs, measured
-            code = _still_held(lambda: _with_ripple(*given))
-            arm.hold_after()
-            return code
+        measured = measured_on(options, arm, commissioning)
         arm.hold_after()
     runs += [(name, measured_in(bag)) for name, bag in measured]
     found = _chosen(commissioning, runs)
     return _written(_file(options, path), found, _names(commissioning, runs))
-
-
-def _with_ripple(
-    options: Namespace,
-    path: Path,
-    arm: PostureByPosture,
-    commissioning: Commissioning,
-    given: Runs,
-    measured: Sequence[tuple[str, Path]],
-) -> int:
-    """Choose the gains of a robot that rests, prove them, and find the torque ripple.
-
-    Return the exit code.
-    """
-    slow = [Path(name) for name, run in given if commissioning.is_slow_motion(run)]
-    names = _names(commissioning, given) + [name for name, _ in measured]
-    bags = [*options.bags, *(bag for _, bag in measured)]
-    file = _file(options, path)
-    print_notice(_CHOOSING)
-    found = arm.aside(commissioning.result, bags)
-    if code := _written(file, found, names, arm.aside):
-        return code
-    on_robot(arm, file, found, slow)
-    return 0
-
-
-def _still_held(work: Callable[[], int]) -> int:
-    """Return the exit code of work beside an arm that is held; an error is printed.
-
-    Raises EndedError if the arm is not to be held any more.
-    """
-    try:
-        return work()
-    except EndedError:
-        raise
-    except BlfDscError as error:
-        print(f'blf_dsc commission: {error}', file=sys.stderr)
-        return 1
 
 
 def _chosen(commissioning: Commissioning, runs: Runs) -> Commissioned:
@@ -192,27 +143,15 @@ def _chosen(commissioning: Commissioning, runs: Runs) -> Commissioned:
     return commissioning.result([run for _, run in runs], names)
 
 
-def _at_once(compute: Callable[..., Any], *given: object) -> Any:
-    return compute(*given)
-
-
-def _written(
-    file: CommissionedFile,
-    found: Commissioned,
-    names: Sequence[str],
-    aside: Callable[..., Any] = _at_once,
-) -> int:
-    """Print, draw and write what was found, by runs of these names; return the exit code.
-
-    What takes long is computed `aside`.
-    """
+def _written(file: CommissionedFile, found: Commissioned, names: Sequence[str]) -> int:
+    """Print, draw and write what was found, by runs of these names; return the exit code."""
     print(page.table(found))  # also if the gains are too soft for any bound: an error
     if found.ripples:
         print(f'\n{ripple_page.ripple_table(found.before, found.ripples)}')
-    content: Content = aside(file.content, found)
+    content = file.content(found)
     print('\n'.join(['', *content.lines]))
     picture = _picture(file.path)
-    aside(draw, found, names, picture)
+    draw(found, names, picture)
     print(f'wrote {picture}')
     if not found.has_margin:
         print(f'not written: {file.path}')
@@ -283,10 +222,14 @@ def _check(options: Namespace) -> None:
             '--ripple is found with the gains that are chosen, and --write measures nothing: leave '
             'out one of them'
         )
-    if options.ripple and options.bags and not is_robot:
+    if options.ripple and options.bags:
         raise BlfDscError(
-            '--ripple makes a motion, and its bag needs no option: give --robot or --ros, too, or '
-            'leave out --ripple'
+            '--ripple makes a motion, and its bag needs no option: leave out --ripple'
+        )
+    if options.ripple and is_robot and not options.prove:
+        raise BlfDscError(
+            '--ripple moves a robot with gains that are proven: measure it without --ripple, and '
+            'then give --prove --ripple with the file that is written'
         )
     if not is_robot and (options.yes or options.record):
         raise BlfDscError(
@@ -335,15 +278,10 @@ def _prove_on_robot(
         before.append(ripple_page.description(slow_motion(config)))
     with _arm(options, path, commissioning) as arm:
         ask(options, before)
-        found = proven(arm, planned, config)
-        if options.ripple:
-            print_proof(config, *found)
-            code = _still_held(lambda: after_proof(options, arm, config, path))
-            arm.hold_after()
-            return code
+        print_proof(config, *proven(arm, planned, config))
+        code = after_proof(options, arm, config, path) if options.ripple else 0
         arm.hold_after()
-    print_proof(config, *found)
-    return 0
+    return code
 
 
 def _write_motions(

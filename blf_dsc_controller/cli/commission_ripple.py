@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`blf_dsc commission --ripple`: the slow motion that shows torque ripple, and what it shows.
 
-The file with the gains is written before, so an end before its time costs the ripple alone.
+On a robot it follows a proof. The file with the gains exists before, so an end before its time
+costs the ripple alone.
 """
 
 from __future__ import annotations
@@ -13,11 +14,6 @@ from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 
-from blf_dsc_controller.cli.commission_robot import (
-    of_proof,
-    print_proof,
-    proven,
-)
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile, wrapped
 from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.commissioning import files, ripple_page, simulated
@@ -25,46 +21,15 @@ from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.commissioning.postures import (
     EndedError,
     PostureByPosture,
-    ripples_by_bags,
+    ripples_by_bag,
 )
-from blf_dsc_controller.commissioning.proof import Step, steps
 from blf_dsc_controller.commissioning.ripple import ripples_in, to_learn
-from blf_dsc_controller.commissioning.slow_motion import SlowMotion, slow_motion
+from blf_dsc_controller.commissioning.slow_motion import slow_motion
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import dump, load_loop, read
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.progress import print_notice
-
-
-def before_start(options: Namespace, config: ControllerConfig) -> Iterator[str]:
-    """Yield what an arm does once it is measured: the proof, and the slow motion."""
-    yield 'then the gains are chosen, which takes some ten seconds; the arm rests'
-    yield from of_proof(options, config)
-    yield ripple_page.description(slow_motion(config))
-
-
-def on_robot(
-    arm: PostureByPosture,
-    file: CommissionedFile,
-    found: Commissioned,
-    slow_bags: Sequence[Path],
-) -> None:
-    """Prove the gains that are in a file, make the slow motion and write what it shows.
-
-    `slow_bags` are other runs of it.
-
-    Raises EndedError or BlfDscError, which say that torque ripple was not measured.
-    """
-    with _without_ripple(file.path):
-        planned, motion = arm.aside(_planned, found)
-        print_proof(motion.config, *proven(arm, planned, motion.config))
-        ripples = _measured(arm, motion, slow_bags)
-        found = found._replace(ripples=ripples)
-        content = arm.aside(file.content, found)
-    file.write(found, content)
-    _tell(found.before, ripples)
-    print(f'wrote {file.path}')
 
 
 def after_proof(
@@ -73,11 +38,18 @@ def after_proof(
     """Make the slow motion with gains that are proven, and write what it shows.
 
     `source` is the file that has them; with a ripple, it is written anew.  Return the exit code.
+    An error is printed, since the arm is still to be held.
 
-    Raises as `on_robot`.
+    Raises EndedError if it is not.
     """
-    with _without_ripple(source):
-        ripples = _measured(arm, arm.aside(slow_motion, config), ())
+    try:
+        with _without_ripple(source):
+            ripples = _measured(arm, config)
+    except EndedError:
+        raise
+    except BlfDscError as error:
+        print(f'blf_dsc commission: {error}', file=sys.stderr)
+        return 1
     _tell(config, ripples)
     if listed := to_learn(ripples):
         sections = files.with_ripple(read(source), [each.cycles for each in listed])
@@ -95,14 +67,13 @@ def _comment(path: Path) -> Iterator[str]:
         yield from takewhile(lambda line: line.startswith('#'), lines)
 
 
-def _measured(
-    arm: PostureByPosture, motion: SlowMotion, others: Sequence[Path]
-) -> tuple[Ripples, ...]:
-    """Return what a slow motion shows, with the bags of others."""
+def _measured(arm: PostureByPosture, config: ControllerConfig) -> tuple[Ripples, ...]:
+    """Return what the slow motion of a configuration shows."""
+    motion = arm.aside(slow_motion, config)
     print(ripple_page.description(motion), flush=True)
     bag = arm.slow(motion)
     print_notice('looking for torque ripple in it: some seconds')
-    return arm.aside(ripples_by_bags, [*others, bag])
+    return arm.aside(ripples_by_bag, bag)
 
 
 def on_simulated(file: CommissionedFile, found: Commissioned, stop: str) -> int:
@@ -144,12 +115,6 @@ def _without_ripple(path: Path) -> Iterator[None]:
         raise EndedError(error.end, f'{error}. {left}') from error
     except BlfDscError as error:
         raise BlfDscError(f'{error}. {left}') from error
-
-
-def _planned(found: Commissioned) -> tuple[list[Step], SlowMotion]:
-    """Return the steps of the proof, and the motion after them."""
-    config = found.config
-    return steps(config), slow_motion(config)
 
 
 def _tell(config: ControllerConfig, ripples: Sequence[Ripples]) -> None:

@@ -78,11 +78,8 @@ def measured_on(
     options: Namespace,
     arm: PostureByPosture,
     commissioning: Commissioning,
-    after: Iterable[str] = (),
 ) -> list[tuple[str, Path]]:
     """Measure a robot, and return for each posture its name and its bag.
-
-    `after` says what follows.
 
     Raises:
         EndedError: it ended before its time.
@@ -90,7 +87,7 @@ def measured_on(
     """
     planned = commissioning.motions_from(arm.position())
     duration = arm.duration(planned)
-    ask(options, [*_limits(options, commissioning, planned, duration), *after])
+    ask(options, _limits(options, commissioning, planned, duration))
     return list(_followed(arm, planned))
 
 

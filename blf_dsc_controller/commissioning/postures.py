@@ -130,12 +130,12 @@ def better_known_by_bag(
     return commissioning.better_known(planned, measured_in(bag).run)
 
 
-def ripples_by_bags(bags: Sequence[Path]) -> tuple[Ripples, ...]:
-    """Return the torque ripple of each joint by bags of a slow motion.
+def ripples_by_bag(bag: Path) -> tuple[Ripples, ...]:
+    """Return the torque ripple of each joint by the bag of a slow motion.
 
     Raises BlfDscError as `ripples_in`.
     """
-    return ripples_in([measured_in(bag) for bag in bags])
+    return ripples_in([measured_in(bag)])
 
 
 def check(bag: Path) -> None:
