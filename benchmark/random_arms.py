@@ -68,7 +68,7 @@ from blf_dsc_controller.studies.distributions import parse
 from blf_dsc_controller.studies.laws import COMPUTED_TORQUE
 from blf_dsc_controller.studies.monte_carlo import Study, draw, plant_with
 from blf_dsc_controller.studies.variations import Variation
-from blf_dsc_controller.warnings.stability import linear_feedback
+from blf_dsc_controller.warnings.expected_errors import linear_feedback
 
 SECONDS = 11.0
 BEGIN, PICK_UP, SETTLED = 3.0, 6.0, 9.0  # s

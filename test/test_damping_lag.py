@@ -11,7 +11,7 @@ import pytest
 import blf_dsc_controller as blf
 from benchmark import random_arms
 from blf_dsc_controller.arms.linear_loop import law_responses
-from blf_dsc_controller.warnings.stability import linear_feedback
+from blf_dsc_controller.warnings.expected_errors import linear_feedback
 
 T = 0.001  # s
 LATE = 100.0  # s, when bounds have narrowed

@@ -19,7 +19,7 @@ from blf_dsc_controller import (
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.warnings.table import config_warnings
+from blf_dsc_controller.warnings.table import config_warnings, worsened
 
 UR5E = {'robot.urdf': 'ur5e.urdf', 'robot.tip': 'tool0'}
 GAINS = {
@@ -159,6 +159,28 @@ def test_gains_that_no_arm_bears_are_not_simulated_unless_they_are_insisted_on()
         simulate(of_readme(9000.0, 60.0), plant)
     insisted = of_readme(9000.0, 60.0, insist=['feedback.stiffness'])
     assert simulate(insisted, plant).run().time.size
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'said'),
+    [
+        ({}, {'feedback.stiffness': 1.1}, ''),
+        ({}, {'feedback.stiffness': 4.0}, 'oscillates at'),
+        ({'feedback.stiffness': 4.0}, {'feedback.stiffness': 3.9}, ''),
+        ({'feedback.stiffness': 4.0}, {'feedback.stiffness': 5.0}, 'oscillates at'),
+        (
+            {},
+            {'feedback.stiffness': 8.0},
+            'list feedback.stiffness in insist',
+        ),
+    ],
+)
+def test_other_gains_of_a_running_law_make_no_loop_unstable(before, after, said):
+    """Gains of a file with a warning may be changed back."""
+    running = built(**GAINS, **before)
+    found = worsened(running, change(running, after))
+    assert bool(found) == bool(said)
+    assert all(said in text for text in found)
 
 
 def test_adaptation_integrates_no_faster_than_the_disturbance_estimate():

@@ -48,13 +48,21 @@ _BISECTIONS = 8
 class Gears(NamedTuple):
     """Gears and drives: stiffness (n,) [N m/rad], and the inertia that the drives add."""
 
-    stiffness: Floats
+    stiffness: Floats | None  # None: rigid
     motors: Floats  # (n,) kg m^2, as the torques see them
     viscous: Floats  # (n,) N m s/rad
     has_torque_loop: bool
+    unknown: Floats | None = (
+        None  # (n,) kg m^2, what rigid drives may be beyond a guess
+    )
 
     def variants(self) -> tuple[Joints, ...]:
         """Return the joints that these may be."""
+        if self.stiffness is None:
+            guessed = Joints(motors=self.motors, viscous=self.viscous)
+            if self.unknown is None:
+                return (guessed,)
+            return guessed, guessed._replace(motors=self.motors + self.unknown)
         loop = TorqueLoop() if self.has_torque_loop else None
         hidden = 1.0 + (loop.gain if loop else 0.0)
         sides = (False,) if loop else (False, True)  # the sensors are at the links
@@ -82,14 +90,21 @@ class GearedArm(NamedTuple):
     def inertia(self) -> Floats:
         """The largest inertia (n,) [kg m^2] of each joint."""
         links = np.diagonal(self.links, axis1=1, axis2=2).max(axis=0)
-        return np.asarray(links + self.gears.motors)
+        inertia = links + self.gears.motors
+        if self.gears.unknown is not None:
+            inertia = inertia + self.gears.unknown
+        return np.asarray(inertia)
+
+    def loops(self, feedback: Feedback) -> list[Loop]:
+        """Return the loops of a law with the gears that these may be."""
+        return [
+            Loop(self.links, joints, self.timing, feedback)
+            for joints in self.gears.variants()
+        ]
 
     def margin(self, feedback: Feedback) -> Margin:
         """Return the least modulus margin of a law."""
-        return min(
-            Loop(self.links, joints, self.timing, feedback).margin()
-            for joints in self.gears.variants()
-        )
+        return min(loop.margin() for loop in self.loops(feedback))
 
     def joint_gains(self) -> JointGains:
         """Return the stiffest gains of joints, each on its own, with the margin."""

@@ -30,11 +30,9 @@ from blf_dsc_controller.configuration.nodes import (
     locate,
 )
 from blf_dsc_controller.drive.drivers import is_in_network
-from blf_dsc_controller.drive.motor_feedback import as_in_motors
+from blf_dsc_controller.drive.motor_feedback import robot_warnings
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
-from blf_dsc_controller.warnings.not_commissioned import not_commissioned
-from blf_dsc_controller.warnings.table import config_warnings
 
 _NEEDED = ('numpy', 'scipy', 'numba', 'mcap', 'rosbags', 'matplotlib')
 _EXTRAS = {
@@ -163,10 +161,9 @@ def _configuration(path: str) -> Iterator[Finding]:
         file = locate(path)
         config = load(file, CONTROLLER, ControllerConfig)
         in_motors = load(file, DRIVE, DriveConfig).feedback == 'motor'
-        judged = as_in_motors(config) if in_motors else config
-        unmeasured = not_commissioned(config, in_motors=in_motors)
-        found = unmeasured, ignored_in(file, (CONTROLLER, DRIVE))
-        warnings = [*config_warnings(judged), *filter(None, found)]
+        warnings = robot_warnings(config, in_motors=in_motors)
+        if ignored := ignored_in(file, (CONTROLLER, DRIVE)):
+            warnings.append(ignored)
     except BlfDscError as error:
         yield problem('config', str(error))
         return

@@ -32,14 +32,16 @@ from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
-from blf_dsc_controller.drive.motor_feedback import as_in_motors, closed_in_motors
+from blf_dsc_controller.drive.motor_feedback import (
+    as_in_motors,
+    closed_in_motors,
+    robot_warnings,
+)
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.warnings.expected_errors import expectation
-from blf_dsc_controller.warnings.not_commissioned import not_commissioned
-from blf_dsc_controller.warnings.table import config_warnings
 
 CODES = {
     End.DURATION: 0,
@@ -108,12 +110,11 @@ def drive(options: Namespace) -> int:
 def _say_before(config: ControllerConfig, driver: Driver) -> None:
     """Print the warnings, the errors to expect, and where waypoints end."""
     in_motors = driver.config.feedback == 'motor'
-    unmeasured = not_commissioned(config, in_motors=in_motors)
-    judged = as_in_motors(config) if in_motors else config
-    for warning in [*config_warnings(judged), *([unmeasured] if unmeasured else [])]:
+    for warning in robot_warnings(config, in_motors=in_motors):
         print_notice(f'warning: {warning}')
     if config.model == 'urdf':
-        print(f'errors to expect: {expectation(judged)}')
+        loop = as_in_motors(config) if in_motors else config
+        print(f'errors to expect: {expectation(loop)}')
     if end := end_of_waypoints(config):
         print(end)
 

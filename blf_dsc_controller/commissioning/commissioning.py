@@ -43,11 +43,10 @@ from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import Run
-from blf_dsc_controller.warnings.stability import refuse_unstable
+from blf_dsc_controller.warnings.table import refuse
 
 REPEATS = 2
 """How often a posture is measured again at most: softer, with swings, or with more torque."""
@@ -113,7 +112,7 @@ class Commissioning:
                 raise BlfDscError(f'{name}: got {given:g}, but it must be above 0')
         if not isinstance(config, ControllerConfig):
             config = load(locate(config), CONTROLLER, ControllerConfig)
-        refuse_unstable(config, settings_of_config(config))
+        refuse(config)
         self.config = config
         self.margin = margin
         self._lags = lags

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from blf_dsc_controller.configuration import law_file
-from blf_dsc_controller.configuration.checked import Checked
 from blf_dsc_controller.configuration.schema import format_value, suggestion
 from blf_dsc_controller.errors import BlfDscError
 
@@ -30,12 +29,11 @@ LAWS = (OWN, *law_file.PACKAGED)
 """Laws that are found by their name; the first is the default."""
 
 
-def traits_of(config: Checked) -> Traits:
-    """Return what the law of a configuration does; that of a file says so itself."""
-    if not law_file.has_file(config.law):
+def traits_of(name: str, gains: Any) -> Traits:
+    """Return what a law does; that of a file, which has a group of gains, says so itself."""
+    if not law_file.has_file(name):
         return Traits(has_barrier=True, learns=True)
-    gains = dataclasses.asdict(getattr(config, law_file.GROUP))
-    law = law_file.load_law(config.law)(**gains)
+    law = law_file.load_law(name)(**dataclasses.asdict(gains))
     return Traits(bool(law.has_barrier), bool(getattr(law, 'learns', False)))
 
 

@@ -22,6 +22,12 @@ from blf_dsc_controller.configuration.robot import (
     described,
     given_robot,
 )
+from blf_dsc_controller.configuration.rules import (
+    Finding,
+    Severity,
+    When,
+    findings,
+)
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Value,
@@ -395,7 +401,7 @@ class PlantConfig(ArmConfig):
             ),
         }
 
-    def problems(self) -> Iterator[str]:
+    def problems(self) -> Iterator[Finding]:
         """Check the joints, the sample time and the duration."""
         yield from self.arm_problems(
             'the simulated arm', None if self.robot.urdf else 2
@@ -419,12 +425,8 @@ class PlantConfig(ArmConfig):
                 f'duration: got {self.duration:g} s, shorter than one sample of '
                 f'{self.sample_time:g} s (0 runs until stopped)'
             )
-        yield from plausibility.problems_of_plant(
-            self,
-            resolution=self.sensor.resolution,
-            noise=self.sensor.position_noise,
-            lag=self.actuator.time_constant,
-        )
+        rules = (plausibility.INSISTED, *plausibility.OF_PLANT)
+        yield from findings(rules, self, When.LOAD, Severity.REFUSE, self.insist)
 
     def _spring_problems(self) -> Iterator[str]:
         """Check what springs, their loop and a base need."""

@@ -9,42 +9,27 @@ listed in `insist`: nobody should have to find out in motion that a bound was in
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from itertools import islice
+from typing import Any
 
 import numpy as np
 
 from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT, WIDEST
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.configuration.checked import Checked
+from blf_dsc_controller.configuration.controller_parameters import (
+    ControllerParameters,
+)
 from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
-from blf_dsc_controller.configuration.robot import ArmConfig, Robot
+from blf_dsc_controller.configuration.robot import ArmConfig
+from blf_dsc_controller.configuration.rules import Rule, Severity, When
 from blf_dsc_controller.configuration.schema import suggestion
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.run import joint_units
 
-CHECKED = (
-    'feedback.stiffness',
-    'torque.limit',
-    'safety.velocity_limit',
-    'limits.velocity',
-    'limits.position_lower',
-    'limits.position_upper',
-    'barrier.bound',
-    POSITION,
-    ANGLE,
-    'robot.gravity',
-    'robot.payload',
-    'robot.drive_payload',
-    'robot.drive_payload_centre',
-    'robot.rotor_inertia',
-    'robot.coulomb',
-    'robot.viscous',
-    'sensor.resolution',
-    'sensor.position_noise',
-    'actuator.time_constant',
-)
-"""Parameters whose values are compared with the arm; gains, at the start."""
+STIFFNESS = 'feedback.stiffness'
+"""The parameter of gains that are too high; listed in `insist`, they are not refused."""
 
 _ROUNDED = 1.001  # defaults have four digits
 _BROKEN = 10.0  # times the speed of the fastest joint: no measurement
@@ -59,125 +44,150 @@ LONGEST_LAG = 0.1
 """Lag [s] that is too long for any loop; drivers have up to 0.03."""
 
 
-class _Doubt(NamedTuple):
-    """A value that cannot be meant."""
-
-    name: str  # of its parameter
-    text: str  # what it got, what the arm allows, and what may be meant
+def of_urdf(config: Any) -> bool:
+    """Whether the arm is that of a URDF."""
+    return bool(config.robot.urdf)
 
 
-def problems_of_controller(config: Checked) -> Iterator[str]:
-    """Yield what no arm can mean among the parameters of a controller."""
-    yield from _unknown_words(config.insist)
-    chain = None
-    if config.model == 'urdf':
-        chain = config.robot.chain(config.joints)
-        of_robot = list(_refused(_of_robot(config.robot, chain), config.insist))
-        if of_robot:  # from which the others follow
-            yield from of_robot
-            return
-    yield from _refused(_of_controller(config, chain), config.insist)
+def _row(
+    name: str,
+    find: Callable[[Any], Iterable[str]],
+    applies: Callable[[Any], bool] = of_urdf,
+) -> Rule:
+    """Return the rule for a value, of the first joint whose value is implausible."""
 
-
-def _of_controller(config: Checked, chain: Chain | None) -> Iterator[_Doubt]:
-    yield from _of_velocity(config, chain)
-    yield from _of_errors(config)
-    if chain is not None:
-        yield from _of_drives(config, chain)
-        yield from _of_ranges(config, chain)
-        yield from _of_tool(config, chain)
-
-
-def problems_of_plant(
-    config: ArmConfig, *, resolution: float, noise: float, lag: float
-) -> Iterator[str]:
-    """Yield what no arm can mean among the parameters of a simulated one.
-
-    They are `sensor.resolution`, `sensor.position_noise` [rad] and
-    `actuator.time_constant` [s].
-    """
-    yield from _unknown_words(config.insist)
-    doubts = _of_sensors(config, resolution, noise, lag)
-    yield from _refused(doubts, config.insist)
-
-
-def _unknown_words(insist: Iterable[str]) -> Iterator[str]:
-    """Yield a problem for each entry of `insist` whose value is not checked."""
-    for name in insist:
-        if name not in CHECKED:
-            yield (
-                f'insist: got {name}, whose value is not compared with the arm'
-                f'{suggestion(name, CHECKED)}'
-            )
-
-
-def _refused(doubts: Iterable[_Doubt], insist: Sequence[str]) -> Iterator[str]:
-    """Yield the problem of each parameter, of the first joint that it has one for."""
-    first: dict[str, str] = {}
-    for name, text in doubts:
-        first.setdefault(name, text)
-    for name, text in first.items():
-        if name not in insist:
+    def found(config: Any) -> Iterator[str]:
+        for text in islice(find(config), 1):
             yield f'{name}: {text}; if it is meant, list {name} in insist'
 
-
-def _of_drives(config: Checked, chain: Chain) -> Iterator[_Doubt]:
-    """Check torques against the efforts of the drives."""
-    strongest = config.robot.largest_efforts(chain).clip(UNKNOWN_EFFORT).tolist()
-    for joint, (_, unit, _), limit, most in zip(
-        chain.joints, config.units, config.torque.limit, strongest, strict=True
-    ):
-        allowed = joint.effort
-        source = 'the URDF gives its drive'
-        if math.isinf(allowed):
-            allowed = most
-            source = 'no drive of an arm of this weight has more than'
-        if limit > _ROUNDED * allowed:
-            text = f'got {limit:g} {unit} for {joint.name}, but {source} {allowed:.4g} {unit}'
-            yield _Doubt('torque.limit', text)
+    return Rule(name, When.LOAD, Severity.REFUSE, found, applies, can_insist=True)
 
 
-def _of_velocity(config: Checked, chain: Chain | None) -> Iterator[_Doubt]:
-    """Check the speeds to stop at against those of the joints."""
-    limit = max(config.safety.velocity_limit)
-    motions = config.limits.velocity
-    unlimited = [math.inf] * len(motions)
-    speeds = [joint.velocity for joint in chain.joints] if chain else unlimited
-    pairs = list(zip(speeds, motions, strict=True))
-    known = max((speed for speed, _ in pairs if math.isfinite(speed)), default=0.0)
-    assumed = max((motion for speed, motion in pairs if math.isinf(speed)), default=0.0)
-    if limit > max(_BROKEN * known, _UNKNOWN * assumed):
-        fastest, source = (assumed, ' (limits.velocity)') if assumed else (known, '')
-        yield _Doubt(
-            'safety.velocity_limit',
-            f'got {limit:g} rad/s, but the fastest joint has {fastest:.3g} rad/s{source}: '
-            f'{_of_degrees(limit)}',
-        )
+def _number(
+    name: str,
+    unit: str,
+    values: Callable[[Any], tuple[Any, float]],
+    why: str,
+    other: str,
+    factor: float | Callable[[float], float] = 1e-3,
+    applies: Callable[[Any], bool] = of_urdf,
+) -> Rule:
+    """Return the rule for a number, or for the length of a vector.
 
+    `values` are what it is and the most it may be, `factor` leads from the other unit.
+    """
 
-def _of_ranges(config: Checked, chain: Chain) -> Iterator[_Doubt]:
-    """Check the limits of motions against those of the URDF."""
-    limits = config.limits
-    for joint, fastest in zip(chain.joints, limits.velocity, strict=True):
-        if fastest > _ROUNDED * joint.velocity:
-            yield _Doubt(
-                'limits.velocity',
-                f'got {fastest:g} for {joint.name}, but the URDF allows '
-                f'{joint.velocity:g}: {_unit_of(joint.kind, fastest)}',
+    def convert(value: float) -> float:
+        return factor * value if isinstance(factor, float) else factor(value)
+
+    def find(config: Any) -> Iterator[str]:
+        value, most = values(config)
+        size = float(np.linalg.norm(value))
+        if size > most:
+            meant = f'{convert(size):.3g}'
+            if isinstance(value, tuple):
+                meant = str([convert(each) for each in value])
+            yield (
+                f'got {size:.4g} {unit}, but {why} {most:.3g} {unit}: is it in {other}? '
+                f'Give {meant}'
             )
-    for joint, lower, upper in zip(
-        chain.joints, limits.position_lower, limits.position_upper, strict=True
+
+    return _row(name, find, applies)
+
+
+def _degrees(kind: str, value: float) -> str:
+    """Ask whether a value of a joint is of another unit."""
+    if kind == 'prismatic':
+        return f': is it in mm? Give {1e-3 * value:g}'
+    return f': is it in degrees? Give {math.radians(value):.3g}'
+
+
+def _mrad(kind: str, value: float) -> str:
+    also = '' if kind == 'prismatic' else f'; in mrad? Give {1e-3 * value:g}'
+    return _degrees(kind, value) + also
+
+
+def _beyond(
+    config: ArmConfig,
+    values: Iterable[float],
+    allowed: Iterable[float],
+    why: str,
+    unit: str = 'rad',
+    hint: Callable[[str, float], str] = lambda _kind, _value: '',
+    sign: float = 1.0,
+) -> Iterator[str]:
+    """Yield which joints have more than is allowed, or less with a `sign` of -1."""
+    kinds = config.robot.kinds(config.joints)
+    for joint, kind, value, most in zip(
+        config.joints, kinds, values, allowed, strict=False
     ):
-        for name, value, is_past in (
-            ('limits.position_lower', lower, lower < joint.lower - PAST_LIMITS),
-            ('limits.position_upper', upper, upper > joint.upper + PAST_LIMITS),
-        ):
-            if is_past:
-                yield _Doubt(
-                    name,
-                    f'got {value:g} for {joint.name}, whose range in the URDF is '
-                    f'{joint.lower:g} to {joint.upper:g}: {_unit_of(joint.kind, value)}',
-                )
+        if sign * value > _ROUNDED * sign * most:
+            own = joint_units(kind).of(unit)
+            yield (
+                f'got {value:g} {own} for {joint}, but {why} {most:.4g} {own}'
+                f'{hint(kind, value)}'
+            )
+
+
+def _torques(config: ControllerParameters) -> Iterator[str]:
+    """Check torques against the efforts of the drives."""
+    chain = config.robot.chain(config.joints)
+    strongest = config.robot.largest_efforts(chain).clip(UNKNOWN_EFFORT).tolist()
+    efforts = [joint.effort for joint in chain.joints]
+    unknown = np.where(np.isinf(efforts), strongest, math.inf).tolist()
+    compare = partial(_beyond, config, config.torque.limit, unit='N m')
+    yield from compare(efforts, 'the URDF gives its drive')
+    yield from compare(unknown, 'no drive of an arm of this weight has more than')
+
+
+def _fastest(config: ControllerParameters) -> tuple[float, float]:
+    """Return the speed to stop at, and the most that it may be [rad/s]."""
+    motions = config.limits.velocity
+    speeds = [math.inf] * len(motions)
+    if config.robot.urdf:
+        joints = config.robot.chain(config.joints).joints
+        speeds = [joint.velocity for joint in joints]
+    known = [speed for speed in speeds if math.isfinite(speed)]
+    assumed = [
+        motion
+        for motion, speed in zip(motions, speeds, strict=True)
+        if math.isinf(speed)
+    ]
+    most = max(_BROKEN * max(known, default=0.0), _UNKNOWN * max(assumed, default=0.0))
+    return max(config.safety.velocity_limit), most
+
+
+def _of_drives(name: str, unit: str, least: Callable[[Chain], list[float]]) -> Rule:
+    """Return the rule for what a drive moves at its effort, whatever it is `least` (n,)."""
+
+    def find(config: ArmConfig) -> Iterator[str]:
+        robot = config.robot
+        chain = robot.chain(config.joints)
+        most = (robot.efforts(chain) / least(chain)).tolist()
+        why = 'which its drive could hardly move: its effort allows'
+        return _beyond(config, getattr(robot, name), most, why, unit)
+
+    return _row(f'robot.{name}', find)
+
+
+def _motions(config: ControllerParameters) -> Iterator[str]:
+    joints = config.robot.chain(config.joints).joints
+    speeds = [joint.velocity for joint in joints]
+    why = 'the URDF allows'
+    return _beyond(config, config.limits.velocity, speeds, why, 'rad/s', _degrees)
+
+
+def _range(end: str, sign: float) -> Rule:
+    """Return the rule for the lower or the upper position limits."""
+
+    def find(config: ControllerParameters) -> Iterator[str]:
+        joints = config.robot.chain(config.joints).joints
+        ends = [getattr(joint, end) + sign * PAST_LIMITS for joint in joints]
+        given = getattr(config.limits, f'position_{end}')
+        why = f'past its limits in the URDF are less than {PAST_LIMITS:g}, up to'
+        return _beyond(config, given, ends, why, 'rad', _degrees, sign)
+
+    return _row(f'limits.position_{end}', find)
 
 
 def widest_bound(kind: str, lower: float, upper: float) -> float:
@@ -188,27 +198,16 @@ def widest_bound(kind: str, lower: float, upper: float) -> float:
     return max(allowed, WIDEST)
 
 
-def _of_errors(config: Checked) -> Iterator[_Doubt]:
+def _bounds(config: ControllerParameters) -> Iterator[str]:
     """Check the bounds on errors against the ranges of the joints."""
-    if config.barrier.bounds_tool:  # from which they follow
-        return
-    limits = config.limits
-    for joint, kind, bound, lower, upper in zip(
-        config.joints,
-        config.robot.kinds(config.joints),
-        config.barrier.bound,
-        limits.position_lower,
-        limits.position_upper,
-        strict=True,
-    ):
-        allowed = widest_bound(kind, lower, upper)
-        if bound > allowed:
-            yield _Doubt(
-                'barrier.bound',
-                f'got {bound:g} for {joint}, but past {allowed:.3g}, half of its range or a '
-                f'quarter turn, nothing is bounded: {_unit_of(kind, bound)}'
-                + ('' if kind == 'prismatic' else f'; in mrad? Give {1e-3 * bound:g}'),
-            )
+    limits, kinds = config.limits, config.robot.kinds(config.joints)
+    widest = map(widest_bound, kinds, limits.position_lower, limits.position_upper)
+    why = 'nothing is bounded past half of its range or a quarter turn,'
+    return _beyond(config, config.barrier.bound, widest, why, hint=_mrad)
+
+
+def _bounds_joints(config: ControllerParameters) -> bool:
+    return not config.barrier.bounds_tool
 
 
 def widest_at_tool(chain: Chain) -> tuple[float, float]:
@@ -216,107 +215,147 @@ def widest_at_tool(chain: Chain) -> tuple[float, float]:
     return _WIDEST * chain.reach or math.inf, _QUARTER
 
 
-def _of_tool(config: Checked, chain: Chain) -> Iterator[_Doubt]:
-    """Check the bounds at the tool against the reach of the arm."""
-    reach = chain.reach
-    bound = config.barrier.tool_bound
-    widest, turned = widest_at_tool(chain)
-    if bound > widest:
-        yield _Doubt(
-            POSITION,
-            f'got {bound:g} m, more than a tenth of the reach, {reach:.3g} m: is it in mm? '
-            f'Give {1e-3 * bound:g}',
-        )
-    angle = config.barrier.tool_angle_bound
-    if angle > turned:
-        yield _Doubt(
-            ANGLE, f'got {angle:g} rad, more than a quarter turn: {_of_degrees(angle)}'
-        )
+def _carried(name: str) -> Callable[[ArmConfig], tuple[float, float]]:
+    """Return what a load is, and the most that an arm could hold [kg]."""
+
+    def loads(config: ArmConfig) -> tuple[float, float]:
+        robot = config.robot
+        mass = getattr(robot, name)
+        most = _CARRIED * robot.carried(robot.chain(config.joints))
+        is_usual = mass == getattr(type(robot), name)
+        return mass, math.inf if is_usual else most or math.inf
+
+    return loads
 
 
-def _of_robot(robot: Robot, chain: Chain) -> Iterator[_Doubt]:
-    """Check what is said of the robot against its efforts and its reach."""
-    if (gravity := float(np.linalg.norm(robot.gravity))) > _HEAVIEST:
-        text = f'got {gravity:.4g} m/s^2: is it in mm/s^2? Give {1e-3 * gravity:.4g}'
-        yield _Doubt('robot.gravity', text)
-        return
-    yield from _of_payloads(robot, chain)
-    efforts = robot.efforts(chain)
-    speeds = [min(joint.velocity, 1.0) for joint in chain.joints]
-    for name, unit, given, most in (
-        ('rotor_inertia', 'kg m^2', robot.rotor_inertia, efforts / _SLOWEST),
-        ('coulomb', 'N m', robot.coulomb, efforts),
-        ('viscous', 'N m s/rad', robot.viscous, efforts / speeds),
-    ):
-        for joint, value, allowed in zip(
-            chain.joints, given, most.tolist(), strict=False
-        ):
-            if value > allowed:
-                own = joint_units(joint.kind).of(unit)
-                yield _Doubt(
-                    f'robot.{name}',
-                    f'got {value:g} {own} for {joint.name}, which its drive could hardly move: '
-                    f'its effort allows {allowed:.3g} {own}',
-                )
-
-
-def _of_payloads(robot: Robot, chain: Chain) -> Iterator[_Doubt]:
-    """Check loads against what the arm can hold, and their centre against its reach."""
-    reach = chain.reach
-    centre = float(np.linalg.norm(robot.drive_payload_centre))
-    if centre > reach > 0.0:
-        yield _Doubt(
-            'robot.drive_payload_centre',
-            f'got a centre {centre:g} m from the tip, farther than the arm reaches, '
-            f'{reach:.3g} m: is it in mm? Give '
-            f'{[1e-3 * each for each in robot.drive_payload_centre]}',
-        )
-    most = _CARRIED * robot.carried(chain)
-    for name, mass, default in (
-        ('payload', robot.payload, type(robot).payload),
-        ('drive_payload', robot.drive_payload, 0.0),
-    ):
-        if mass > most > 0.0 and mass != default:
-            yield _Doubt(
-                f'robot.{name}',
-                f'got {mass:g} kg, over ten times what the strongest joint holds at full '
-                f'reach, {most / _CARRIED:.3g} kg: is it in g? Give {1e-3 * mass:g}',
-            )
-
-
-def _of_sensors(
-    config: ArmConfig, resolution: float, noise: float, lag: float
-) -> Iterator[_Doubt]:
-    """Check the sensors and actuators of a simulated arm."""
+def _coarsest(config: ArmConfig) -> float:
+    """Return the most that a sensor may be off by [rad]."""
     ranges = [math.tau]
     if config.robot.urdf:
         joints = config.robot.chain(config.joints).joints
         ranges += [joint.upper - joint.lower for joint in joints]
-    coarsest = _COARSEST * min(ranges)
-    if resolution > coarsest:
-        yield _Doubt(
-            'sensor.resolution',
-            f'got {resolution:g} rad, with which the range of a joint has fewer than a hundred '
-            f'steps: is it in bits? Give {math.tau / 2.0 ** min(resolution, 64.0):.3g}',
-        )
-    if noise > coarsest:
-        yield _Doubt(
-            'sensor.position_noise',
-            f'got {noise:g} rad rms, more than a hundredth of the range of a '
-            f'joint: {_of_degrees(noise)}',
-        )
-    if lag > LONGEST_LAG:
-        yield _Doubt(
-            'actuator.time_constant',
-            f'got {lag:g} s, too long for any loop: is it in ms? Give {1e-3 * lag:g}',
-        )
+    return _COARSEST * min(ranges)
 
 
-def _unit_of(kind: str, value: float) -> str:
-    """Ask whether a value of a joint is of another unit."""
-    if kind == 'prismatic':
-        return f'is it in mm? Give {1e-3 * value:g}'
-    return _of_degrees(value)
+def _reach(config: ArmConfig) -> float:
+    return config.robot.chain(config.joints).reach or math.inf
+
+
+_IN_DEGREES = math.radians(1.0)
+
+OF_ROBOT = (
+    _number(
+        'robot.gravity',
+        'm/s^2',
+        lambda config: (np.linalg.norm(config.robot.gravity), _HEAVIEST),
+        'on no planet it is more than',
+        'mm/s^2',
+    ),
+    _number(
+        'robot.drive_payload_centre',
+        'm',
+        lambda config: (config.robot.drive_payload_centre, _reach(config)),
+        'the arm reaches no farther than',
+        'mm',
+    ),
+    *(
+        _number(
+            f'robot.{name}',
+            'kg',
+            _carried(name),
+            'ten times what the strongest joint holds at full reach are',
+            'g',
+        )
+        for name in ('payload', 'drive_payload')
+    ),
+    _of_drives('rotor_inertia', 'kg m^2', lambda _: [_SLOWEST]),
+    _of_drives('coulomb', 'N m', lambda _: [1.0]),
+    _of_drives(
+        'viscous',
+        'N m s/rad',
+        lambda chain: [min(joint.velocity, 1.0) for joint in chain.joints],
+    ),
+)
+"""Rules of the robot, from which those of the controller follow."""
+
+OF_CONTROLLER = (
+    _row('torque.limit', _torques),
+    _number(
+        'safety.velocity_limit',
+        'rad/s',
+        _fastest,
+        'no joint, ten times as fast as the fastest or a hundred times limits.velocity, has',
+        'degrees',
+        _IN_DEGREES,
+        lambda _: True,
+    ),
+    _row('limits.velocity', _motions),
+    _range('lower', -1.0),
+    _range('upper', 1.0),
+    _row('barrier.bound', _bounds, _bounds_joints),
+    _number(
+        POSITION,
+        'm',
+        lambda config: (config.barrier.tool_bound, _WIDEST * _reach(config)),
+        'a tenth of the reach is',
+        'mm',
+    ),
+    _number(
+        ANGLE,
+        'rad',
+        lambda config: (config.barrier.tool_angle_bound, _QUARTER),
+        'a quarter turn is',
+        'degrees',
+        _IN_DEGREES,
+    ),
+)
+
+OF_PLANT = (
+    _number(
+        'sensor.resolution',
+        'rad',
+        lambda config: (config.sensor.resolution, _coarsest(config)),
+        'a hundredth of the range of a joint is',
+        'bits',
+        lambda bits: math.tau / 2.0 ** min(bits, 64.0),
+        lambda _: True,
+    ),
+    _number(
+        'sensor.position_noise',
+        'rad',
+        lambda config: (config.sensor.position_noise, _coarsest(config)),
+        'a hundredth of the range of a joint is',
+        'degrees',
+        _IN_DEGREES,
+        lambda _: True,
+    ),
+    _number(
+        'actuator.time_constant',
+        's',
+        lambda config: (config.actuator.time_constant, LONGEST_LAG),
+        'no loop bears more than',
+        'ms',
+        applies=lambda _: True,
+    ),
+)
+
+_CHECKED = (
+    STIFFNESS,
+    *(rule.parameter for rule in (*OF_ROBOT, *OF_CONTROLLER, *OF_PLANT)),
+)
+
+
+def _unknown_words(config: ArmConfig) -> Iterator[str]:
+    """Yield a problem for each entry of `insist` whose value is not checked."""
+    for name in config.insist:
+        if name not in _CHECKED:
+            yield (
+                f'insist: got {name}, whose value is not compared with the arm'
+                f'{suggestion(name, _CHECKED)}'
+            )
+
+
+INSISTED = Rule('insist', When.LOAD, Severity.REFUSE, _unknown_words)
 
 
 def hint_at_degrees(at: float, lower: float, upper: float) -> str:
@@ -324,7 +363,3 @@ def hint_at_degrees(at: float, lower: float, upper: float) -> str:
     if abs(at) > 2.0 * math.pi and lower <= math.radians(at) <= upper:
         return f'; if this is in degrees, give {math.radians(at):.4g}'
     return ''
-
-
-def _of_degrees(value: float) -> str:
-    return f'is it in degrees? Give {math.radians(value):.3g}'

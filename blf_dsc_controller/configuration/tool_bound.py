@@ -28,8 +28,9 @@ from blf_dsc_controller.arms import tuning
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.configuration.checked import Checked
-from blf_dsc_controller.configuration.law_traits import traits_of
+from blf_dsc_controller.configuration.controller_parameters import (
+    ControllerParameters,
+)
 from blf_dsc_controller.configuration.motion_groups import PAST_LIMITS
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.numerics.algebra import inverse, product
@@ -72,7 +73,7 @@ def is_given(values: Mapping[str, Any]) -> bool:
     return any(values.get(name, 0.0) > 0.0 for name in (POSITION, ANGLE))
 
 
-def tool_of(config: Checked) -> Tool | None:
+def tool_of(config: ControllerParameters) -> Tool | None:
     """Return the tool of a configuration; None without a bound on its error."""
     if not config.barrier.bounds_tool:
         return None
@@ -214,7 +215,7 @@ def _expected(
     return tuple((np.ones(n) if even else found).tolist())
 
 
-def certified(config: Checked) -> tuple[float, float]:
+def certified(config: ControllerParameters) -> tuple[float, float]:
     """Return the bounds [m, rad] at the tool that the joint bounds ensure."""
     tool = tool_of(config)
     assert tool is not None  # noqa: S101 - the caller has looked
@@ -222,7 +223,7 @@ def certified(config: Checked) -> tuple[float, float]:
     return position, angle
 
 
-def problems(config: Checked) -> Iterator[str]:
+def problems(config: ControllerParameters) -> Iterator[str]:
     """Check that there is a tool, and that the joint bounds keep its bound."""
     barrier = config.barrier
     if not barrier.bounds_tool:
@@ -238,7 +239,7 @@ def problems(config: Checked) -> Iterator[str]:
     if len(config.joints) > MOST_JOINTS:
         yield f'{name}: got {len(config.joints)} joints, but at most {MOST_JOINTS} are allowed'
         return
-    if not traits_of(config).has_barrier:
+    if not config.traits.has_barrier:
         yield f'{name}: the law {config.law} keeps no bound: choose blf_dsc, or remove {name}'
     least = min(barrier.bound)
     if least == 0.0:

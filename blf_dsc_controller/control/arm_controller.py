@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
+from blf_dsc_controller.configuration.rules import When
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.loop_outputs import LoopOutputs
 from blf_dsc_controller.control.outputs import Output
@@ -30,8 +31,7 @@ from blf_dsc_controller.run import FIRST_STAMP
 from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase
-from blf_dsc_controller.warnings.not_commissioned import not_commissioned
-from blf_dsc_controller.warnings.stability import refuse_unstable
+from blf_dsc_controller.warnings.table import config_warnings, refuse
 
 Vector = NDArray[np.float64]
 
@@ -121,14 +121,14 @@ class ArmController:
         self.config = config
         self.joints = config.joints
         self._loop = GuardedLoop(config)
-        refuse_unstable(config, self._loop.guard.controller.settings)
+        refuse(config)
         self._outputs = LoopOutputs(self._loop, record)
         self._is_on_wall = stamps == 'wall'
         self._shift: int | None = None  # ns, of the stamps
         self._logged_turns: set[str] = set()
         self._is_closed = False
         self._loop.guard.starting.activate()
-        if text := not_commissioned(config):
+        for text in config_warnings(config, When.ROBOT):
             logging.getLogger(__name__).info(text)
 
     def __enter__(self) -> ArmController:

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.configuration.plausibility import STIFFNESS
+from blf_dsc_controller.configuration.rules import When
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.law.local_gains import LocalGains
 from blf_dsc_controller.motors.frame import Frame, Gains, Motion, Ranges, split
-from blf_dsc_controller.warnings.stability import STIFFNESS
+from blf_dsc_controller.warnings.table import config_warnings
 
 Vector = NDArray[np.float64]
 # s, with which the gains that the maker of a YAM runs in its motors are stable
@@ -35,6 +37,12 @@ def as_in_motors(config: ControllerConfig) -> ControllerConfig:
         'robot.lag': min(config.robot.lag, _LAG),
     }
     return change(config, fast)
+
+
+def robot_warnings(config: ControllerConfig, *, in_motors: bool) -> list[str]:
+    """Return the warnings before a robot moves, whose motors may close the feedback."""
+    loop = as_in_motors(config) if in_motors else config
+    return config_warnings(loop, When.START | When.ROBOT, in_motors=in_motors)
 
 
 def closed_in_motors(config: ControllerConfig) -> ControllerConfig:

@@ -31,13 +31,11 @@ from blf_dsc_controller.drive.beside import LinkLog
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End
-from blf_dsc_controller.drive.motor_feedback import as_in_motors, closed_in_motors
+from blf_dsc_controller.drive.motor_feedback import closed_in_motors, robot_warnings
 from blf_dsc_controller.drive.script import Script
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
-from blf_dsc_controller.warnings.not_commissioned import not_commissioned
-from blf_dsc_controller.warnings.table import config_warnings
 
 _POLL = 0.1  # s
 _PATIENCE = 5.0  # s, for the script to take the last messages
@@ -72,10 +70,10 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
     config = load(path, CONTROLLER, ControllerConfig, _HOLD | given)
     driver = driver_of(wanted['robot'], path, config, overrides)
     in_motors = driver.config.feedback == 'motor'
-    judged = as_in_motors(config) if in_motors else config
-    unmeasured = not_commissioned(config, in_motors=in_motors)
-    of_file = ignored_in(path, (CONTROLLER, DRIVE)), unmeasured
-    for warning in [*config_warnings(judged), *filter(None, of_file)]:
+    ignored = ignored_in(path, (CONTROLLER, DRIVE))
+    for warning in filter(
+        None, [*robot_warnings(config, in_motors=in_motors), ignored]
+    ):
         log.info(warning)
     if in_motors:
         config = closed_in_motors(config)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from blf_dsc_controller.configuration.rules import When
 from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
@@ -12,7 +13,7 @@ from blf_dsc_controller.nodes.process import PlainNode
 from blf_dsc_controller.run import unit_of_all
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import STAMPS, Phase, Reason
-from blf_dsc_controller.warnings.not_commissioned import not_commissioned
+from blf_dsc_controller.warnings.table import config_warnings
 
 NOTHING_COMMANDED = 'nothing is commanded'
 """Begins what is logged of a stop before the first torque."""
@@ -117,10 +118,10 @@ class ControllerLog:
         """Say what matters to a robot, and not to a simulated arm, which waits in lock-step."""
         if guard.watchdog.why_off:
             self._log.warning(guard.watchdog.why_off)
-        text = not_commissioned(guard.config)
-        if text and self.warns_of_gains:
-            self.warns_of_gains = False
-            self._log.warning(text)
+        if self.warns_of_gains:
+            for text in config_warnings(guard.config, When.ROBOT):
+                self.warns_of_gains = False
+                self._log.warning(text)
 
     def warn_of_learning(
         self, guard: Guard, names: Sequence[str], status: ControllerStatus

@@ -35,9 +35,7 @@ from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
 from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.state_check import rate_mismatch
-from blf_dsc_controller.warnings.gains import worsened
-from blf_dsc_controller.warnings.reference_load import ReferenceLoad, reference_load
-from blf_dsc_controller.warnings.table import config_warnings
+from blf_dsc_controller.warnings.table import config_warnings, worsened
 
 _RARELY = 10  # samples between looks at what rarely changes
 _RATE_SAMPLES = 1001  # samples before the rate is checked
@@ -68,7 +66,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.guard: Guard | None = None
         self.outputs = Outputs()
         self._loop: GuardedLoop | None = None
-        self._load: ReferenceLoad | None = None
         self.declaration: ServiceDeclaration | None = None
         self._decoder = JointStateDecoder(joints, required=('position',))
         self._encoder = Float64MultiArrayEncoder(len(joints))
@@ -105,8 +102,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.guard = self._loop.guard
         self.log.begin()
         self._record_topics(self.guard)
-        self._load = reference_load(self.config, self.guard.controller.settings)
-        for warning in config_warnings(self.config, load=self._load):
+        for warning in config_warnings(self.config):
             self.get_logger().warning(warning)
         if end := end_of_waypoints(self.config):
             self.get_logger().info(end)
@@ -385,10 +381,10 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _check(self, before: ControllerConfig, after: ControllerConfig) -> list[str]:
         """Return what is worse than before; called beside the loop."""
-        if self.guard is None or self._load is None:
+        if self.guard is None:
             return []
         remedy = '; to use it anyway, start the node with it'
-        return [text + remedy for text in worsened(before, after, self._load)]
+        return [text + remedy for text in worsened(before, after)]
 
     def _retune(self, config: ControllerConfig) -> None:
         self.config = config

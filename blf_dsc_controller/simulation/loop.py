@@ -44,7 +44,7 @@ from blf_dsc_controller.messages.topics import Message
 from blf_dsc_controller.run import FIRST_STAMP, Run, Series, Stop
 from blf_dsc_controller.simulation.sampled_run import run_of
 from blf_dsc_controller.supervision.guard import Guard
-from blf_dsc_controller.warnings.stability import refuse_unstable
+from blf_dsc_controller.warnings.table import refuse
 from sim_plant.plant import plant_of
 from sim_plant.sampled_plant import Plant
 from sim_plant.settings import parameter_names_of, steps_of
@@ -75,7 +75,7 @@ def simulate(
     plant = plant_of(plant_config)
     if supervised:
         guard = Guard(controller_config, lambda: 0, lambda: 0)
-        refuse_unstable(controller_config, guard.controller.settings)
+        refuse(controller_config)
         guard.starting.activate()
         record = new_record(
             guard.controller, controller_config, plant_config, guard.journal

@@ -8,7 +8,6 @@ from itertools import chain
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.law_traits import traits_of
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.factory.estimate import estimate_names, learned_arm
@@ -56,7 +55,7 @@ def run_of(
         external=external,
         arm=learned_arm(config),
         tool=tool.errors if tool else None,
-        learns=traits_of(config).learns and config.learning.enabled,
+        learns=config.traits.learns and config.learning.enabled,
         effort=effort,
         sliding=config.robot.sliding(config.joints),
         xi2=samples.xi2,

@@ -297,4 +297,4 @@ class Guard(InCommand):
         """Return why a configuration cannot be applied now; empty if it can."""
         if not self.supervisor.running:
             return []
-        return list(retuning.problems(self.controller, config, self.reference.time))
+        return retuning.problems(self.controller, config, self.reference.time)

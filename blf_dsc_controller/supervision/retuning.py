@@ -11,12 +11,19 @@ whose disturbance gain is 0 has no integrator, so its torque steps.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_traits import PAPER
+from blf_dsc_controller.configuration.rules import (
+    Rule,
+    Severity,
+    When,
+    findings,
+)
 from blf_dsc_controller.factory.laws import law_of
 from blf_dsc_controller.factory.settings import settings_in_loop
 from blf_dsc_controller.law import barrier
@@ -56,22 +63,26 @@ def apply_bumpless(
     state.disturbance[integrates] -= (signals.demand - demand)[integrates]
 
 
-def problems(
-    controller: Controller, config: ControllerConfig, t: float
-) -> Iterator[str]:
-    """Yield why a running law cannot accept a valid configuration at t [s]."""
-    settings = settings_in_loop(config)
-    yield from _outside_bound(controller, config, settings, t)
-    yield from _above_torque_limit(controller, config)
-    yield from _diverging_update(controller, config, settings)
+class _Change(NamedTuple):
+    """A change of a running law at t [s]."""
+
+    controller: Controller
+    config: ControllerConfig
+    settings: Settings
+    t: float
 
 
-def _outside_bound(
-    controller: Controller, config: ControllerConfig, settings: Settings, t: float
-) -> Iterator[str]:
-    """Yield which joints the bound of a configuration leaves outside at t [s]."""
-    bounds = barrier.bound_at(settings.barrier, t)
-    errors = np.abs(controller.sample.xi1)
+def problems(controller: Controller, config: ControllerConfig, t: float) -> list[str]:
+    """Return why a running law cannot accept a valid configuration at t [s]."""
+    case = _Change(controller, config, settings_in_loop(config), t)
+    return [str(each) for each in findings(RULES, case, When.NOW, Severity.REFUSE)]
+
+
+def _outside_bound(change: _Change) -> Iterator[str]:
+    """Yield which joints the bound of a configuration leaves outside."""
+    config = change.config
+    bounds = barrier.bound_at(change.settings.barrier, change.t)
+    errors = np.abs(change.controller.sample.xi1)
     for joint, (unit, _, _), error, bound in zip(
         config.joints, config.units, errors, bounds, strict=True
     ):
@@ -83,11 +94,10 @@ def _outside_bound(
             )
 
 
-def _above_torque_limit(
-    controller: Controller, config: ControllerConfig
-) -> Iterator[str]:
+def _above_torque_limit(change: _Change) -> Iterator[str]:
     """Yield which joints are held by more than their limit."""
-    torques = np.abs(controller.sample.torque)
+    config = change.config
+    torques = np.abs(change.controller.sample.torque)
     for joint, (_, unit, _), torque, limit in zip(
         config.joints, config.units, torques, config.torque.limit, strict=True
     ):
@@ -98,11 +108,10 @@ def _above_torque_limit(
             )
 
 
-def _diverging_update(
-    controller: Controller, config: ControllerConfig, settings: Settings
-) -> Iterator[str]:
+def _diverging_update(change: _Change) -> Iterator[str]:
     """Yield how much each step of the learned estimates overshoots, if they diverge."""
-    latch, adaptation = controller.state.latch, settings.adaptation
+    config, adaptation = change.config, change.settings.adaptation
+    latch = change.controller.state.latch
     step, stretch = 'Newton step', 1.0
     if config.law == PAPER:
         step, stretch = 'gradient step', float(np.linalg.norm(latch.Phi, 2))
@@ -118,3 +127,10 @@ def _diverging_update(
             f'estimates by {share:.3g} times their error, which diverges at {_STABLE:g} or more: '
             'lower it or two_link.adaptation_gain'
         )
+
+
+RULES = (
+    Rule('barrier.bound', When.NOW, Severity.REFUSE, _outside_bound),
+    Rule('torque.limit', When.NOW, Severity.REFUSE, _above_torque_limit),
+    Rule('two_link.learning_weight', When.NOW, Severity.REFUSE, _diverging_update),
+)

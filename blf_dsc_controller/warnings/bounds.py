@@ -7,18 +7,16 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.base_parameters import HEAVIER_DRIVE
 from blf_dsc_controller.arms.tuning import SAMPLES, loop_delay
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION
+from blf_dsc_controller.configuration.rules import Rule, Severity, When
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
 from blf_dsc_controller.run import TURNING, JointUnits
-from blf_dsc_controller.warnings.expected_errors import ExpectedErrors
-from blf_dsc_controller.warnings.stability import guesses_rotors
-
-Floats = NDArray[np.float64]
+from blf_dsc_controller.warnings.case import Case
+from blf_dsc_controller.warnings.expected_errors import ExpectedErrors, guesses_rotors
 
 # exponent of an error in the stiffness it needs: 0.5 without delays
 _STIFFENING = 0.6
@@ -26,13 +24,9 @@ _ROOM = 1.1  # recommended bound over the errors to expect
 _WIDEST_BOUND = 0.35  # rad, 20 degrees
 
 
-def width_warnings(
-    config: ControllerConfig, errors: ExpectedErrors | None
-) -> Iterator[str]:
-    """Check for bounds that bound nothing: of another unit, or because of soft gains.
-
-    `errors` are those to expect, if known.
-    """
+def _width(case: Case) -> Iterator[str]:
+    """Check for bounds that bound nothing: of another unit, or because of soft gains."""
+    config, errors = case.config, case.errors
     barrier = config.barrier
     widest = max(barrier.bound)
     if widest <= _WIDEST_BOUND:
@@ -64,16 +58,6 @@ def width_warnings(
     yield f'{name}: {wide} bounds nothing: {remedy}'
 
 
-def error_warnings(
-    config: ControllerConfig, bound: Floats, errors: ExpectedErrors
-) -> Iterator[str]:
-    """Check that the errors to expect are within the bound (n,) [rad]."""
-    if errors.is_endless:
-        return
-    yield from _of_unmodelled(config, bound, errors.unmodelled)
-    yield from _of_pick_up(config, bound, errors.pick_up)
-
-
 def _tool_parameter(config: ControllerConfig) -> str:
     """Return the parameter by which the error at the tool is bounded; empty if it is not."""
     if not config.barrier.bounds_tool:
@@ -81,10 +65,10 @@ def _tool_parameter(config: ControllerConfig) -> str:
     return POSITION if config.barrier.tool_bound > 0.0 else ANGLE
 
 
-def _of_unmodelled(
-    config: ControllerConfig, bound: Floats, errors: Floats
-) -> Iterator[str]:
-    """Check the errors (n,) [rad] by friction and unmodelled torque."""
+def _of_unmodelled(case: Case) -> Iterator[str]:
+    """Check the errors by friction and unmodelled torque."""
+    config, bound = case.config, case.settings.barrier.bound
+    errors = _expected(case).unmodelled
     worst = int(np.argmax(errors / bound))
     if not errors[worst] > bound[worst]:
         return
@@ -137,10 +121,10 @@ def _wide_enough(error: float, units: JointUnits) -> str:
     return f'give {wide_enough:.2g} {units.position}, or'
 
 
-def _of_pick_up(
-    config: ControllerConfig, bound: Floats, errors: Floats
-) -> Iterator[str]:
-    """Check the errors (n,) [rad] when a load is picked up in motion."""
+def _of_pick_up(case: Case) -> Iterator[str]:
+    """Check the errors when a load is picked up in motion."""
+    config, bound = case.config, case.settings.barrier.bound
+    errors = _expected(case).pick_up
     worst = int(np.argmax(errors / bound))
     peak = errors[worst]
     if not peak > bound[worst]:
@@ -173,3 +157,19 @@ def _remedy_of_pick_up(config: ControllerConfig, share: float) -> str:
     if faster > 0.0:
         return f'a sample time of {faster / SAMPLES:.2g} s'
     return f'a robot.lag below {lag:g} s'
+
+
+def _expected(case: Case) -> ExpectedErrors:
+    assert case.errors is not None  # noqa: S101 - `_has_errors`
+    return case.errors
+
+
+def _has_errors(case: Case) -> bool:
+    return case.errors is not None and not case.errors.is_endless
+
+
+RULES = (
+    Rule('barrier.bound', When.START, Severity.WARN, _width),
+    Rule('barrier.bound', When.START, Severity.WARN, _of_unmodelled, _has_errors),
+    Rule('barrier.bound', When.START, Severity.WARN, _of_pick_up, _has_errors),
+)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.arms.linear_loop import Joints, Loop
+from blf_dsc_controller.arms.linear_loop import Feedback, Joints, Loop, Timing
 from blf_dsc_controller.arms.model import inertia_matrices, regressors_at
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import parameters_of
@@ -23,11 +23,6 @@ from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.numerics.digits import largest_error
 from blf_dsc_controller.warnings.reference_load import along
-from blf_dsc_controller.warnings.stability import (
-    guesses_rotors,
-    linear_feedback,
-    timing_of,
-)
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +30,39 @@ _RESPONSE = 20.0  # time constants of the damping, for which the response is fol
 _PEAK = 6.0  # of the surface, likewise; the peak comes before the integral acts
 _MOMENTS = 40  # of the reference
 _LOOKED_AT = 8  # of them, every so many, for a loop that is stable
+
+
+def linear_feedback(settings: Settings, M0: Floats, stiffness: Floats) -> Feedback:
+    """Return the law at small errors, with its inertia M0 (k, n, n) [kg m^2] of k postures.
+
+    `stiffness` (n,) [N m/rad] is the slope of the barrier.
+    """
+    one = np.broadcast_to(np.eye(settings.n), M0.shape)
+    acting = (
+        M0 / settings.joint_inertia if settings.feedback.follows_inertia == 1 else one
+    )
+    return Feedback(
+        position=acting * stiffness,
+        surface=one * settings.feedback.gain + M0 * settings.feedback.damping_rate,
+        inertia=0.0 * M0 if settings.feedback.decoupled == 1 else M0,
+        integral=acting * settings.disturbance.gain,
+        rate=settings.surface.gain / 2.0 + settings.surface.mu,
+        time_constant=settings.surface.time_constant,
+        known_rate=settings.surface.known_rate == 1,
+        damping_lag=settings.feedback.damping_lag,
+    )
+
+
+def timing_of(config: ControllerConfig) -> Timing:
+    """Return how late torques and velocities are: half of `robot.lag` each."""
+    half = 0.5 * config.robot.lag
+    return Timing(config.sample_time, drive_lag=half, velocity_lag=half)
+
+
+def guesses_rotors(config: ControllerConfig) -> bool:
+    """Whether the drives may be heavier than the inertia that is guessed for them."""
+    unknown = config.robot.unknown_rotors(config.robot.chain(config.joints))
+    return not config.commissioning.unseen_inertia and bool(unknown.any())
 
 
 def _peak_errors(loop: Loop, settings: Settings, torque: Floats) -> Floats:

@@ -7,14 +7,14 @@ They rest on the initial parameter estimate, which is a guess. doc/tuning.md der
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.factory.settings import settings_in_loop
+from blf_dsc_controller.configuration.rules import Excess, Rule, Severity, When
 from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.warnings.case import Case
 from blf_dsc_controller.warnings.reference_load import ReferenceLoad
 
 Floats = NDArray[np.float64]
@@ -22,48 +22,12 @@ Floats = NDArray[np.float64]
 _MARGIN = 1.25  # recommended torque limit over what the reference needs
 
 
-class Limit(NamedTuple):
-    """A limit of the gains: what it is on, how much is used, what follows above 1."""
-
-    subject: str
-    use: float
-    text: str  # goes on after the subject
-
-
-def exceeded_limits(config: ControllerConfig, load: ReferenceLoad) -> list[Limit]:
-    """Return the limits that gains and torque limits exceed with this load of the reference."""
-    # a limit of next to nothing is exceeded infinitely
-    with np.errstate(over='ignore'):
-        return [each for each in _limits_of_gains(config, load) if each.use > 1.0]
-
-
-def worsened(
-    before: ControllerConfig, after: ControllerConfig, load: ReferenceLoad
-) -> list[str]:
-    """Return the warnings on gains that are new or worse after a change."""
-    known = {each.subject: each.use for each in exceeded_limits(before, load)}
-    return [
-        f'{each.subject} {each.text}'
-        for each in exceeded_limits(after, load)
-        if each.use > known.get(each.subject, 1.0)
-    ]
-
-
-def _limits_of_gains(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Limit]:
-    """Yield what the gains and torque limits use of their limits; above 1 is too much."""
-    settings = settings_in_loop(config)
-    yield from _limits_of_torque(config, load)
-    yield from _limits_of_feedback(config, settings, load)
-    if settings.has_barrier == 1:
-        yield from _limits_of_surface(settings)
-        yield from _limits_of_slope(config, settings, load)
-
-
-def _limits_of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator[Limit]:
+def _limits_of_torque(case: Case) -> Iterator[Excess]:
+    config, load = case.config, case.load
     for joint, (_, unit, _), need, limit in zip(
         config.joints, config.units, load.torque, config.torque.limit, strict=True
     ):
-        yield Limit(
+        yield Excess(
             f'torque.limit: {joint}',
             _MARGIN * need / limit,
             f'has {limit:g} {unit}, but with P^(0) the reference alone needs '
@@ -72,12 +36,11 @@ def _limits_of_torque(config: ControllerConfig, load: ReferenceLoad) -> Iterator
         )
 
 
-def _limits_of_feedback(
-    config: ControllerConfig, settings: Settings, load: ReferenceLoad
-) -> Iterator[Limit]:
+def _limits_of_feedback(case: Case) -> Iterator[Excess]:
+    config, settings, load = case.config, case.settings, case.load
     T = config.sample_time
     rate = load.rate(settings)
-    yield Limit(
+    yield Excess(
         f'{_feedback(config)}: K_p over the inertia',
         rate * T,
         f'is {rate:.3g} 1/s with P^(0), {rate * T:.2g} times the inverse of '
@@ -85,7 +48,7 @@ def _limits_of_feedback(
         f'the limits: lower {_feedback(config)} or sample_time',
     )
     absorbed = float(np.max(settings.disturbance.gain * T / _damping(settings, load)))
-    yield Limit(
+    yield Excess(
         'disturbance.gain: in each sample the disturbance estimate absorbs',
         2.0 * absorbed,
         f'{absorbed:.2g} of the velocity feedback. Above a half it oscillates against '
@@ -104,11 +67,12 @@ def _damping(settings: Settings, load: ReferenceLoad) -> Floats:
     return np.asarray(np.maximum(load.damping(settings), 1e-12))
 
 
-def _limits_of_surface(settings: Settings) -> Iterator[Limit]:
+def _limits_of_surface(case: Case) -> Iterator[Excess]:
+    settings = case.settings
     if settings.surface.known_rate == 0:
         filtering = settings.surface.time_constant
         rate = float(np.max(settings.surface.gain / 2.0 + settings.surface.mu))
-        yield Limit(
+        yield Excess(
             'two_link.surface_gain, two_link.mu: K/2 + mu',
             filtering * rate,
             f'is {rate:.3g} 1/s, but a filter of {filtering:g} s rings above '
@@ -116,15 +80,28 @@ def _limits_of_surface(settings: Settings) -> Iterator[Limit]:
         )
 
 
-def _limits_of_slope(
-    config: ControllerConfig, settings: Settings, load: ReferenceLoad
-) -> Iterator[Limit]:
-    T, damping = config.sample_time, _damping(settings, load)
+def _limits_of_slope(case: Case) -> Iterator[Excess]:
+    config, settings = case.config, case.settings
+    T, damping = config.sample_time, _damping(settings, case.load)
     ratios = settings.barrier.slope_limit * T / damping
     for joint, ratio in zip(config.joints, ratios, strict=True):
-        yield Limit(
+        yield Excess(
             f'{_feedback(config)}: past the knee of its barrier {joint} is corrected by',
             ratio / 2.0,
             f'{ratio:.2g} times its error in a sample. Above 2 the error grows: give a '
             'shorter sample_time',
         )
+
+
+def _has_barrier(case: Case) -> bool:
+    return case.settings.has_barrier == 1
+
+
+_GAINS = When.START | When.LIVE
+
+RULES = (
+    Rule('torque.limit', _GAINS, Severity.WARN, _limits_of_torque),
+    Rule('feedback', _GAINS, Severity.WARN, _limits_of_feedback),
+    Rule('two_link.mu', _GAINS, Severity.WARN, _limits_of_surface, _has_barrier),
+    Rule('feedback', _GAINS, Severity.WARN, _limits_of_slope, _has_barrier),
+)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings about a configuration that is valid but cannot work well.
+"""The rules of a start and of other gains, and what they find in a configuration.
 
 Those on gains are in `gains` and `stability`, those on the bound in `bounds`; here are the
 others, and all of them together. doc/tuning.md derives them.
@@ -8,7 +8,7 @@ others, and all of them together. doc/tuning.md derives them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -16,27 +16,19 @@ from blf_dsc_controller.arms.tuning import UNKNOWN_EFFORT
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_traits import OWN, PAPER
 from blf_dsc_controller.configuration.plausibility import LONGEST_LAG
-from blf_dsc_controller.configuration.robot import (
-    implausible_friction,
+from blf_dsc_controller.configuration.robot import implausible_friction
+from blf_dsc_controller.configuration.rules import (
+    Excess,
+    Finding,
+    Rule,
+    Severity,
+    When,
+    findings,
 )
-from blf_dsc_controller.factory.settings import settings_of_config
-from blf_dsc_controller.law.state import Settings
+from blf_dsc_controller.errors import StartError
+from blf_dsc_controller.warnings import bounds, gains, stability
 from blf_dsc_controller.warnings.bodies import body_warnings
-from blf_dsc_controller.warnings.bounds import (
-    error_warnings,
-    width_warnings,
-)
-from blf_dsc_controller.warnings.expected_errors import (
-    expected_errors,
-)
-from blf_dsc_controller.warnings.gains import exceeded_limits
-from blf_dsc_controller.warnings.reference_load import ReferenceLoad, reference_load
-from blf_dsc_controller.warnings.stability import (
-    is_checked,
-    refuse_unstable,
-    soft_gains_warning,
-    stability_warnings,
-)
+from blf_dsc_controller.warnings.case import Case, case_of
 
 _FIRST_ERROR = 1.5  # recommended bound over the first error
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
@@ -50,8 +42,9 @@ _TIMES = (
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
 
 
-def _of_units(config: ControllerConfig) -> Iterator[str]:
+def _of_units(case: Case) -> Iterator[str]:
     """Check for values that are those of another unit."""
+    config = case.config
     lag = config.robot.lag
     if lag > LONGEST_LAG:
         yield (
@@ -70,8 +63,9 @@ def _of_units(config: ControllerConfig) -> Iterator[str]:
             )
 
 
-def _of_stop(config: ControllerConfig) -> Iterator[str]:
+def _of_stop(case: Case) -> Iterator[str]:
     """Check that the joint bounds from which a bound at the tool follows are kept."""
+    config = case.config
     share = config.safety.error_ratio
     if config.barrier.bounds_tool and not 0.0 < share <= 1.0:
         stop = (
@@ -83,63 +77,41 @@ def _of_stop(config: ControllerConfig) -> Iterator[str]:
         )
 
 
-def config_warnings(
-    config: ControllerConfig, load: ReferenceLoad | None = None
-) -> list[str]:
-    """Return the warnings, each beginning with the parameter to change first.
-
-    `load` is that of the reference, if known.
-    """
-    settings = settings_of_config(config)
-    load = load or reference_load(config, settings)
-    errors = None
-    refuse_unstable(config, settings)
-    if is_checked(config):
-        errors = expected_errors(config, settings)
-    found = [*_of_units(config), *width_warnings(config, errors), *_of_stop(config)]
-    if config.model == 'urdf':
-        found += _of_urdf(config, load)
-    found += [f'{each.subject} {each.text}' for each in exceeded_limits(config, load)]
-    if errors is not None:
-        found += stability_warnings(config, settings)
-        found += soft_gains_warning(config, settings)
-        found += error_warnings(config, settings.barrier.bound, errors)
-    if config.model != 'urdf' and config.law in (OWN, PAPER):
-        found += _of_first_error(config, settings, load)
-    if (
-        settings.has_barrier == 1
-        and settings.adaptation.weight > 0.0
-        and settings.adaptation.adaptation_gain.any()
-    ):
-        found += _of_learning(config, settings, load)
-    return found
+def _of_bodies(case: Case) -> Iterator[str]:
+    return body_warnings(case.config.robot.chain(case.config.joints))
 
 
-def _of_urdf(config: ControllerConfig, load: ReferenceLoad) -> Iterator[str]:
-    """Check for implausible figures, and for defaults that are hardly meant."""
-    yield from _of_placeholders(config)
-    chain = config.robot.chain(config.joints)
-    yield from body_warnings(chain)
-    if chain.gripper and not config.robot.tip:
+def _of_tip(case: Case) -> Iterator[str]:
+    """Check for a joint of a gripper among those of the arm."""
+    chain = case.config.robot.chain(case.config.joints)
+    if chain.gripper and not case.config.robot.tip:
         yield (
             f'robot.tip: without it, {chain.gripper} is one of the joints of the arm. If it is '
             f'that of a gripper, give the link that carries it: {chain.joints[-2].link}'
         )
-    yield from _of_unknown_efforts(config)
-    yield from _of_torque_sensors(config)
+
+
+def _of_strength(case: Case) -> Iterator[str]:
+    """Check for joints that are far too weak for their links."""
+    config = case.config
     for joint, limit, inertia, units in zip(
-        chain.joints, config.torque.limit, load.free_inertia, config.units, strict=True
+        config.joints,
+        config.torque.limit,
+        case.load.free_inertia,
+        config.units,
+        strict=True,
     ):
         if limit / inertia < _SLUGGISH:
             yield (
-                f'robot.urdf: {joint.name} accelerates at only {limit / inertia:.2g} '
+                f'robot.urdf: {joint} accelerates at only {limit / inertia:.2g} '
                 f'{units.position}/s^2 at its torque limit: are masses in kg, inertias in kg m^2, '
                 'lengths in m?'
             )
 
 
-def _of_torque_sensors(config: ControllerConfig) -> Iterator[str]:
+def _of_torque_sensors(case: Case) -> Iterator[str]:
     """Check that joint torque sensors are used if they are declared, and only then."""
+    config = case.config
     pole = config.disturbance.observer_bandwidth
     if config.has_torque_sensors and not pole and not config.commissioning.friction:
         yield (
@@ -155,8 +127,9 @@ def _of_torque_sensors(config: ControllerConfig) -> Iterator[str]:
         )
 
 
-def _of_unknown_efforts(config: ControllerConfig) -> Iterator[str]:
+def _of_unknown_efforts(case: Case) -> Iterator[str]:
     """Check for joints whose torque limit is assumed, for want of an effort."""
+    config = case.config
     joints = config.robot.chain(config.joints).joints
     assumed = {
         joint.name: f'{limit:g} {units.torque}'
@@ -173,8 +146,9 @@ def _of_unknown_efforts(config: ControllerConfig) -> Iterator[str]:
         )
 
 
-def _of_placeholders(config: ControllerConfig) -> Iterator[str]:
+def _of_placeholders(case: Case) -> Iterator[str]:
     """Check for efforts and friction that look like placeholders."""
+    config = case.config
     robot = config.robot
     chain = robot.chain(config.joints)
     if (joints := robot.placeholder_efforts(chain)) and not robot.rotor_inertia:
@@ -196,15 +170,14 @@ def _of_placeholders(config: ControllerConfig) -> Iterator[str]:
         )
 
 
-def _of_first_error(
-    config: ControllerConfig, settings: Settings, load: ReferenceLoad
-) -> Iterator[str]:
+def _of_first_error(case: Case) -> Iterator[str]:
     """Check that these gains keep the first error within the bound.
 
     The prior of such an arm is as wide as its parameters: at first the torque may err
     by all that the reference needs, which feedback and barrier make up for: K_p (K/2 +
     mu) xi1 + w xi1.
     """
+    config, settings, load = case.config, case.settings, case.load
     stiffness = (
         settings.feedback.gain * (settings.surface.gain / 2.0 + settings.surface.mu)
         + settings.barrier.weight
@@ -223,9 +196,8 @@ def _of_first_error(
         )
 
 
-def _of_learning(
-    config: ControllerConfig, settings: Settings, load: ReferenceLoad
-) -> Iterator[str]:
+def _of_learning(case: Case) -> Iterator[str]:
+    config, settings, load = case.config, case.settings, case.load
     learning = config.learning
     rate = float(settings.adaptation.adaptation_gain.max())
     what = 'kappa Gamma T'
@@ -248,3 +220,87 @@ def _of_learning(
                     f"reference's {frequency:g} rad/s: give a whole number of periods, over which "
                     'a disturbance of that frequency averages out'
                 )
+
+
+def _of_urdf(case: Case) -> bool:
+    return case.config.model == 'urdf'
+
+
+def _errs_at_first(case: Case) -> bool:
+    return case.config.model != 'urdf' and case.config.law in (OWN, PAPER)
+
+
+def _learns(case: Case) -> bool:
+    adaptation = case.settings.adaptation
+    has_gains = adaptation.weight > 0.0 and adaptation.adaptation_gain.any()
+    return bool(case.settings.has_barrier == 1 and has_gains)
+
+
+def _row(
+    name: str,
+    find: Callable[[Case], Iterable[Finding]],
+    applies: Callable[[Case], bool],
+) -> Rule:
+    return Rule(name, When.START, Severity.WARN, find, applies)
+
+
+RULES = (
+    Rule('robot.lag', When.START, Severity.WARN, _of_units),
+    Rule('safety.error_ratio', When.START, Severity.WARN, _of_stop),
+    *bounds.RULES,
+    _row('torque.limit', _of_placeholders, _of_urdf),
+    _row('robot.urdf', _of_bodies, _of_urdf),
+    _row('robot.tip', _of_tip, _of_urdf),
+    _row('torque.limit', _of_unknown_efforts, _of_urdf),
+    _row('disturbance.observer_bandwidth', _of_torque_sensors, _of_urdf),
+    _row('robot.urdf', _of_strength, _of_urdf),
+    *gains.RULES,
+    *stability.RULES,
+    _row('barrier.bound', _of_first_error, _errs_at_first),
+    _row('learning', _of_learning, _learns),
+)
+
+
+def refuse(config: ControllerConfig) -> None:
+    """Raise StartError if no arm bears the gains, unless they are insisted on."""
+    refused = findings(
+        RULES, case_of(config), When.START, Severity.REFUSE, config.insist
+    )
+    for found in refused:
+        raise StartError(str(found))
+
+
+def config_warnings(
+    config: ControllerConfig,
+    when: When = When.START,
+    *,
+    in_motors: bool = False,
+) -> list[str]:
+    """Return the warnings, each beginning with the parameter to change first.
+
+    Raises StartError if no arm bears the gains.
+    """
+    if When.START in when:
+        refuse(config)
+    case = case_of(config, in_motors=in_motors)
+    return [str(each) for each in findings(RULES, case, when, Severity.WARN)]
+
+
+def worsened(before: ControllerConfig, after: ControllerConfig) -> list[str]:
+    """Return what is wrong with gains, and was less so before a change of a running law."""
+    found = {each.subject: each for each in _excesses(after)}
+    known = {each.subject: each.use for each in _excesses(before)}
+    return [
+        str(each)
+        for subject, each in found.items()
+        if each.use > known.get(subject, 1.0)
+    ]
+
+
+def _excesses(config: ControllerConfig) -> Iterator[Excess]:
+    for severity in (Severity.WARN, Severity.REFUSE):
+        for each in findings(
+            RULES, case_of(config), When.LIVE, severity, config.insist
+        ):
+            if isinstance(each, Excess):
+                yield each
