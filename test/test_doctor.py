@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 
 import pytest
 
@@ -54,6 +55,34 @@ def test_configuration_says_what_the_controller_would_say(capsys):
     first, *others = found['config']
     assert first == ['ok', '7 joints at 1000 Hz, law blf_dsc']
     assert any('nobody has measured' in text for _, text in others)
+
+
+@pytest.mark.parametrize(
+    ('given', 'source'),
+    [
+        ('', 'assumed, for gears of any stiffness; .* drive 0.375 kg m.2, assumed'),
+        (
+            'joint_stiffness: [3.0e+4, 3.0e+4, 3.0e+4, 2.0e+4, 2.0e+4, 2.0e+4]',
+            'derived',
+        ),
+        ('rotor_inertia: [0.4, 0.4, 0.4, 0.1, 0.1, 0.1]', 'drive 0.4 kg m.2, given'),
+        ('ur5e', '900 N m/rad and 60 N m s/rad, given; integral'),
+        ('ur5e_commissioned', '714 N m/rad and .* N m s/rad, measured; integral'),
+    ],
+)
+def test_gains_of_each_joint_are_shown_with_where_they_come_from(
+    capsys, tmp_path, given, source
+):
+    path = given
+    if not given.startswith('ur5e'):
+        path = tmp_path / 'my.yaml'
+        robot = ', '.join(filter(None, ('urdf: ur5e.urdf', 'tip: tool0', given)))
+        path.write_text(f'/**: {{ros__parameters: {{robot: {{{robot}}}}}}}')
+    _, found = diagnosed(capsys, '--config', str(path))
+    assert len(found['gains']) == 6
+    level, text = found['gains'][0]
+    assert level == 'ok'
+    assert re.match(f'shoulder_pan_joint: .*{source}', text)
 
 
 def test_configuration_with_a_mistake_is_a_problem(capsys, tmp_path):

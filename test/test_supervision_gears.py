@@ -170,7 +170,7 @@ def test_gains_that_no_arm_bears_are_not_simulated_unless_they_are_insisted_on()
         ({'feedback.stiffness': 4.0}, {'feedback.stiffness': 5.0}, 'oscillates at'),
         (
             {},
-            {'feedback.stiffness': 8.0},
+            {'feedback.joint_stiffness': [9000.0] * 3 + [2250.0] * 3},
             'list feedback.stiffness in insist',
         ),
     ],
@@ -180,7 +180,7 @@ def test_other_gains_of_a_running_law_make_no_loop_unstable(before, after, said)
     running = built(**GAINS, **before)
     found = worsened(running, change(running, after))
     assert bool(found) == bool(said)
-    assert all(said in text for text in found)
+    assert not said or any(said in text for text in found)
 
 
 def test_adaptation_integrates_no_faster_than_the_disturbance_estimate():

@@ -18,6 +18,7 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.cli import computer
 from blf_dsc_controller.cli.domains import check_network, shell_domain, strangers
 from blf_dsc_controller.cli.finding import Finding, Level, note, ok, problem
+from blf_dsc_controller.cli.gains_of_joints import gains_of_joints
 from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.compiled.kernel_cache import SHIPPED, is_quick, place
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -169,6 +170,9 @@ def _configuration(path: str) -> Iterator[Finding]:
         return
     rate = 1.0 / config.sample_time
     yield ok('config', f'{len(config.joints)} joints at {rate:g} Hz, law {config.law}')
+    if config.model == 'urdf':
+        for line in gains_of_joints(config):
+            yield ok('gains', line)
     for warning in warnings:
         yield note('config', warning, '')
 
