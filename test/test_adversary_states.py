@@ -47,6 +47,7 @@ FOUND = {
     'zeros beside the arm': ('ur5e_driver', 'of another', 0.5, 0, 1, 1),
     'a pose beside the arm': ('panda', 'of another', -0.3, 3, 2, 4),
     'scaled positions': ('ur5e', 'scaled', 0.4, 1, 20, 4),
+    'five states between gaps of thirty: 4': ('openarm', 'not finite', 0.0, 0, 5, 30),
     'glitches': ('panda', 'position', -0.8, 2, 100, 1),
     'lost states': ('fr3', 'missing', 0.1, 0, 5, 4),
     'copies': ('openarm', 'copied', 0.1, 2, 1, 2),

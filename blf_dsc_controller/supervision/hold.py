@@ -296,7 +296,7 @@ class Hold:
         for each in (self._usual, self._calm):
             each.update(lacking, limit, dt)
         is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
-        is_calm |= not self._last.is_measured
+        is_calm |= not self._last.is_measured or self._last.gap > 0.0
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
 
     def _begin_observing(self, load: Vector | float) -> None:
