@@ -294,9 +294,9 @@ class Hold:
         limit = self._settings.torque.limit
         lacking = self.commanded - needed
         for each in (self._usual, self._calm):
-            each.update(lacking, limit, dt)
+            each.update(lacking, limit, dt, self._last.gap)
         is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
-        is_calm |= not self._last.is_measured or self._last.gap > 0.0
+        is_calm |= not self._last.is_measured
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
 
     def _begin_observing(self, load: Vector | float) -> None:
