@@ -75,13 +75,15 @@ class LastState:
         period: float,
         *,
         continues: bool = True,
+        is_new: bool = True,
         is_measured: bool = True,
     ) -> None:
         """Store a trusted state beside the law, `period` [s] after the last as a rule.
 
         Velocities that are not measured, not finite or beyond `fastest` (n,) [rad/s] are replaced
         with `slow`.  After a silence, whose positions show only its mean velocity, and where the
-        state does not continue the last one, `slow` begins with those that were measured.
+        state does not continue the last one, `slow` begins with those that were measured.  A
+        reading that is not new does not show how fast the arm is.
         """
         q, dq, _ = measurement.reshape(3, -1)
         elapsed = (stamp - self.stamp) * 1e-9
@@ -94,7 +96,7 @@ class LastState:
         differenced = np.zeros_like(q)
         if is_next:
             differenced = (q - self.q) / elapsed
-            self.speed = np.abs(differenced)
+            self.speed = np.abs(differenced) if is_new else self.speed
             differenced = np.clip(differenced, -fastest, fastest)
             self.slow += min(1.0, elapsed / FILTER) * (differenced - self.slow)
         is_usable = is_measured and bool((np.abs(dq) <= fastest).all())

@@ -45,10 +45,11 @@ class ObservedLoad:
     ) -> None:
         """Take what the model lacked (n,) [N m] in the last `dt` [s], of torques up to `limit`.
 
-        Where states have gaps, a load is held for a `gap` [s], and observed no faster than that.
+        Where states have gaps, a load is held for a `gap` [s], and observed over two of them: half
+        as fast as what is corrected at once.
         """
         first, second = (
-            min(1.0, rate * dt / (1.0 + rate * gap)) for rate in self._rates
+            min(1.0, rate * dt / (1.0 + 2.0 * rate * gap)) for rate in self._rates
         )
         self._residual += first * np.clip(lacking - self._residual, -limit, limit)
         self.load += second * (self._residual - self.load)

@@ -187,12 +187,14 @@ class Readings:
 
     def follow(self, reading: Reading) -> None:
         """Let a trusted reading beside the law be the last one."""
+        age = (reading.stamp - self._new_at) * NANOSECOND
         self.last.follow(
             reading.stamp,
             reading.measurement,
             self.fastest,
             self._sample_time,
             continues=reading.continues,
+            is_new=not 0.0 < age < BRIDGED * self._sample_time,
             is_measured=self._velocity is None,
         )
 
