@@ -291,10 +291,13 @@ class Hold:
         return needed if np.isfinite(needed).all() else None
 
     def _update_load(self, needed: Vector, dt: float) -> None:
+        """Update the load, once the arm answers to the damping that a gap had switched off."""
+        if not self._last.has_settled:
+            return
         limit = self._settings.torque.limit
         lacking = self.commanded - needed
         for each in (self._usual, self._calm):
-            each.update(lacking, limit, dt, self._last.gap)
+            each.update(lacking, limit, dt)
         is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
         is_calm |= not self._last.is_measured
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)

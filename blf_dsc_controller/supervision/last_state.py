@@ -52,6 +52,7 @@ class LastState:
         self.age = inf
         self.gap = 0.0
         self._gap_ended = 0  # ns, stamp of the state after it
+        self._resumed = 0  # ns, likewise after the last one
         self.stamp = -1
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
@@ -114,6 +115,11 @@ class LastState:
         self.age = 0.0
         self.stamp = stamp
 
+    @property
+    def has_settled(self) -> bool:
+        """Whether states have come since the last gap for as long as `slow` takes to settle."""
+        return (self.stamp - self._resumed) * 1e-9 >= FILTER
+
     def skip(self, period: float) -> None:
         """Account for a state that is not trusted: after some, the motion is unknown."""
         self.age += period
@@ -137,6 +143,8 @@ class LastState:
         `period` [s] is the usual time between two states.
         """
         gap = (stamp - self.stamp) * 1e-9
+        if gap > LONG_GAP * period:
+            self._resumed = stamp
         if stamp - self._gap_ended > _REMEMBERED_NS:
             self.gap = 0.0
         if self.stamp >= 0 and gap > max(self.gap, LONG_GAP * period):

@@ -40,17 +40,9 @@ class ObservedLoad:
         """Begin with a load (n,) [N m]."""
         self.load[:] = self._residual[:] = load
 
-    def update(
-        self, lacking: Vector, limit: Vector, dt: float, gap: float = 0.0
-    ) -> None:
-        """Take what the model lacked (n,) [N m] in the last `dt` [s], of torques up to `limit`.
-
-        Where states have gaps, a load is held for a `gap` [s], and observed over two of them: half
-        as fast as what is corrected at once.
-        """
-        first, second = (
-            min(1.0, rate * dt / (1.0 + 2.0 * rate * gap)) for rate in self._rates
-        )
+    def update(self, lacking: Vector, limit: Vector, dt: float) -> None:
+        """Take what the model lacked (n,) [N m] in the last `dt` [s], of torques up to `limit`."""
+        first, second = (min(1.0, rate * dt) for rate in self._rates)
         self._residual += first * np.clip(lacking - self._residual, -limit, limit)
         self.load += second * (self._residual - self.load)
         largest = _LARGEST_LOAD * limit
