@@ -41,9 +41,8 @@ from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
-_FIRST_TIME = (
-    0.5  # s since the first window, in which theta^ settles and s^2 is measured
-)
+# s since the first window, in which theta^ settles and s^2 is measured
+_FIRST_TIME = 0.5
 _REVERSING = 1.5  # `learning.coulomb_velocity`, below which a joint is about to reverse
 _RESTING = 0.005  # `learning.coulomb_velocity`, below which it rests
 # 1/L, for which it still counts as reversing, and does not count as resting

@@ -47,9 +47,8 @@ _ALARM_SQUARE = 8.0
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many
 # rows, and ever less until the mean square is of a window
 _ASSUMED_SHARE, _ASSUMED_ROWS = 0.1, 100.0
-_MOST_SQUARE = (
-    3.0  # times s^2, as which a row counts: those of a change hardly raise it
-)
+# times s^2, as which a row counts: those of a change hardly raise it
+_MOST_SQUARE = 3.0
 _LEAST_SQUARE = 0.001  # of that square, which s^2 is at least
 
 

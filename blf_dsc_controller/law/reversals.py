@@ -36,9 +36,8 @@ from blf_dsc_controller.law.lag import filter_gain
 
 _MEMORY_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
 _SHOWN_ENERGY = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
-_COULOMB_PRIOR = (
-    0.015  # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
-)
+# pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
+_COULOMB_PRIOR = 0.015
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
 _MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _NEAR_TIME = 0.1  # s around a reversal in which its torque is compared with friction's

@@ -37,9 +37,8 @@ from blf_dsc_controller.law.lag import filter_gain
 NONE, SHAKES, OFF = range(3)
 """What is wrong with r, for good, if anything."""
 
-_FADE = (
-    0.005  # s, with which r is left out or comes back: it may grow threefold in 10 ms
-)
+# s, with which r is left out or comes back: it may grow threefold in 10 ms
+_FADE = 0.005
 _FADED = 1e-6  # of r
 _SHAKING_TORQUE = 0.0125  # of the torque limit: a quarter of an oscillation of r
 _OFF_TORQUE = 0.1  # of the torque limit

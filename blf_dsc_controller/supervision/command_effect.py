@@ -11,9 +11,8 @@ Vector = NDArray[np.float64]
 _SETTLING_TIME = 0.01  # s, for which the velocities lag behind the stop
 _SPEED_TIME = 0.02  # s, against their noise
 _NOTICED_TORQUE = 0.05  # of the torque limit
-_CHANGED_COMMAND = (
-    0.2  # of it: a command that changes by more would have accelerated the arm
-)
+# of it: a command that changes by more would have accelerated the arm
+_CHANGED_COMMAND = 0.2
 _EFFECT_TIME = 0.1  # s, for which commands may have no effect
 
 

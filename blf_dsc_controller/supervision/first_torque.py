@@ -25,9 +25,8 @@ Vector = NDArray[np.float64]
 MATTERS = 0.05
 """Share of the torque limit from which a torque of gravity matters."""
 
-_RESTING_SPEED = (
-    0.05  # rad/s: below it efforts are those of rest, which encoder steps interrupt
-)
+# rad/s: below it efforts are those of rest, which encoder steps interrupt
+_RESTING_SPEED = 0.05
 _NOTICED_GRAVITY = 0.02  # of the torque of gravity; a few amperes for some fifty N m
 _ALIKE_COSINE = 0.9  # cosine of the angle between two torques
 _SEND = 'safety.first_torque: send'

@@ -20,9 +20,8 @@ from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
 _PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Franka's 30
-_IGNORED_REPEATS = (
-    3  # states in a row with the stamp of the one before that are ignored
-)
+# states in a row with the stamp of the one before that are ignored
+_IGNORED_REPEATS = 3
 _CLOCK_MOTION = 0.02  # rad/s: a slower motion shows no time
 _CLOCK_RATIO = 0.5  # of the time by the stamps
 _CLOCK_SPEED_RATIO = 0.5  # of the speed: an arm whose clock was set keeps its own
