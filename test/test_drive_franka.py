@@ -32,7 +32,7 @@ from blf_dsc_controller.drive.driver import (
     disagreements,
 )
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.messages.tip_load import TipLoad
 
 if not all(map(importlib.util.find_spec, ('pylibfranka', 'franky_sim'))):
     pytest.skip('needs pylibfranka and franky-sim', allow_module_level=True)
@@ -307,8 +307,8 @@ def test_load_is_told_in_the_frame_of_the_flange_and_none_without_mass(connected
     robot = MadeUpRobot()
     given = {'load_inertia': [0.1, 0.2, 0.3]}
     driver, _, _ = connected(robot, given, **{'robot.tip': 'fr3_link7'})
-    driver.tell_load(DriveLoad(2.0, (0.02, 0.0, 0.01)))
-    driver.tell_load(DriveLoad(0.0, (0.0, 0.0, 0.0)))
+    driver.tell_load(TipLoad(2.0, (0.02, 0.0, 0.01)))
+    driver.tell_load(TipLoad(0.0, (0.0, 0.0, 0.0)))
     (mass, centre, inertia), without_mass = robot.told
     assert (mass, inertia) == (2.0, np.diag([0.1, 0.2, 0.3]).ravel().tolist())
     np.testing.assert_allclose(centre, [0.02, 0.0, 0.01 - 0.107], atol=1e-9)

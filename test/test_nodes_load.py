@@ -21,11 +21,11 @@ from std_srvs.srv import Trigger
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.process import drain
 from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 from sim_plant.settings import plant_settings
 
 PACKAGES = ('ur_msgs', 'franka_msgs')
@@ -218,7 +218,7 @@ def test_load_that_is_put_down_has_no_centre(services, ros, kind, mass):
     ros.tester.create_service(services[kind], SERVICE, take)
     law = ros.add(ControllerNode, flatten(FR3.controller) | given)
     ros.until(lambda: law.declaration.client)
-    law.declaration.declare(DriveLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
+    law.declaration.declare(TipLoad(mass, (0.01, 0.02, 0.03) if mass else (0.0,) * 3))
     ros.until(lambda: requests)
     (request,) = requests
     at = getattr(request, 'center_of_gravity', None)

@@ -11,7 +11,7 @@ from scenario import Scenario
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.law.contact import TOUCHED
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.messages.tip_load import TipLoad
 from sim_plant.settings import plant_settings
 
 HELD = {'events.begin': [4.0], 'events.duration': [12.0], 'events.payload': [2.0]}
@@ -104,7 +104,7 @@ def test_told_load_is_left_as_it_is_until_another_is_weighed():
     """Small changes are declared as the rest of a load only, not as one of its own."""
     arm = Scenario('fr3_direct', GIVEN)
     arm.run(0.05)
-    arm.controller.take_over(DriveLoad(2.0, (0.01, -0.02, 0.05)))
+    arm.controller.take_over(TipLoad(2.0, (0.01, -0.02, 0.05)))
     load = arm.guard.controller.state.weighing.load
     declared = []
     for mass in (2.05, 2.2, 2.05):  # which begins in several steps, and goes on

@@ -24,11 +24,11 @@ from blf_dsc_controller.control.outputs import Output
 from blf_dsc_controller.errors import BlfDscError, LoopEndedError, check_type
 from blf_dsc_controller.law.weighing import DEVIATION
 from blf_dsc_controller.messages.named_values import disturbance_names
+from blf_dsc_controller.messages.tip_load import TAKEN_UP, TipLoad
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.run import FIRST_STAMP
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase
 from blf_dsc_controller.warnings.table import config_warnings, refuse
@@ -286,20 +286,47 @@ class ArmController:
             self._logged_turns.add(what)
             logging.getLogger(__name__).warning('%s %s', what, turned)
 
-    def load_to_tell(self) -> DriveLoad | None:
+    def load_to_tell(self) -> TipLoad | None:
         """Return the load to declare to the drives next, a step at a time.
 
         None: there is none, or `load.tell_drive` is false.
         """
         return self._loop.guard.load_to_tell()
 
-    def take_over(self, load: DriveLoad) -> None:
+    def take_over(self, load: TipLoad) -> None:
         """Subtract the weight of a load that the drives add from the next state on.
 
         Raises:
             BlfDscError: the drives add no weight.
         """
         self._loop.guard.take_over(load)
+
+    def expect_load(
+        self,
+        mass: float = 0.0,
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+        interval: float = TAKEN_UP,
+        *,
+        remember: bool = False,
+    ) -> None:
+        """Say what the tip takes up now, as when a gripper closes, or that it holds nothing.
+
+        The law carries it at once, instead of finding it by the error that it causes.  What is
+        said is the mean of the prior: learning corrects it.
+
+        Args:
+            mass: what the tip will hold besides what it held at the start [kg].
+            centre: of this mass, in the frame of `robot.tip` [m].
+            interval: time in which the tip takes it up [s].
+            remember: the load that the law has weighed last, instead of `mass` and `centre`.
+
+        Raises:
+            BlfDscError: this arm cannot hold that, the law is not in command, or none has been
+                weighed.
+        """
+        self._check_open()
+        load = None if remember else TipLoad.given(mass, centre)
+        self._loop.guard.expect_load(load, interval)
 
     def tare(self) -> None:
         """Take the external torque for zero where the arm rests now.

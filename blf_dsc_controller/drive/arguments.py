@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.errors import DriveError
+from blf_dsc_controller.errors import BlfDscError, DriveError
+from blf_dsc_controller.messages.tip_load import TipLoad
 
 _TURNS = 4.0 * math.pi  # rad, beyond which hardly a joint turns
 _NODES = ('blf_dsc_controller', 'drive', 'sim_plant')
@@ -129,16 +130,17 @@ def checked_timeout(timeout: Any) -> float:
 def checked_load(mass: Any, centre: Any) -> dict[str, Any]:
     """Return a load [kg] and its centre (3,) [m] as JSON has them."""
     try:
-        at = np.asarray(centre, float)
-    except (TypeError, ValueError):
-        at = np.zeros(0)
-    is_mass = _is_number(mass) and 0.0 <= mass < math.inf
-    if not is_mass or at.shape != (3,) or not np.isfinite(at).all():
-        raise DriveError(
-            f'load: got {mass!r} kg at {centre!r} m, but a mass of at least 0 and three '
-            'coordinates are needed'
-        )
-    return {'mass': float(mass), 'centre': at.tolist()}
+        load = TipLoad.given(mass, centre)
+    except BlfDscError as error:
+        raise DriveError(str(error)) from None
+    return {'mass': load.mass, 'centre': list(load.centre)}
+
+
+def checked_interval(interval: Any) -> float:
+    """Return the time [s] in which a tip takes up a load."""
+    if _is_number(interval):
+        return float(interval)
+    raise DriveError(f'interval: got {interval!r}, but seconds are needed')
 
 
 def checked_joints(joints: Any) -> list[str]:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from blf_dsc_controller.drive.arguments import (
     checked_config,
+    checked_interval,
     checked_joints,
     checked_load,
     checked_overrides,
@@ -39,6 +40,7 @@ from blf_dsc_controller.errors import (
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.script_link import ArmState
+from blf_dsc_controller.messages.tip_load import TAKEN_UP
 
 if TYPE_CHECKING:
     from blf_dsc_controller.drive.pose import Pose, Poses
@@ -269,6 +271,41 @@ class Drive:
         wanted = checked_load(mass, centre)
         self._ask(
             script_link.LOAD, lambda number: {'number': number, **wanted}, timeout
+        )
+
+    def expect_load(
+        self,
+        mass: float = 0.0,
+        centre: Sequence[float] = (0.0, 0.0, 0.0),
+        interval: float = TAKEN_UP,
+        *,
+        remember: bool = False,
+        timeout: float | None = None,
+    ) -> None:
+        """Say what the tip takes up now, as when a gripper closes, or that it holds nothing.
+
+        The law carries it at once, instead of finding it by the error that it causes, and learning
+        corrects it.  `load` is for the drives of the robot; this is for the law.
+
+        Args:
+            mass: what the tip will hold besides what it held at the start [kg].
+            centre: of this mass, in the frame of `robot.tip` [m].
+            interval: time in which the tip takes it up [s].
+            remember: the load that the law has weighed last, instead of `mass` and `centre`.
+            timeout: longest time to wait [s].
+
+        Raises:
+            MotionFailedError: this arm cannot hold that, the law is not in command, or none has
+                been weighed.
+            NotInTimeError, LoopEndedError: as for `move_to`.
+        """
+        wanted = {
+            **checked_load(mass, centre),
+            'interval': checked_interval(interval),
+            'remember': bool(remember),
+        }
+        self._ask(
+            script_link.EXPECT, lambda number: {'number': number, **wanted}, timeout
         )
 
     def tare(self, timeout: float | None = None) -> None:

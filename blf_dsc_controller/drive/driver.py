@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.motors.frame import Frame, Ranges
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 Vector = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ class Driver(ABC):
         del frame
         raise _only_torques(type(self))
 
-    def tell_load(self, load: DriveLoad) -> None:
+    def tell_load(self, load: TipLoad) -> None:
         """Declare this load, in the frame of the tip; called in another thread.
 
         Raises:

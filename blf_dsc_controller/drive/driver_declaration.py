@@ -6,7 +6,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from blf_dsc_controller.drive.driver import Driver, DriverError
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.supervision.load_declaration import (
     DeclarationError,
     LoadDeclaration,
@@ -28,12 +28,12 @@ class DriverDeclaration(LoadDeclaration):
         self._answer: Future[None] | None = None
         self._thread: ThreadPoolExecutor | None = None
 
-    def declare(self, load: DriveLoad) -> None:
+    def declare(self, load: TipLoad) -> None:
         """Tell the driver, in the thread."""
         self._thread = self._thread or ThreadPoolExecutor(1, 'load')
         self._answer = self._thread.submit(self._driver.tell_load, load)
 
-    def is_in_force(self, load: DriveLoad) -> bool:
+    def is_in_force(self, load: TipLoad) -> bool:
         """Whether the robot reports this load, or has accepted it and reports none.
 
         Raises:

@@ -27,7 +27,7 @@ from blf_dsc_controller.drive.driver import (
     ReflexError,
     RobotState,
 )
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.messages.tip_load import TipLoad
 
 Vector = NDArray[np.float64]
 _JOINTS = 7
@@ -109,9 +109,9 @@ class FrankaDriver(Driver):
         """Declare `robot.drive_payload` to the robot, whose model then includes it."""
         if self.config.set_load:
             robot = self.controller.robot
-            self.tell_load(DriveLoad(robot.drive_payload, robot.drive_payload_centre))
+            self.tell_load(TipLoad(robot.drive_payload, robot.drive_payload_centre))
 
-    def tell_load(self, load: DriveLoad) -> None:
+    def tell_load(self, load: TipLoad) -> None:
         """Send a load; the robot takes it in motion, too."""
         has_load = load.mass > 0.0
         centre = self._tip @ np.append(load.centre, 1.0) if has_load else np.zeros(4)

@@ -20,16 +20,16 @@ from blf_dsc_controller.control.goals import Goals
 from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.drive.loop import DriveLoop
-from blf_dsc_controller.errors import BlfDscError, TareError
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.script_link import ArmState, encode_sample
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.reference.turns import short_way
 from blf_dsc_controller.run import TURNING
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 
 _PERIOD = 0.005  # s of the robot's time between two samples
 _SHORTEST = 0.1  # s, of a move
@@ -123,8 +123,10 @@ class Script(Beside):
                 self._brake(wanted)
             case script_link.LOAD:
                 self._declare(wanted)
+            case script_link.EXPECT:
+                self._expect(wanted)
             case script_link.TARE:
-                self._tare(wanted)
+                self._answer(wanted, self._guard.findings.tare)
             case script_link.CLOSE:
                 self._close()
 
@@ -160,16 +162,26 @@ class Script(Beside):
         else:
             self._braking.append((end, number))
 
-    def _tare(self, number: int) -> None:
+    def _expect(self, wanted: dict[str, Any]) -> None:
+        load = TipLoad(wanted['mass'], tuple(wanted['centre']))
+        self._answer(
+            wanted['number'],
+            lambda: self._guard.expect_load(
+                None if wanted['remember'] else load, wanted['interval']
+            ),
+        )
+
+    def _answer(self, number: int, act: Callable[[], object]) -> None:
+        """Do what a request asks for at once, and say that it is done, or why not."""
         try:
-            self._guard.findings.tare()
-        except TareError as error:
+            act()
+        except BlfDscError as error:
             self._tell_done(number, str(error))
         else:
             self._tell_done(number)
 
     def _declare(self, wanted: dict[str, Any]) -> None:
-        load = DriveLoad(wanted['mass'], tuple(wanted['centre']))
+        load = TipLoad(wanted['mass'], tuple(wanted['centre']))
         try:
             self._guard.loads.declare(load)
         except BlfDscError as error:

@@ -21,10 +21,10 @@ from blf_dsc_controller.configuration.motor_options import limits_of
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.drive.driver import Driver, Facts, ReflexError, RobotState
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.motors.damiao import ranges_of
 from blf_dsc_controller.motors.frame import Frame, Ranges, torque_alone
 from blf_dsc_controller.run import FIRST_STAMP, NANOSECOND
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 from sim_plant.kernels import plant_views
 from sim_plant.motors import IN_REAL_TIME, MotorPlant
 from sim_plant.plant import plant_of
@@ -51,7 +51,7 @@ class SimulatedDriver(Driver):
         self._is_braked = True
         self._count = 0
         self._due = 0.0
-        self._load = DriveLoad(
+        self._load = TipLoad(
             self.plant_config.robot.drive_payload,
             self.plant_config.robot.drive_payload_centre,
         )
@@ -108,7 +108,7 @@ class SimulatedDriver(Driver):
             self._put_into_force(self._load)
         self._advance()
 
-    def tell_load(self, load: DriveLoad) -> None:
+    def tell_load(self, load: TipLoad) -> None:
         """Let the drives add the weight of a load from the next state on."""
         self._load = load
 
@@ -130,7 +130,7 @@ class SimulatedDriver(Driver):
         self._torque[:] = 0.0
         self._is_braked = True
 
-    def _put_into_force(self, load: DriveLoad) -> None:
+    def _put_into_force(self, load: TipLoad) -> None:
         given = {
             'robot.drive_payload': load.mass,
             'robot.drive_payload_centre': list(load.centre),

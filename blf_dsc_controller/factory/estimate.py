@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import deepcopy
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,7 +16,9 @@ from blf_dsc_controller.arms.base_parameters import (
     UNKNOWN_ROTOR,
     prior_factor,
 )
+from blf_dsc_controller.arms.inertia import inertia_of, moved
 from blf_dsc_controller.arms.model import ArmModel, arm_model, regressors_at
+from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import UNKNOWN_FRICTION, parameters_of
 from blf_dsc_controller.configuration.two_link import two_link
@@ -129,6 +132,18 @@ def estimate_names(config: ControllerConfig) -> tuple[str, ...]:
         *model_of(config).parameter_names,
         *(column.name for column in columns_of(config)),
     )
+
+
+def tip_parameters(config: ControllerConfig, loads: Iterable[np.ndarray]) -> np.ndarray:
+    """Return by how much each of k loads changes the base parameters (p, k).
+
+    A load is a pseudo-inertia (4, 4) in the frame of the tip.
+    """
+    robot = config.robot
+    chain = robot.chain(config.joints)
+    K = parameters_of(robot, chain).K[:, -(ROTOR + 1) : -1]
+    moves = [inertia_of(moved(load, chain.tip_placement)) for load in loads]
+    return product(K, np.transpose(moves))
 
 
 def prior_covariance(config: ControllerConfig) -> np.ndarray:

@@ -14,9 +14,8 @@ from blf_dsc_controller.arms.base_parameters import (
     deviations,
     payload_inertia,
 )
-from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.arms.joint_gains import SURFACE
-from blf_dsc_controller.arms.serial_chain import ROTOR
 from blf_dsc_controller.compiled.layout import filled
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.robot import (
@@ -31,6 +30,7 @@ from blf_dsc_controller.factory.estimate import (
     doubting_covariance,
     model_of,
     prior_covariance,
+    tip_parameters,
 )
 from blf_dsc_controller.factory.gains import law_gains
 from blf_dsc_controller.factory.inertia import joint_inertia
@@ -56,7 +56,7 @@ from blf_dsc_controller.law import (
     window,
 )
 from blf_dsc_controller.law.state import Settings
-from blf_dsc_controller.numerics.algebra import inverse, product
+from blf_dsc_controller.numerics.algebra import inverse
 
 _COLUMNS = 1.0  # Gamma of the disturbance columns
 _CHECKS = 0.01  # s, between two checks of the excitation
@@ -145,11 +145,13 @@ def _parts_of_learning(
 ) -> dict[str, Any]:
     """Return theta^ at first, its prior, and the settings of what learns it, by field."""
     initial = (column.initial for column in learned)
+    estimate = np.array((*law_gains(config).initial_estimate, *initial))
     covariance = prior_covariance(config)
     sliding = _window(config)
     of = _columns(config, p)
     return {
-        'initial_estimate': np.array((*law_gains(config).initial_estimate, *initial)),
+        'initial_estimate': estimate,
+        'prior_mean': estimate.copy(),
         'information': inverse(covariance),
         'row_information': inverse(doubting_covariance(config)),
         'columns': of,
@@ -460,7 +462,10 @@ def _weighing(
     )
     if not config.weighs:
         return settings
-    loaded, D = _loaded_parameters(config)
+    D = deviations(
+        payload_inertia(max(config.robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE
+    )
+    loaded = tip_parameters(config, map(pseudo_inertia, D.T))
     p = len(loaded)
     changed = _changed_friction(learned)
     since = weighing.LOAD + changed.shape[1]
@@ -478,17 +483,6 @@ def _weighing(
         columns=columns,
         scale=scale,
     )
-
-
-def _loaded_parameters(config: ControllerConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return N D and D: base parameters (p, 10) and load phi (10, 10) by its deviations z."""
-    robot = config.robot
-    chain = robot.chain(config.joints)
-    D = deviations(payload_inertia(max(robot.payload, 1.0)), 1.0, 2.0 * PAYLOAD_SIZE)
-    T = chain.tip_placement
-    K = parameters_of(robot, chain).K[:, -(ROTOR + 1) : -1]
-    moves = [inertia_of(moved(pseudo_inertia(direction), T)) for direction in D.T]
-    return product(K, np.transpose(moves)), D
 
 
 def _unsure_breakaway(config: ControllerConfig) -> np.ndarray:

@@ -39,6 +39,7 @@ class State(NamedTuple):
 
     changes: Cell  # number of times that the arm was found to have changed
     hasty: Cell  # the last changes that came soon after the one before
+    announced: Cell  # 1: the arm changes now, as somebody has said
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     recent_residual: Cell  # of the last rows against the solution, (N m)^2
     # with a prior: theta of the rows so far, and the factor of its equations

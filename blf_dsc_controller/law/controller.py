@@ -11,7 +11,7 @@ import numpy as np
 from blf_dsc_controller.compiled.jit import direct
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law import barrier, external_torque, friction
+from blf_dsc_controller.law import barrier, external_torque, friction, load_observer
 from blf_dsc_controller.law.check_state import checks_of, checks_size
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
@@ -115,8 +115,8 @@ class Controller:
     def reset(self) -> None:
         """Return to the initial state: initial estimate, empty filters and window."""
         self.state_vector.fill(0.0)
-        self.state.estimate[:] = self.settings.initial_estimate
-        self.state.latch.anchor[:] = self.settings.initial_estimate
+        self.state.estimate[:] = self.settings.prior_mean
+        self.state.latch.anchor[:] = self.settings.prior_mean
         self.state.window.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
         self.state.latch.active.fill(1.0)
         self.state.rotors.gain_scale.fill(1.0)
@@ -206,6 +206,18 @@ class Controller:
         self.state.saturation.added[:] = added_torque(self.settings.torque, q)
         self.state.saturation.held_back[:] = 0.0
         self.state.saturation.takes_over[0] = 1.0
+
+    def expect(self, load: Array) -> None:
+        """Let the mean of the prior have a `load`, base parameters (p,), from now on."""
+        mean = self.settings.prior_mean
+        mean[:] = self.settings.initial_estimate
+        mean[: load.size] += load
+
+    def shift_estimate(self, change: Array) -> None:
+        """Add an expected `change` (p,) of base parameters to the estimate, with its torque."""
+        for each in (self.state.estimate, self.state.latch.anchor):
+            each[: change.size] += change
+        load_observer.expect(self.settings.observer, self.state.observer, change)
 
     def replace_torque(self, torque: Array) -> None:
         """Let another torque (n,) [N m] leave than the one of the last update."""

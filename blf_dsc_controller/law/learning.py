@@ -77,7 +77,7 @@ def check_excitation(
 ) -> None:
     """Latch the window at time t [s] if it suffices."""
     sliding = Window(settings.window, state.window, signals.scratch.window)
-    prior = Prior(settings.initial_estimate, settings.information)
+    prior = Prior(settings.prior_mean, settings.information)
     excitation.update_excitation(
         settings.excitation,
         state.latch,
@@ -199,12 +199,13 @@ def detect_change(
 ) -> None:
     """Forget the window if the arm has changed: its rows contradict each other, or the solution.
 
-    If the window was latched before it was full, the estimate returns to the one before;
+    Somebody may also have announced it; then nothing that was learned before is in doubt.  If the
+    window was latched before it was full, the estimate returns to the one before;
     of friction, only what reversals have shown of late is taken back.
     """
     of, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.scratch.window)
-    prior = Prior(settings.initial_estimate, settings.row_information)
+    prior = Prior(settings.prior_mean, settings.row_information)
     if change.is_predicted(sliding):
         has_changed = change.compare_with_rows(
             state.change,
@@ -221,10 +222,14 @@ def detect_change(
         has_changed = change.compare_with_solution(
             of, state.change, signals.scratch.change, latch, row, dt
         )
-    if not has_changed:
+    is_announced = state.change.announced[0] == 1.0
+    if not (has_changed or is_announced):
         return
-    reversals.take_back(state.friction.reversals, state.friction.breakaway)
-    if latch.latched[0] == 1.0:
+    if is_announced:
+        state.change.announced[0] = state.change.hasty[0] = 0.0
+    else:
+        reversals.take_back(state.friction.reversals, state.friction.breakaway)
+    if latch.latched[0] == 1.0 and not is_announced:
         friction.return_estimate(
             settings.friction, state.friction, latch.active, state.estimate
         )

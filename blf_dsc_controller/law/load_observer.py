@@ -259,6 +259,16 @@ def transfer_learned(
         state.steady[i] -= given_up
 
 
+def expect(settings: Settings, state: State, change: Array) -> None:
+    """Hold what r gives up by an expected `change` (p,) of P^ until the sensors show it.
+
+    It fades with L, as r would catch up, whether or not the load comes.
+    """
+    if state.torque.size and has_settled(settings, state):
+        given_up = state.filtered[:, : change.size] @ change
+        state.handover[:] += (1.0 - state.faded[0]) * given_up
+
+
 @inner
 def hand_over(
     settings: Settings,

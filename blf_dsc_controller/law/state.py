@@ -52,6 +52,8 @@ class Settings(NamedTuple):
     memory: int  # numbers in the memory of a law of a file
     has_barrier: int  # 1: the law keeps the error inside its bound
     initial_estimate: Annotated[Array, 'm']  # P^(0), then that of the columns
+    # mean of the prior of theta: P^(0) with the load that the tip is expected to hold
+    prior_mean: Annotated[Array, 'm']
     # R, inverse covariance of the prior of theta
     information: Annotated[Array, 'm', 'm']
     # of the prior that rows are compared with, which doubts guessed drives

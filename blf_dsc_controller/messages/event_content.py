@@ -145,6 +145,11 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
         'mass': Field(NUMBER),  # kg
         'centre': Field(NUMBERS),  # m
     },
+    'expected load': {  # what the tip takes up besides what it held at the start, as somebody says
+        'mass': Field(NUMBER),  # kg
+        'centre': Field(NUMBERS),  # m, in the frame of the tip
+        'interval': Field(NUMBER),  # s, in which it does
+    },
     'tare': {},  # the external torque is zero where the arm rests now
     'contact': {
         'reaction': Field(TEXT),

@@ -45,6 +45,7 @@ class EventType(str, Enum):
     BRAKE = 'brake'
     PARAMETERS = 'parameters'
     DRIVE_LOAD = 'drive load'  # the drives add the weight of a load from now on
+    EXPECTED_LOAD = 'expected load'  # somebody says what the tip takes up
     TARE = 'tare'  # the external torque of the arm at rest is taken for zero
     CONTACT = 'contact'  # something touches the arm
     OSCILLATION = 'oscillation'  # the arm oscillates

@@ -34,6 +34,9 @@ LOAD = 115
 """The drives are to add a load: `number`, `mass` [kg], `centre` [m]."""
 TARE = 118
 """Take the external torque for zero: the number of the request."""
+EXPECT = 119
+"""The tip takes up a load: `number`, `mass` [kg], `centre` [m], `interval` [s], or the last one
+weighed if `remember`."""
 CLOSE = 116
 """End at rest; a second one ends at once."""
 RECOVER = 117

@@ -5,23 +5,26 @@ from __future__ import annotations
 
 import sys
 import traceback
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import Inertia
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, WATCHDOG
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
-from blf_dsc_controller.errors import TareError
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
     Float64MultiArrayEncoder,
     JointStateDecoder,
 )
 from blf_dsc_controller.messages.errors import MessageError
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_log import ControllerLog
 from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
@@ -92,6 +95,13 @@ class ControllerNode(LoopNode[ControllerConfig]):
         )
         if self.config.contact.enabled:
             self.create_service(Trigger, '~/tare', self._on_tare)
+        if self.config.robot.tip:
+            self.create_subscription(
+                Inertia, '~/expected_load', self._on_expected_load, 10
+            )
+            self.create_service(
+                Trigger, '~/expect_last_load', self._on_expect_last_load
+            )
         self.start()
 
     # Life cycle.
@@ -235,18 +245,39 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         """Take the external torque for zero, or say why not."""
-        response.success, response.message = self._tared()
-        self._report()
+        response.success, response.message = self._answer(
+            lambda guard: guard.findings.tare(), 'the external torque is zero here'
+        )
         return response
 
-    def _tared(self) -> tuple[bool, str]:
+    def _on_expect_last_load(
+        self, _request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Let the law expect the load that it has weighed last, or say why not."""
+        response.success, response.message = self._answer(
+            lambda guard: guard.expect_load(None), 'the last load is expected'
+        )
+        return response
+
+    def _on_expected_load(self, message: Inertia) -> None:
+        """Let the law expect a load of the tip: mass and centre of mass, no more of it."""
+        centre = message.com.x, message.com.y, message.com.z
+        accepted, text = self._answer(
+            lambda guard: guard.expect_load(TipLoad.given(message.m, centre)), ''
+        )
+        if not accepted:
+            self.get_logger().warning(f'~/expected_load: {text}')
+
+    def _answer(self, act: Callable[[Guard], object], done: str) -> tuple[bool, str]:
+        """Do what somebody asks for; return whether it is `done`, and that or why not."""
         if self.guard is None:
             return False, f'{self.get_name()} is {self.state_label}: activate it first'
         try:
-            self.guard.findings.tare()
-        except TareError as error:
+            act(self.guard)
+        except BlfDscError as error:
             return False, str(error)
-        return True, 'the external torque is zero here'
+        self._report()
+        return True, done
 
     # The loop.
 

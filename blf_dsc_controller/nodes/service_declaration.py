@@ -18,7 +18,7 @@ from rclpy._rclpy_pybind11 import RCLError
 from rclpy.node import Node
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.supervision.load_declaration import (
     DeclarationError,
     LoadDeclaration,
@@ -95,7 +95,7 @@ class ServiceDeclaration(LoadDeclaration):
         """Whether the service is there."""
         return self.client is not None and self.client.service_is_ready()
 
-    def declare(self, load: DriveLoad) -> None:
+    def declare(self, load: TipLoad) -> None:
         """Ask the service to accept a load.
 
         Raises:
@@ -116,7 +116,7 @@ class ServiceDeclaration(LoadDeclaration):
                 f'{self._name} cannot be called ({error}): see whether its driver still runs'
             ) from error
 
-    def is_in_force(self, load: DriveLoad) -> bool:
+    def is_in_force(self, load: TipLoad) -> bool:
         """Whether the service has accepted this load.
 
         Raises:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.reference.retargeting import Target
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
-from blf_dsc_controller.supervision.drive_load import DriveLoad
 from blf_dsc_controller.supervision.guard import Guard
 
 Content = Mapping[str, Any]
@@ -41,7 +41,12 @@ def _follow_target(guard: Guard, content: Content) -> None:
 
 
 def _declare_load(guard: Guard, content: Content) -> None:
-    guard.take_over(DriveLoad(content['mass'], tuple(content['centre'])))
+    guard.take_over(TipLoad(content['mass'], tuple(content['centre'])))
+
+
+def _expect_load(guard: Guard, content: Content) -> None:
+    load = TipLoad(content['mass'], tuple(content['centre']))
+    guard.expect_load(load, content['interval'])
 
 
 GUARD_CALLS: dict[EventType, Callable[[Guard, Content], object]] = {
@@ -56,8 +61,9 @@ GUARD_CALLS: dict[EventType, Callable[[Guard, Content], object]] = {
     EventType.BRAKE: lambda guard, _: guard.motions.brake(),
     EventType.TARE: lambda guard, _: guard.findings.tare(),
     EventType.DRIVE_LOAD: _declare_load,
+    EventType.EXPECTED_LOAD: _expect_load,
 }
 """For each event, the call of a guard with the event's content.
 
-Each raises what the guard raises: TrajectoryError, TareError, StartError or MotionError.
+Each raises what the guard raises, a BlfDscError.
 """

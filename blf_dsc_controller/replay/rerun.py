@@ -21,7 +21,7 @@ from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change, parameters
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.errors import BlfDscError, TareError
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType
 from blf_dsc_controller.messages.topics import TRACKING_ERROR, Message, Topic
@@ -300,8 +300,8 @@ class Rerun:
         except TrajectoryError as error:
             self._depart(f'trajectory accepted ({error})', event.stamp)
             return
-        except TareError as error:
-            self._depart(f'tared ({error})', event.stamp)
+        except BlfDscError as error:
+            self._depart(f'{event.type} ({error})', event.stamp)
             return
         if pending and _key(pending[0]) == _key(event):
             self._compare(event, pending.popleft())

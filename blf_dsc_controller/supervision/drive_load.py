@@ -17,7 +17,6 @@ torque by more than `_STEP` of its limit, each after the one before has taken ef
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +30,7 @@ from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.load_observer import most_load
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.law.weighing import DEVIATION, MASS
+from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 Vector = NDArray[np.float64]
@@ -46,26 +46,6 @@ def widest_interval(mass: ArrayLike) -> Vector:
     return np.maximum(_NARROW, _SHARE * np.abs(mass))
 
 
-class DriveLoad(NamedTuple):
-    """A load that drives compensate, in the frame of the tip."""
-
-    mass: float  # kg
-    centre: tuple[float, ...]  # (3,) m
-
-    @property
-    def moments(self) -> Vector:
-        """Mass and first moments (4,) [kg, kg m]."""
-        return self.mass * np.array((1.0, *self.centre))
-
-    @classmethod
-    def of(cls, moments: Vector) -> DriveLoad:
-        """Return the load with these mass and first moments."""
-        mass = float(moments[0])
-        if mass <= 0.0:
-            return cls(0.0, (0.0, 0.0, 0.0))
-        return cls(mass, tuple((moments[1:] / mass).tolist()))
-
-
 class DriveLoads:
     """The load that is declared to the drives of an arm, step by step.
 
@@ -78,17 +58,17 @@ class DriveLoads:
 
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:
         robot = config.robot
-        self._at_start = DriveLoad(robot.drive_payload, robot.drive_payload_centre)
+        self._at_start = TipLoad(robot.drive_payload, robot.drive_payload_centre)
         self.in_force = self._at_start
         # when the law began to learn: at the start, or at a reset
         self._base = self._at_start
-        self._wanted: DriveLoad | None = None  # by hand, whatever is weighed
+        self._wanted: TipLoad | None = None  # by hand, whatever is weighed
         self._controller = controller
         self._robot, self._joints = robot, config.joints
         self._is_used = config.load.tell_drive
         self._goes_on = False  # a load has been declared in part
 
-    def declare(self, load: DriveLoad) -> None:
+    def declare(self, load: TipLoad) -> None:
         """Let the steps lead to this load, whatever is weighed.
 
         Raises:
@@ -105,7 +85,7 @@ class DriveLoads:
             )
         self._is_used = True
 
-    def take(self, load: DriveLoad) -> None:
+    def take(self, load: TipLoad) -> None:
         """Count the weight of this load, which the drives add from now on, in the law.
 
         Raises:
@@ -142,7 +122,7 @@ class DriveLoads:
         most = 0.0 if is_left_out else most_load(settings.torque.limit)
         settings.observer.most[:] = most
 
-    def begin_step(self) -> DriveLoad | None:
+    def begin_step(self) -> TipLoad | None:
         """Begin the next step: return the load to declare; None if there is none, or too uncertain.
 
         Nothing is declared while something touches the arm.
@@ -159,14 +139,12 @@ class DriveLoads:
         )
         q = controller.signals.q[np.newaxis]
         (H,) = regressors_at(chain, q, *np.zeros((3, 1, settings.n)))
-        change = H @ (
-            self._columns(DriveLoad.of(target)) - self._columns(self.in_force)
-        )
+        change = H @ (self._columns(TipLoad.of(target)) - self._columns(self.in_force))
         largest = float((np.abs(change) / (_STEP * settings.torque.limit)).max())
         part = min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
         moments = self.in_force.moments
         self._goes_on = part < 1.0
-        return DriveLoad.of(moments + part * (target - moments))
+        return TipLoad.of(moments + part * (target - moments))
 
     def _left(self) -> Vector | None:
         """Return mass and moments (4,) that a user declares; None: the drives have them."""
@@ -195,7 +173,7 @@ class DriveLoads:
                 return None
             picked_up[:] = load[MASS] * np.array((1.0, *load[MASS + 1 : DEVIATION]))
         target = self._base.moments + picked_up
-        target = np.asarray(DriveLoad.of(target).moments)
+        target = np.asarray(TipLoad.of(target).moments)
         is_new = abs(target[0] - self.in_force.mass) > narrow
         return target if is_new or self._goes_on else None
 
@@ -206,7 +184,7 @@ class DriveLoads:
         since = self._columns(self.in_force) - self._columns(self._base)
         return self._columns(self._at_start) + since
 
-    def _columns(self, load: DriveLoad) -> Vector:
+    def _columns(self, load: TipLoad) -> Vector:
         """Return the factors of the columns of the drives' gravity, with this load."""
         robot = replace(
             self._robot, drive_payload=load.mass, drive_payload_centre=load.centre

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import differences
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.check_state import INVALID
 from blf_dsc_controller.law.checks import is_valid_state
 from blf_dsc_controller.messages.errors import (
@@ -32,11 +33,13 @@ from blf_dsc_controller.messages.errors import (
     ShortArrayError,
 )
 from blf_dsc_controller.messages.journal import EventType
+from blf_dsc_controller.messages.tip_load import TAKEN_UP, TipLoad
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision import retuning
-from blf_dsc_controller.supervision.drive_load import DriveLoad, DriveLoads
+from blf_dsc_controller.supervision.drive_load import DriveLoads
 from blf_dsc_controller.supervision.envelope import LONGEST, Motion, limited
 from blf_dsc_controller.supervision.envelope_limits import limits_of
+from blf_dsc_controller.supervision.expected_load import ExpectedLoad
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.motions import Motions
@@ -64,6 +67,7 @@ class Guard(InCommand):
     Attributes:
         findings: contacts, oscillations and wrong sensors that the law has found.
         loads: the load that is declared to the drives.
+        expected: the load that the tip is expected to hold.
         starting: activation, reset, and the start from a state.
         motions: trajectories and targets, planned and followed.
         foreign: number of messages ignored because they name none of the joints.
@@ -80,7 +84,8 @@ class Guard(InCommand):
         super().__init__(config, steady, wall)
         self.findings = Findings(self)
         self.loads = DriveLoads(config, self.controller)
-        self.starting = Starting(self, self.findings, self.loads)
+        self.expected = ExpectedLoad(config, self.controller)
+        self.starting = Starting(self, self.findings, self.loads, self.expected)
         self.motions = Motions(self, self.findings.contacts)
         self.foreign = 0
         self.compute_time = 0.0
@@ -160,6 +165,7 @@ class Guard(InCommand):
     def _update_law(self, reading: Reading, dt: float) -> Vector:
         """Return the law's torque (n,) [N m], `dt` [s] after its last sample."""
         before = perf_counter()
+        self.expected.advance()
         t = self.reference.time_of(reading.stamp)
         torque = self.controller.update(t, dt, reading.measurement)
         self.compute_time = perf_counter() - before
@@ -192,8 +198,11 @@ class Guard(InCommand):
 
         Call it after its torque has been sent.
         """
-        if self.has_sample and self.controller.perceive(self.config.sample_time):
+        if not self.has_sample:
+            return
+        if self.controller.perceive(self.config.sample_time):
             self.findings.react_to_contact()
+        self.expected.observe()
 
     def observe(self, stamp: int, measurement: Vector) -> None:
         """Compare velocities with positions for a state that is held back."""
@@ -265,16 +274,35 @@ class Guard(InCommand):
         else:
             self.stop(reason, text)
 
-    def load_to_tell(self) -> DriveLoad | None:
+    def load_to_tell(self) -> TipLoad | None:
         """Return the load to declare to the drives next, None if there is none."""
         return self.loads.begin_step() if self.has_sample else None
 
-    def take_over(self, load: DriveLoad) -> None:
+    def take_over(self, load: TipLoad) -> None:
         """Subtract the weight of a load that the drives add from the next state on."""
         self.loads.take(load)
         centre = list(load.centre)
         self.note(EventType.DRIVE_LOAD, mass=load.mass, centre=centre)
         self.held.recent.restart()  # the torques so far met drives without it
+
+    def expect_load(self, load: TipLoad | None, interval: float = TAKEN_UP) -> None:
+        """Let the law expect that the tip takes up this load within an `interval` [s] from now.
+
+        None: the load that was weighed last.
+
+        Raises:
+            BlfDscError: it is no load of this arm's tip, or the law is not in command.
+        """
+        if not self.supervisor.running:
+            why = self.supervisor.text or self.supervisor.phase
+            raise BlfDscError(
+                f'expected load: the law is not in command ({why}): expect it once it is'
+            )
+        load = self.expected.expect(load, interval, self.readings.last.q)
+        centre = list(load.centre)
+        self.note(
+            EventType.EXPECTED_LOAD, mass=load.mass, centre=centre, interval=interval
+        )
 
     def retune(self, config: ControllerConfig) -> None:
         """Apply a configuration, between two samples."""
@@ -287,6 +315,7 @@ class Guard(InCommand):
         else:
             retuning.apply(self.controller, config)
         self.loads.subtract_again()
+        self.expected.apply_again()
         self.config = config
         self.oscillation.configure(config)
         self.samples.set_limits(config.safety)

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from typing import Protocol
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.supervision.drive_load import DriveLoad
+from blf_dsc_controller.messages.tip_load import TipLoad
 
 _EVERY = 20  # states, from one step that is in force to the next
 
@@ -27,10 +27,10 @@ class LawWithLoad(Protocol):
     def is_at_rest(self) -> bool:
         """Whether the reference and the arm rest."""
 
-    def load_to_tell(self) -> DriveLoad | None:
+    def load_to_tell(self) -> TipLoad | None:
         """Return the next step; None if there is none."""
 
-    def take_over(self, load: DriveLoad) -> None:
+    def take_over(self, load: TipLoad) -> None:
         """Subtract the weight of this load from the next state on."""
 
 
@@ -45,9 +45,9 @@ class LoadDeclaration(ABC):
 
     def __init__(self) -> None:
         self.problem = ''
-        self.in_force: DriveLoad | None = None
+        self.in_force: TipLoad | None = None
         self.states = 0
-        self._declared: DriveLoad | None = None  # not yet in force
+        self._declared: TipLoad | None = None  # not yet in force
 
     def follow(self, law: LawWithLoad, *, in_motion: bool) -> None:
         """Before each state: let the law take over a step in force, or declare the next.
@@ -69,7 +69,7 @@ class LoadDeclaration(ABC):
         except DeclarationError as error:
             self.give_up(str(error))
 
-    def _take_over_in_force(self, law: LawWithLoad, load: DriveLoad) -> None:
+    def _take_over_in_force(self, law: LawWithLoad, load: TipLoad) -> None:
         if self.is_in_force(load):
             self.states = 0
             self.in_force, self._declared = load, None
@@ -84,7 +84,7 @@ class LoadDeclaration(ABC):
         return True
 
     @abstractmethod
-    def declare(self, load: DriveLoad) -> None:
+    def declare(self, load: TipLoad) -> None:
         """Begin to tell the drives a load in the frame of the tip, without waiting.
 
         Raises:
@@ -92,7 +92,7 @@ class LoadDeclaration(ABC):
         """
 
     @abstractmethod
-    def is_in_force(self, load: DriveLoad) -> bool:
+    def is_in_force(self, load: TipLoad) -> bool:
         """Whether the drives add the weight of this load, which was declared last.
 
         Raises:

@@ -13,6 +13,7 @@ from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.reference.approach import BlendedReference, MotionError
 from blf_dsc_controller.supervision.drive_load import DriveLoads
+from blf_dsc_controller.supervision.expected_load import ExpectedLoad
 from blf_dsc_controller.supervision.findings import Findings
 from blf_dsc_controller.supervision.first_torque import (
     check_first_torque,
@@ -34,7 +35,11 @@ class Starting:
     """
 
     def __init__(
-        self, command: InCommand, findings: Findings, loads: DriveLoads
+        self,
+        command: InCommand,
+        findings: Findings,
+        loads: DriveLoads,
+        expected: ExpectedLoad,
     ) -> None:
         """Bring the law of `command` into command, without earlier findings."""
         self.error: BlfDscError | None = None
@@ -42,6 +47,7 @@ class Starting:
         self._command = command
         self._findings = findings
         self._loads = loads
+        self._expected = expected
         self._acting: Vector | None = None  # N m, by which another node holds the arm
         self._load: Vector | None = None  # N m, load of a reset, which goes on
         self._left_at: Vector | None = None  # rad, where the law left command
@@ -75,6 +81,7 @@ class Starting:
         command.note(EventType.RESET)
         added = self._added_by_drives()
         command.reference.resumable = False
+        self._expected.forget()
         command.controller.reset()
         self._loads.forget()
         load = self._carried(added - self._added_by_drives())
