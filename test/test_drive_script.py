@@ -19,6 +19,7 @@ import pytest
 from command import COMPILED, wait_for
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.drive import loop_process
 
@@ -88,6 +89,23 @@ def test_load_is_declared_to_drives_that_compensate_and_no_torque_changes(tmp_pa
     # rad: friction that holds the arm takes up the steps
     error = blf.read_run(tmp_path / 'bag').error
     assert np.nanmax(np.abs(error)) < 1e-3
+
+
+def test_load_that_the_script_knows_is_carried_at_once(tmp_path):
+    """The arm holds nothing: it is lifted, until its torque sensors show that."""
+    with blf.Drive('fr3_direct', robot='simulated', record=tmp_path / 'bag') as arm:
+        arm.expect_load(1.0, (0.0, 0.0, 0.05), interval=0.1)
+        with pytest.raises(blf.DriveError, match='none has been weighed'):
+            arm.expect_load(remember=True)
+        with pytest.raises(blf.DriveError, match='whose limit is'):
+            arm.expect_load(500.0)
+        with pytest.raises(blf.DriveError, match="interval: got 'soon'"):
+            arm.expect_load(1.0, interval='soon')
+        arm.expect_load(0.0)
+    assert blf.verify(tmp_path / 'bag').difference is None
+    events = [event for _, event in read_content(tmp_path / 'bag').events]
+    said = [each.content for each in events if each.type == 'expected load']
+    assert [each['mass'] for each in said] == [1.0, 0.0]
 
 
 def test_a_stop_of_the_controller_is_an_error_and_can_be_recovered():

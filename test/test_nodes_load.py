@@ -15,12 +15,16 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import interfaces
+from geometry_msgs.msg import Inertia, Vector3
 from ros_rig import LIMIT, RosRig, activate, cleanup, configure, deactivate
 from std_srvs.srv import Trigger
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
+from blf_dsc_controller.configuration.nodes import CONTROLLER as LAW
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
@@ -202,6 +206,35 @@ def test_service_that_cannot_be_called_is_named(ros):
         'can be called',
         service.problem,
     )
+
+
+def test_load_that_another_node_knows_is_carried_at_once(ros, capfd):
+    """As a gripper's node says it; the last one is not known yet."""
+    sends = ros.tester.create_publisher(Inertia, f'/{LAW}/expected_load', 10)
+    journal = ros.listen(topics.JOURNAL, raw=True)
+    plant = ros.add(PlantNode, flatten(FR3.plant) | EVENT | {'autostart': False})
+    law = ros.add(ControllerNode, flatten(FR3.controller))
+
+    def ask():
+        return ros.call(Trigger, f'/{LAW}/expect_last_load', Trigger.Request())
+
+    assert 'not in command' in ask().message
+    assert configure(ros, plant)
+    assert activate(ros, plant)
+    ros.until(lambda: law.guard.reference.time > 1.0)
+    assert 'none has been weighed' in ask().message
+    sends.publish(Inertia(m=-1.0))
+    sends.publish(Inertia(m=1.5, com=Vector3(z=0.05)))
+    ros.until(lambda: any(b'"expected load"' in each for each in journal))
+    (event,) = (
+        event
+        for each in journal
+        if (event := decode(each)).type is EventType.EXPECTED_LOAD
+    )
+    assert (event.content['mass'], event.content['centre']) == (1.5, [0.0, 0.0, 0.05])
+    assert '~/expected_load: load: got -1.0 kg' in capfd.readouterr().err
+    ros.until(lambda: law.guard.reference.time > 2.0)
+    assert law.guard.supervisor.running
 
 
 @pytest.mark.parametrize('kind', ['ur', 'franka'])
