@@ -22,10 +22,10 @@ from numba.core import config as numba_config
 from blf_dsc_controller import __version__
 from blf_dsc_controller.c_export.object_file import without_python
 from blf_dsc_controller.compiled.jit import SLOW
+from blf_dsc_controller.configuration import law_file
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import check_state
-from blf_dsc_controller.law.blf_dsc import BlfDsc
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import sample_of, state_of
 from blf_dsc_controller.law.step import update
@@ -57,16 +57,17 @@ def export(config: ControllerConfig, folder: Path) -> None:
         BlfDscError: it cannot be exported.
         OSError: a file cannot be written.
     """
+    _check(config)
     refuse(config)
     law = Guard(config).controller  # with the limits of its checks
-    _check(config, law)
     n = law.settings.n
     # a piece of a spline, which begins at each sample with what the caller gives
     law.reference_vector = pack(n, [spline_term(np.zeros(1), np.zeros((1, n, 6)))])
     symbol, code = object_file_of(update, *law.arguments, 0.0, 0.0)
     if code is None:
         raise BlfDscError(
-            'the machine code is not in the cache: let NUMBA_CACHE_DIR be a folder that you can write'
+            'the machine code is not in the cache: let NUMBA_CACHE_DIR be a folder that you '
+            'can write'
         )
     code = without_python(code)
     texts = {'SYMBOL': symbol} | _places(law) | _numbers(config)
@@ -86,17 +87,26 @@ def export(config: ControllerConfig, folder: Path) -> None:
         (folder / file.name).write_text(text)
 
 
-def _check(config: ControllerConfig, law: Controller) -> None:
-    """Raise BlfDscError if C would do without what the configuration asks for."""
-    problem = ''
-    if SLOW:
-        problem = SLOW
-    elif not isinstance(law.law, BlfDsc):
-        problem = f'law is {config.law}, but only blf_dsc can be called from C'
-    elif config.contact.enabled:
-        problem = 'contact.enabled is true, but contacts are found in Python: set it to false'
-    if problem:
-        raise BlfDscError(problem)
+def _check(config: ControllerConfig) -> None:
+    """Raise BlfDscError if C cannot do what a configuration asks for."""
+    for cannot, text in (
+        (SLOW, SLOW),
+        (numba_config.DISABLE_JIT, 'NUMBA_DISABLE_JIT is set, and nothing is compiled'),
+        (
+            law_file.has_file(config.law),
+            f'law is {config.law}: only blf_dsc can be called from C',
+        ),
+        (
+            config.contact.enabled,
+            'contact.enabled: contacts are found in Python alone; set it to false',
+        ),
+        (
+            config.safety.velocity == 'estimated',
+            'safety.velocity is estimated, in Python alone: set measured, and give C velocities',
+        ),
+    ):
+        if cannot:
+            raise BlfDscError(text)
 
 
 def _numbers(config: ControllerConfig) -> dict[str, str]:

@@ -16,7 +16,9 @@ _FOR_PYTHON = b'_ZN7cpython'  # how the name of that function begins
 _OF_C = {b'', b'memset', b'memcpy', b'memmove'}  # what a kernel may call
 _WEAK = 2 << 4
 _SYMBOLS, _RELOCATIONS = 2, 4  # kinds of sections
-_HEADER = np.dtype({'names': ['at', 'count'], 'formats': ['<u8', '<u2'], 'offsets': [40, 60]})
+_HEADER = np.dtype(
+    {'names': ['at', 'count'], 'formats': ['<u8', '<u2'], 'offsets': [40, 60]}
+)
 _SECTION = np.dtype(
     [
         ('name', '<u4'),

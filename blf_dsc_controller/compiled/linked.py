@@ -294,7 +294,7 @@ class KernelCache(_Stored):
             self._lock.release()
 
     def object_file(self, signature: Any, context: Any) -> bytes | None:
-        """Return the object file of the compiled kernel, or None; what others can write is not read."""
+        """Return the object file of the compiled kernel, or None; others must not write it."""
         found = self._shipped.object_file(signature, context)
         if found is None and is_own(self._folder):
             found = super().object_file(signature, context)

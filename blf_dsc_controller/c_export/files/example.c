@@ -25,8 +25,8 @@ static int next_state(int64_t *stamp, double *values) {
   return 1;
 }
 
-/* In a robot's loop, this limits the torques and sends them. */
-static void send(const double *torque) {
+/* In a robot's loop, this limits the torques to what the arm may get, and sends them. */
+static void send(double *torque) {
   for (int i = 0; i < N; i++) printf("%.17g%c", torque[i], i + 1 < N ? ' ' : '\n');
 }
 
@@ -57,7 +57,8 @@ int main(int count, char **words) {
       fprintf(stderr, "flags %d at %g s: here you stop the arm\n", flags, t);
       stopped = 1;
     } else {
-      send(torque); /* if other torques leave than these: blf_dsc_sent */
+      send(torque);
+      blf_dsc_sent(law, torque); /* needed where they were limited */
     }
     total += taken;
     longest = taken > longest ? taken : longest;
