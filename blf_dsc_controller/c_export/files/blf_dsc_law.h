@@ -35,13 +35,14 @@ typedef struct blf_dsc_law blf_dsc_law;
 
 /* Read the settings `blf_dsc_law.bin` and begin; return NULL, or what is wrong.
  *
- * It allocates all memory (@MEGABYTES@ MB), and takes some 0.1 s: call it before the loop.
+ * It allocates all memory, twice @MEGABYTES@ MB, and takes some 0.1 s: call it before the loop.
  */
 const char *blf_dsc_load(const char *path, blf_dsc_law **law);
 
 /* Return to the initial state: nothing is learned, and no torque acts.
  *
  * It copies @MEGABYTES@ MB: call it before the loop, at an arm that rests in its brakes or drives.
+ * The first torque is not limited in rate.
  */
 void blf_dsc_begin(blf_dsc_law *law);
 
