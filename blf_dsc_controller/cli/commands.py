@@ -218,6 +218,18 @@ _EXPORT = Command(
         option('--out', 'FILE.csv or FILE.parquet', type=Path, required=True),
     ),
 )
+_EXPORT_C = Command(
+    name='export-c',
+    module='export_c',
+    about='Write the law of a configuration as a library in C, without Python. A new folder has '
+    'its object, header, settings and an example. The safe stop and the envelope are not in it: '
+    'the caller limits and stops the arm.',
+    example='--config my.yaml --out law',
+    options=(
+        option('--config', _CONFIG, default='recommended'),
+        option('--out', 'new folder', type=Path, required=True),
+    ),
+)
 _COMMISSION = Command(
     name='commission',
     module='commission',
@@ -529,6 +541,7 @@ COMMANDS = (
     _REPORT,
     _RECOVER,
     _EXPORT,
+    _EXPORT_C,
     _COMMISSION,
     _EXCITE,
     _IDENTIFY,

@@ -235,6 +235,15 @@ class _Stored(FunctionCache):  # type: ignore[misc]
         rtsys.initialize(context)  # counts the references of a kernel's arguments
         return self._load_overload(signature, context)
 
+    def object_file(self, signature: Any, context: Any) -> bytes | None:
+        """Return the object file of the compiled kernel, or None."""
+        key = self._index_key(signature, context.codegen())
+        found = self._cache_file.load(key)
+        if found is None:
+            return None
+        (_name, _kind, (code, _symbols)), *_others = found
+        return bytes(code)
+
 
 class KernelCache(_Stored):
     """Machine code of a kernel in a folder, or in that of the shipped kernels.
@@ -283,6 +292,24 @@ class KernelCache(_Stored):
                 super().save_overload(signature, data)
         finally:
             self._lock.release()
+
+    def object_file(self, signature: Any, context: Any) -> bytes | None:
+        """Return the object file of the compiled kernel, or None; others must not write it."""
+        found = self._shipped.object_file(signature, context)
+        if found is None and is_own(self._folder):
+            found = super().object_file(signature, context)
+        return found
+
+
+def object_file_of(kernel: Any, *arguments: object) -> tuple[str, bytes | None]:
+    """Return the symbol of a kernel for arguments of these types, and the object file that has it.
+
+    None: it could not be written to the cache.
+    """
+    given = tuple(map(numba.typeof, arguments))
+    kernel.compile(given)
+    symbol = kernel.overloads[given].fndesc.llvm_func_name
+    return symbol, kernel._cache.object_file(given, kernel.targetctx)  # noqa: SLF001
 
 
 def address_of(compiled: Any) -> int:

@@ -6,6 +6,8 @@ What a sample does is in `step`, what follows after its torque in `perception`.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from blf_dsc_controller.compiled.jit import direct
@@ -83,20 +85,18 @@ class Controller:
         )
         views = self.settings, self.state, self.signals
         self.given_law = given = for_kernels(self.law, *views)
-        self._update = direct(
-            for_law(update, given),
-            given,
-            *self._vectors,
-            self.reference_vector,
-            0.0,
-            0.0,
-        )
+        self._update = direct(for_law(update, given), *self.arguments, 0.0, 0.0)
         self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
         self._compare = direct(compare, *self._compared, 0.0)
         if self.settings.weighing.size:
             self._weigh = direct(weigh, *self._vectors[:4], 0.0)
         if self.settings.contact.enabled:
             self._sense = direct(sense, *self._vectors[:5], 0.0)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """What the kernel `update` takes before t and dt."""
+        return self.given_law, *self._vectors, self.reference_vector
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
@@ -140,9 +140,7 @@ class Controller:
         Raises BlfDscError if the measurement has another shape than (3 n,).
         """
         self._take(measurement)
-        self.flags = self._update(
-            self.given_law, *self._vectors, self.reference_vector, t, dt
-        )
+        self.flags = self._update(*self.arguments, t, dt)
         return self.sample.torque
 
     def compare_velocities(self, dt: float, measurement: Array) -> bool:

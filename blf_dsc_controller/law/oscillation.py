@@ -26,11 +26,12 @@ It is taken from the positions: a velocity of the wrong sign changes nothing.
 
 from __future__ import annotations
 
-from math import exp, inf, pi, sqrt
+from math import inf, pi, sqrt
 from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law.lag import filter_gain
 
 WAVES = 6
 """Half waves in a row that are an oscillation."""
@@ -48,6 +49,7 @@ PATIENCE = 0.25
 """Time [s] from one report to the next, in which an oscillation can die out."""
 
 _LOWEST_FREQUENCY = 8.0  # Hz
+_TIME_CONSTANT = 0.5 / (pi * _LOWEST_FREQUENCY)  # s, of the lags
 _LONGEST_HALF_WAVE = 0.5 / _LOWEST_FREQUENCY  # s, half period
 _FAST_FREQUENCY = 20.0  # Hz, from which a velocity may lag far behind its positions
 _LEAST_AMPLITUDE = 0.05  # of the torque limit, amplitude of its torque
@@ -103,7 +105,7 @@ def watch(
     `limit` (n,) [N m] are those of the torques; `noise` [rad^2] is the mean square of
     the sensor's noise, `resolution` [rad] its step.
     """
-    share = 1.0 - exp(-2.0 * pi * _LOWEST_FREQUENCY * dt)
+    share = filter_gain(_TIME_CONSTANT, dt)
     for i in range(limit.size):
         first = error[i] - now.slow[0, i]
         now.slow[0, i] += share * first

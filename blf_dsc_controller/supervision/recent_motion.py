@@ -24,9 +24,14 @@ _ACCELERATION_TIME = 0.1  # s: the noise of a difference of velocities over it i
 _BLOCKS = 10  # of it or some more, each with the mean acceleration in it
 
 
+def shortest_gap(sample_time: float) -> float:
+    """Return the time [s] between two states that is too long to compare them."""
+    return max(_GAP_TIME, LONG_GAP * sample_time)
+
+
 def is_gap(elapsed: float, sample_time: float) -> bool:
     """Whether the time [s] since the last state is too long to compare the two."""
-    return elapsed >= max(_GAP_TIME, LONG_GAP * sample_time)
+    return elapsed >= shortest_gap(sample_time)
 
 
 class RecentMotion:
