@@ -2,7 +2,7 @@
 """The law of an arm from a URDF in plain numpy: the tests' oracle.
 
 It is written from doc/theory.md, departures.md, learning.md and
-stability.md.  The regressors are pinocchio's.  Change detection and light drives are off.
+stability.md, and the docstrings that they name.  The regressors are pinocchio's.  Change detection and light drives are off.
 """
 
 from __future__ import annotations
