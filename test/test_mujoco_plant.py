@@ -174,7 +174,7 @@ def test_what_mujoco_has_not_is_an_error_with_a_remedy(monkeypatch):
     ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):
-    """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/gains.md.
+    """In mrad, from 8 s on and when 2 kg are picked up at 20 s: doc/evidence.md.
 
     Below these, and not far below: dry friction amplifies last digits, so that other releases of
     the libraries give 9 % more.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of gains and torques in a sampled loop: what is used of each, and what to change.
 
-They rest on the initial parameter estimate, which is a guess. doc/tuning.md derives them.
+They rest on the initial parameter estimate, which is a guess. doc/gains.md says how to choose them.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 """The rules of a start and of other gains, and what they find in a configuration.
 
 Those on gains are in `gains` and `stability`, those on the bound in `bounds`; here are the
-others, and all of them together. doc/tuning.md derives them.
+others, and all of them together. doc/gains.md says how to choose them.
 """
 
 from __future__ import annotations
