@@ -111,7 +111,7 @@ def test_saved_configurations_are_those_that_ran(report, found):
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
     name: (ROOT / 'doc' / f'{name}.md').read_text()
-    for name in ('theory', 'departures', 'learning', 'stability', 'errata', 'gains')
+    for name in ('theory', 'learning', 'stability', 'errata', 'gains')
 }
 TESTS = ''.join(path.read_text() for path in (ROOT / 'test').glob('test_*.py'))
 
