@@ -48,6 +48,7 @@ class ExpectedLoad:
         )  # P^ (p,) when the tip last held nothing that was expected
         self._step = np.zeros(0)  # of P^, in a sample
         self._steps = 0  # that are left
+        self._seen = 0.0  # kg, the mass that was weighed last, sure or not
 
     def expect(self, load: TipLoad | None, interval: float, q: Vector) -> TipLoad:
         """Expect this load, which the tip takes up within an `interval` [s], at q (n,) [rad].
@@ -89,12 +90,13 @@ class ExpectedLoad:
     def observe(self) -> None:
         """Remember what the law has weighed, once it is sure of it."""
         found = self._controller.state.weighing.load
-        if not found.size:
-            return
-        mass, half = found[MASS], TWO_SIDED * found[DEVIATION]
+        if not found.size or found[MASS] == self._seen:
+            return  # it is solved for ten times a second
+        self._seen = mass = float(found[MASS])
+        half = TWO_SIDED * found[DEVIATION]
         if 0.0 < half < widest_interval(mass) < mass:
             centre = found[MASS + 1 : DEVIATION].tolist()
-            self.weighed = TipLoad(float(mass), tuple(centre))
+            self.weighed = TipLoad(mass, tuple(centre))
 
     def apply_again(self) -> None:
         """Expect the same load after the settings were replaced."""
