@@ -6,7 +6,9 @@
 Each runs for 60 s; by default those with elastic gears, which pick up 2 kg at 20 s, in full motion,
 and put them down at 45 s.  A cell has the largest error of any joint [mrad], with learning /
 without: a PID over the URDF's model along the reference, with the load observer where the arm
-has joint torque sensors.  The last row is the load with its 95 % interval, 5 s after the pick-up.
+has joint torque sensors.  The next rows are of a law that is told both as they happen, and of one
+that is told 2 kg and holds nothing.  The last row is the load with its 95 % interval, 5 s after the
+pick-up.
 """
 
 from __future__ import annotations
@@ -20,10 +22,13 @@ import numpy as np
 from benchmark.harness import print_table
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
+from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.simulation.loop import Record, simulate
 from blf_dsc_controller.studies.runs import cores
+from sim_plant.plant import plant_of
 
 PRESETS = ('fr3_direct', 'fr3', 'panda', 'ur5e', 'ur5e_driver')
 SPANS = {  # s
@@ -34,6 +39,9 @@ SPANS = {  # s
     'with the load, 24 to 45 s': (24.0, 45.0),
     'put down': (45.0, 49.0),
 }
+TOLD = ('pick-up, told', 'put down, told', 'nothing there, told 2 kg')
+LOAD = 2.0  # kg
+AFTER = 4000  # samples, in which the errors of a change show
 SECONDS = 60.0
 WEIGHED = 25.0  # s
 
@@ -42,6 +50,24 @@ def without_learning(controller: ControllerConfig) -> ControllerConfig:
     """Return a controller that keeps its estimate at first: a PID over the model of the URDF."""
     still = {'learning.enabled': False}
     return change(controller, still)
+
+
+def told(controller: ControllerConfig, plant: PlantConfig) -> list[str]:
+    """Return the errors [mrad] at pick-up and putting down of an arm whose law is told of both."""
+    law, arm = ArmController(controller), plant_of(plant)
+    said = {SPANS['at the pick-up'][0]: LOAD, SPANS['put down'][0]: 0.0}
+    errors = []
+    for k in range(round(SPANS['put down'][1] / controller.sample_time)):
+        t = k * controller.sample_time
+        if t in said:
+            law.expect_load(said[t], interval=0.0)
+        torque = law.update(1.0 + t, *arm.measure().reshape(3, -1))
+        if torque is None or law.reason:
+            return [f'stops: {law.reason}', '']
+        arm.step(torque)
+        errors.append(1e3 * np.abs(law.error).max())
+    begins = [round(t / controller.sample_time) for t in said]
+    return [f'{max(errors[at : at + AFTER]):.2g}' for at in begins]
 
 
 def weight_of(record: Record) -> str:
@@ -71,14 +97,17 @@ def column(preset: str) -> list[str]:
         )
         for begin, end in SPANS.values()
     ]
-    return [*cells, weight_of(records[0])]
+    empty = change(loop.plant, {'events.payload': [0.0]})
+    wrong, _ = told(loop.controller, empty)
+    known = told(loop.controller, loop.plant)
+    return [*cells, *known, wrong, weight_of(records[0])]
 
 
 def rows(presets: list[str]) -> Iterator[list[str]]:
     """Compute the rows of the table."""
     with ProcessPoolExecutor(cores()) as pool:
         columns = list(pool.map(column, presets))
-    for name, *cells in zip((*SPANS, 'weighed'), *columns, strict=True):
+    for name, *cells in zip((*SPANS, *TOLD, 'weighed'), *columns, strict=True):
         yield [name, *cells]
 
 
