@@ -23,7 +23,6 @@ from random_arm import (
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identify import identify_arm
-from blf_dsc_controller.identification.problem import problem_of
 from blf_dsc_controller.identification.problems import is_usable, problems_of
 from blf_dsc_controller.identification.summary import notes_of
 
@@ -65,10 +64,6 @@ def narrow():
     return moved(reach=0.5)
 
 
-def problem(states, robot=ROBOT):
-    return problem_of(recorded(states), robot, 'torque', None, find_signs=True)
-
-
 # those nearest to 1 are the hardest to see
 FACTORS = (0.1, 10.0, 1000.0) if os.environ.get('NIGHTLY') else (0.1, 10.0)
 
@@ -100,9 +95,9 @@ def heavier_on_the_other_side():
 
 def test_right_signs_stay_where_links_are_heavier_than_the_urdf_says():
     """Of joint 6 and 7, gravity of the URDF points the other way."""
-    states = moved(heavier_on_the_other_side())
-    assert not problem(states).reversed.any()
-    found = identify_arm(recorded(states), ROBOT)
+    found = identify_arm(recorded(moved(heavier_on_the_other_side())), ROBOT)
+    assert not found.reversed
+    assert found.other_gravity is None
     share = found.score.errors[2] / found.score.torque
     assert (share[5:] < 0.05).all()  # of torques with 1 % of noise
 
@@ -120,9 +115,9 @@ def test_wrong_mounting_is_named_instead_of_reversed_efforts(wide, given):
     robot = replace(ROBOT, gravity=MOUNTINGS[given])
     other = wide * [[1.0], [1.0], [-1.0]]
     for states, is_reversed in ((wide, False), (other, True)):
-        found = problem(states, robot)
+        found = identify_arm(recorded(states[:2000]), robot)
         np.testing.assert_allclose(found.other_gravity, GRAVITY, atol=0.01)
-        assert (found.reversed == is_reversed).all()
+        assert found.reversed == (PANDA if is_reversed else ())
 
 
 @pytest.mark.parametrize(
@@ -143,8 +138,7 @@ def test_wrong_mounting_is_not_taken_for_a_load_or_other_joints(wide, given):
 
 
 def test_right_mounting_is_not_doubted(wide):
-    assert problem(wide).other_gravity is None
-    assert problem(moved(heavier_on_the_other_side())).other_gravity is None
+    assert identify_arm(recorded(wide), ROBOT).other_gravity is None
 
 
 def test_rows_with_clipped_torques_are_left_out_and_said(wide):

@@ -33,18 +33,20 @@ POSITION, TORQUE = 0, 2  # rows of a state
 
 
 @cache
-def states_of(n):
-    """States (N, 3, n) of a motion."""
+def states_of(n, duration=15.0):
+    """States (N, 3, n) of a motion of so many seconds."""
     chain = ROBOTS[n].chain(PANDA[:n])
-    return measured(shake(chain, truth_of(chain, 1), reference_of(chain, 2), 15.0), 3)
+    return measured(
+        shake(chain, truth_of(chain, 1), reference_of(chain, 2), duration), 3
+    )
 
 
-def recorded(states):
+def recorded(states, every=EVERY):
     n = states.shape[2]
-    return recording_of(states[::EVERY], PANDA[:n], period=1e-3 * EVERY)
+    return recording_of(states[::every], PANDA[:n], period=1e-3 * every)
 
 
-def identified(states, offsets=(), reversed_joints=()):
+def identified(states, offsets=(), reversed_joints=(), every=EVERY):
     """What is found if positions of joints, by number, are recorded with these offsets.
 
     Of reversed joints, positions and efforts are recorded negated before that.
@@ -54,7 +56,7 @@ def identified(states, offsets=(), reversed_joints=()):
         moved[:, :, joint - 1] *= -1.0
     for joint, offset in dict(offsets).items():
         moved[:, POSITION, joint - 1] += offset
-    return identify_arm(recorded(moved), ROBOTS[states.shape[2]])
+    return identify_arm(recorded(moved, every), ROBOTS[states.shape[2]])
 
 
 @pytest.mark.parametrize(
@@ -92,6 +94,16 @@ def test_a_joint_that_counts_the_other_way_from_another_zero_is_named():
     assert problem.startswith('OTHER DIRECTIONS AND ZEROS:')
     assert 'negated of panda_joint4, and if then there is added' in problem
     assert f'{QUARTER:+.5g} rad to panda_joint4' in problem
+
+
+def test_the_zero_of_one_joint_and_the_direction_of_another_are_named():
+    """Pairs of joints that may count in any way at once lead elsewhere."""
+    found = identified(states_of(7, 20.0), {2: -QUARTER}, [6], every=4)
+    convention = found.other_convention.convention
+    np.testing.assert_array_equal(convention.signs, [1, 1, 1, 1, 1, -1, 1])
+    np.testing.assert_allclose(convention.offsets, [0, QUARTER, 0, 0, 0, 0, 0])
+    (problem,) = problems_of(found, 'torque')
+    assert problem.startswith('OTHER DIRECTIONS AND ZEROS:')
 
 
 def test_a_last_joint_that_counts_the_other_way_is_named():

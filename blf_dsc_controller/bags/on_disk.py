@@ -54,13 +54,13 @@ def blocks_of(size: int) -> Iterator[slice]:
 
 
 class Samples:
-    """An array (N, *shape) of floats on disk, of which rows come into memory when indexed."""
+    """An array (N, ...) of floats on disk, of which rows come into memory when indexed."""
 
-    def __init__(self, blocks: Iterator[Floats], *shape: int) -> None:
-        """Write blocks of rows (., *shape)."""
+    def __init__(self, blocks: Iterator[Floats]) -> None:
+        """Write blocks of rows (., ...), of which there is at least one."""
         self._store = OnDisk()
-        self._shape = shape
         for block in blocks:
+            self._shape = block.shape[1:]
             self._store.append(np.asarray(block, dtype=np.float64))
 
     def __len__(self) -> int:
@@ -74,7 +74,15 @@ class Samples:
         return self._store.array('<f8').reshape(-1, *self._shape)
 
 
-def mapped(size: int, function: Callable[[slice], Floats]) -> Samples:
-    """Return the rows (`size`, k) that a function returns for the slices of `blocks_of`."""
-    width = function(slice(0, 1)).shape[1]
-    return Samples((function(rows) for rows in blocks_of(size)), width)
+def mapped(size: int, function: Callable[[slice], Floats], margin: int = 0) -> Samples:
+    """Return the rows (`size`, k) that a function returns for the slices of `blocks_of`.
+
+    It is given so many rows more on both sides, where there are some.
+    """
+
+    def own(rows: slice) -> Floats:
+        first = max(rows.start - margin, 0)
+        found = function(slice(first, min(rows.stop + margin, size)))
+        return found[rows.start - first : rows.stop - first]
+
+    return Samples(map(own, blocks_of(size)))

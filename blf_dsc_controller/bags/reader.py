@@ -168,17 +168,17 @@ def _arrays(
         'references': None if references is None else references.at_stamps(stamp),
         'bounds': None if bounds is None else bounds.held(stamp),
     }
-    arrays: dict[str, Values | None] = {}
-    for name, (source, field) in _ARRAYS.items():
-        messages = sources[source]
-        arrays[name] = None if messages is None else Values(messages, field)
-    errors, references = sources['errors'], sources['references']
+    arrays = {
+        name: None if (messages := sources[source]) is None else messages.field(field)
+        for name, (source, field) in _ARRAYS.items()
+    }
     if errors is not None:
         # Errors are not decimated: q - xi1 is the reference at every sample. Where the
         # positions may wrap, the controller's is whole turns off.
-        if references is None or may_wrap:
-            references = states.select(np.full(states.size, -1))
-        arrays['reference'] = Values(references, 0, (states.field(0), errors.field(0)))
+        known = sources['references']
+        if known is None or may_wrap:
+            known = states.select(np.full(states.size, -1))
+        arrays['reference'] = Values(known, 0, (states.field(0), errors.field(0)))
     return arrays
 
 

@@ -116,17 +116,13 @@ class _Copy:
     Attributes:
         last: latest time of a message copied [ns]; -1 before the first.
         found: number of messages of each channel.
-        unknown: number of messages whose topic or type is unknown.
-        packed: number of compressed messages that cannot be unpacked.
-        foreign: numbers of messages that are not CDR, by topic and encoding.
+        lost: number of messages that are not copied, by what they are.
     """
 
     def __init__(self, bag: BagWriter, summary: Summary) -> None:
         self.last = -1
         self.found = Counter[int]()
-        self.unknown = 0
-        self.packed = 0
-        self.foreign = Counter[tuple[str, str]]()
+        self.lost = Counter[str]()
         self._bag = bag
         self._summary = summary
         # by number of the channel; 0 where its topic is unknown
@@ -138,18 +134,19 @@ class _Copy:
         self.found[number] += 1
         channel = self._summary.channels.get(number)
         if channel and channel.message_encoding != CDR:
-            self.foreign[channel.topic, channel.message_encoding] += 1
+            encoding = channel.message_encoding or 'unknown'
+            self.lost[f'messages of {channel.topic}: they are {encoding}, not CDR'] += 1
             return
         if not self._handles.get(number):  # its topic may have become known
             self._handles[number] = _handle(self._bag, self._summary, number)
         handle = self._handles[number]
         if not handle:
-            self.unknown += 1
+            self.lost['messages of topics whose name or type is unknown'] += 1
             return
         try:
             plain = _plain(raw)
         except (ValueError, ZstdError):
-            self.packed += 1
+            self.lost['compressed messages that cannot be unpacked'] += 1
             return
         self.last = max(self.last, received)
         self._bag.write(handle, plain, received, published, sequence)
@@ -178,12 +175,8 @@ def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
             f'the recording was not closed; {ends}. Later messages are lost: usually the last '
             '0.1 s before a kill, more if the computer was overloaded or lost power'
         )
-    if copy.unknown:
-        yield f'{copy.unknown} messages of topics whose name or type is unknown'
-    for (topic, encoding), count in copy.foreign.items():
-        yield f'{count} messages of {topic}: they are {encoding or "unknown"}, not CDR'
-    if copy.packed:
-        yield f'{copy.packed} compressed messages that cannot be unpacked'
+    for kind, count in copy.lost.items():
+        yield f'{count} {kind}'
     yield from _missing(summary, copy.found)
 
 

@@ -95,20 +95,18 @@ class JointStates:
         messages: TopicMessages,
         names: Sequence[str],
         places: NDArray[np.intp],
-        kinds: NDArray[np.intp],
         number: NDArray[np.int32],
     ) -> None:
         """Take messages by their `number` (N,) in the topic; -1 is an unknown one.
 
-        Their positions, velocities and efforts are the words `places` (kinds, 3, n) in a
-        message, -1 if unknown; `kinds` are those of the layouts of the topic.
+        Their positions, velocities and efforts are the words `places` (layouts, 3, n) in
+        a message of each layout of the topic, -1 if unknown.
         """
         self.names = tuple(names)
         self.size = number.size
         self.messages = messages
         self.number = number
         self._places = places
-        self._kinds = kinds
 
     @property
     def received(self) -> Stamps:
@@ -126,27 +124,23 @@ class JointStates:
         word = _STAMP if self.messages.is_stamped else _RECEIVED
         return self.messages.words(word, self.number)
 
-    def field(self, k: int) -> Any:
+    def field(self, k: int) -> Values:
         """Return positions (0), velocities (1) or efforts (2) as `Values` (N, n)."""
         return Values(self, k)
 
     def read(self, field: int, columns: Any = _ALL) -> Floats:
         """Return some columns of a field (N, k), or one (N,); NaN where it is unknown."""
-        places = self._places[:, field, columns]
-        found = np.full((self.size, *places.shape[1:]), np.nan)
-        known = self.number >= 0
-        if known.any():
-            number = self.number[known]
-            places = places[self._kinds[self.messages.words(_LAYOUT, number)]]
-            found[known] = self.messages.words(places.T, number).view(float).T
-        return found
+        layouts = self.messages.words(_LAYOUT, np.maximum(self.number, 0))
+        places = self._places[:, field, columns][layouts]
+        words = self.messages.words(places.T, self.number)
+        return np.asarray(words.view(np.float64).T)
 
     def select(self, rows: Rows) -> JointStates:
         """Return the states of these rows; -1 is an unknown one."""
         chosen = self.number[rows]
         if not isinstance(rows, slice):
             chosen[rows < 0] = -1
-        return JointStates(self.messages, self.names, self._places, self._kinds, chosen)
+        return JointStates(self.messages, self.names, self._places, chosen)
 
     def by_stamp(self) -> JointStates:
         """Return the states ordered by stamp, one per stamp."""
@@ -225,7 +219,7 @@ class TopicMessages:
         return len(self._begins)
 
     def add(self, message: BagMessage) -> None:
-        """Add a message."""
+        """Add a message; raise BagError if one that is kept as it is has too many bytes."""
         raw = message.raw
         if message.sequence:
             self._count(message.sequence, hash(raw))
@@ -240,19 +234,16 @@ class TopicMessages:
                 stamp = seconds * NANOSECONDS + nanoseconds
         else:
             last = len(raw)
-            self._check_text(last)
+            if last > _MOST_TEXT:
+                raise BagError(
+                    f'a message of {self.name} has {last / 1e6:.0f} MB, more than '
+                    f'{_MOST_TEXT / 1e6:.0f}: the bag is damaged or was not recorded from this '
+                    'topic'
+                )
             content = raw.ljust(-(-last // _WORD) * _WORD, b'\0')
         self._begins.append(self._store.size // _WORD)
         head = _HEAD.pack(message.received, message.sequence, stamp, last)
         self._store.append(head + content)
-
-    def _check_text(self, size: int) -> None:
-        """Raise BagError if a message that is kept as it is has too many bytes."""
-        if size > _MOST_TEXT:
-            raise BagError(
-                f'a message of {self.name} has {size / 1e6:.0f} MB, more than '
-                f'{_MOST_TEXT / 1e6:.0f}: the bag is damaged or was not recorded from this topic'
-            )
 
     def raw(self) -> Iterator[tuple[int, bytes]]:
         """Yield reception time [ns] and content of each message of another type."""
@@ -356,32 +347,24 @@ class TopicMessages:
             UnreadableMessageError: there are messages, and none can be decoded.
         """
         problems: dict[int, MessageError] = {}
-        last = len(self._kinds)  # of what has no layout
-        places: dict[int, NDArray[np.intp]] = {}
+        places = np.full((len(self._kinds), 3, len(names)), -1)
         for k, kind in enumerate(self._kinds):
             try:
                 places[k] = kind.places_of(names, required)
             except MessageError as error:
                 problems[k] = error
-        is_read = np.array([k in places for k in range(last)] + [False])
-        is_bad = np.array(
-            [not _is_foreign(problems.get(k), names) for k in range(last)] + [True]
-        )
         layouts = self.words(_LAYOUT, np.arange(self.size, dtype=np.int32))
-        number = np.flatnonzero(is_read[layouts]).astype(np.int32)
-        bad = (
-            np.flatnonzero((is_bad & ~is_read)[layouts])
-            if number.size
-            else range(self.size)
-        )
+        is_read = ~np.isin(layouts, [*problems, _UNREADABLE])
+        number = np.flatnonzero(is_read).astype(np.int32)
+        foreign = [k for k, each in problems.items() if _is_foreign(each, names)]
+        is_bad = ~is_read & ~np.isin(layouts, foreign if number.size else [])
         errors = {
-            k: self._unreadable.get(k) or problems[layouts[k]] for k in map(int, bad)
+            k: self._unreadable.get(k) or problems[layouts[k]]
+            for k in np.flatnonzero(is_bad).tolist()
         }
         if errors and not number.size:
             raise UnreadableMessageError(self.name, *min(errors.items()))
-        kinds = np.cumsum(is_read) - 1
-        table = np.array([*places.values()], np.intp).reshape(-1, 3, len(names))
-        return JointStates(self, names, table, kinds, number), errors
+        return JointStates(self, names, places, number), errors
 
     def name_lists(self) -> list[tuple[str, ...]]:
         """Return the different lists of names; raise UnreadableMessageError if none."""
@@ -400,5 +383,5 @@ class TopicMessages:
         return names
 
 
-def _is_foreign(problem: MessageError | None, names: Collection[str]) -> bool:
+def _is_foreign(problem: MessageError, names: Collection[str]) -> bool:
     return isinstance(problem, MissingJointError) and problem.is_foreign(names)

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from blf_dsc_controller.identification.recording import Flags
 from blf_dsc_controller.run import Floats
 
 _FAR = 500.0  # as a file has it: those in use begin with 999
@@ -45,43 +45,26 @@ def extremes(values: Floats) -> Extremes:
     )
 
 
-def stand_ins(
-    values: Floats, names: Sequence[str]
-) -> tuple[NDArray[np.bool_], list[str]]:
+def stand_ins(values: Floats, names: Sequence[str]) -> tuple[Flags, list[str]]:
     """Return the rows (N,) of values (N, k) of one kind that have stand-ins, and what to say."""
     rows = np.zeros(len(values), dtype=bool)
     said: list[str] = []
     found = extremes(values)
     with np.errstate(over='ignore'):  # of values such as 1e308
         spread = np.maximum(found.most - found.least, 0.0)
-    doubtful = np.flatnonzero(spread >= _FAR).tolist()
-    columns = {k: np.array(values[:, k]) for k in doubtful}
-    spread[doubtful] = 0.0
-    for _ in range(_MOST if columns else 0):
-        with np.errstate(over='ignore'):
-            apart = _stand_ins(columns, spread.max())
-        for k, value in apart.items():
-            at = columns[k] == value
-            columns[k][at] = np.nan
-            rows |= at
-            said.append(f'{names[k]} is {value:g} in {at.sum()} row(s)')
-        if not apart:
-            break
+        doubtful = np.flatnonzero(spread >= _FAR).tolist()
+        left = {k: np.unique(values[np.isfinite(values[:, k]), k]) for k in doubtful}
+        spread[doubtful] = 0.0
+        for _ in range(_MOST):
+            apart = {k: _apart(each) for k, each in left.items() if each.size > 1}
+            least = max([spread.max(), *(each.spread for each in apart.values())])
+            for k, (value, distance, own) in apart.items():
+                if distance > max(_FAR, _TIMES * own, least):
+                    at = values[:, k] == value
+                    rows |= at
+                    said.append(f'{names[k]} is {value:g} in {at.sum()} row(s)')
+                    left[k] = left[k][left[k] != value]
     return rows, said
-
-
-def _stand_ins(columns: dict[int, Floats], spread: float) -> dict[int, float]:
-    """Return a stand-in of each column that has one, farther off than any other values are.
-
-    Values of other columns have that spread.
-    """
-    found = {k: _apart(column[np.isfinite(column)]) for k, column in columns.items()}
-    largest = max([spread, *(each.spread for each in found.values())])
-    return {
-        k: each.value
-        for k, each in found.items()
-        if each.distance > max(_FAR, _TIMES * each.spread, largest)
-    }
 
 
 class _Apart(NamedTuple):
@@ -93,30 +76,15 @@ class _Apart(NamedTuple):
 
 
 def _apart(known: Floats) -> _Apart:
-    """Return the value of a column (N,) that may be a stand-in."""
-    if not known.size or np.ptp(known) < _FAR:
-        return _Apart(np.nan, 0.0, float(np.ptp(known)) if known.size else 0.0)
-    median = _middle(known)
-    farthest = float(known[np.argmax(np.abs(known - median))])
-    # where most are missing, the median is the stand-in
-    found = [_compared(known, value) for value in (farthest, median)]
-    return max(found, key=lambda each: each.distance / (each.spread or _FAR))
-
-
-def _compared(known: Floats, value: float) -> _Apart:
+    """Return what may be a stand-in of different values (k,) in their order: an end of them."""
+    middle = np.median(known)
+    value = max(known[[0, -1]], key=lambda end: (abs(end - middle), abs(end)))
     others = known[known != value]
-    centre = _middle(others)
-    spread = float(np.abs(others - centre).max())
-    return _Apart(value, abs(value - centre), spread)
+    centre = np.median(others)
+    return _Apart(value, abs(value - centre), np.abs(others - centre).max())
 
 
-def _middle(values: Floats) -> float:
-    """Return the median, one of the values: a mean of two would overflow."""
-    half = values.size // 2
-    return float(np.partition(values, half)[half])
-
-
-def unrecorded(torque: Floats) -> NDArray[np.bool_]:
+def unrecorded(torque: Floats) -> Flags:
     """Return the rows (N,) in which all torques (N, n) are zero, or one is for long.
 
     Few of the former at the begin and the end stay: arms may have no torque there.
@@ -141,7 +109,7 @@ def unrecorded(torque: Floats) -> NDArray[np.bool_]:
     return found
 
 
-def _runs(which: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def _runs(which: Flags) -> Iterator[tuple[int, int]]:
     """Yield begin and end of each run of true values."""
     edges = np.flatnonzero(np.diff(which.astype(np.int8), prepend=0, append=0))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)

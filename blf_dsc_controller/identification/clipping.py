@@ -28,7 +28,7 @@ def without_clipped(rows: Rows) -> Rows:
 
     if not np.isfinite((lowest, highest)).any():
         return rows
-    clipped = rows.over_windows(is_clipped, np.ones_like(rows.g)) > 0.0
+    clipped = rows.over_windows(is_clipped) > 0.0
     weight = np.where(clipped, 0.0, rows.weight)
     return rows._replace(clipped=clipped, weight=weight)
 

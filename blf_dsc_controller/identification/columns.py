@@ -20,22 +20,20 @@ from blf_dsc_controller.identification.units import factor_of, is_of_drive, spli
 KINDS = ('time', 'q', 'tau', 'theta')
 """Columns, by the names of `--map`; positions theta of the motors are not needed."""
 
-_CURRENTS = {'current', 'currents'}
 _WORDS = {
-    'time': {'t', 'time', 'times', 'timestamp', 'stamp', 'secs', 'seconds'},
-    'q': {'q', 'pos', 'position', 'positions', 'angle', 'angles', 'jointposition'},
-    'tau': {
-        *('tau', 'torque', 'torques', 'effort', 'efforts', 'force', 'trq'),
-        *('jointtorque', *_CURRENTS),
-    },
-    'theta': {'theta', 'motor', 'motors'},
+    kind: frozenset(words.split())
+    for kind, words in {
+        'time': 't time times timestamp stamp secs seconds',
+        'q': 'q pos position positions angle angles jointposition',
+        'tau': 'tau torque torques effort efforts force trq jointtorque current currents',
+        'theta': 'theta motor motors',
+        'current': 'current currents',
+        'rate': 'dot ddot vel velocity speed acc acceleration',
+        'unmeasured': 'd des desired target ref reference cmd command '
+        'ext external error err offset',
+    }.items()
 }
 _UNIT_OF = {'q': 'q', 'tau': 'tau', 'theta': 'q'}
-_SIDES = {
-    *('d', 'des', 'desired', 'target', 'ref', 'reference', 'cmd', 'command'),
-    *('ext', 'external', 'error', 'err', 'offset'),
-}
-_RATES = {'dot', 'ddot', 'vel', 'velocity', 'speed', 'acc', 'acceleration'}
 _SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
 _NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
 _SHOWN = 60  # names of columns in a message
@@ -110,7 +108,7 @@ def choose_columns(
         q=_with_factors(path, q, 'q', given['q']),
         tau=_with_factors(path, tau, 'tau', given['tau']),
         theta=_with_factors(path, theta, 'q', given['theta']),
-        has_currents=bool(words & _CURRENTS) or any(map(is_of_drive, units)),
+        has_currents=bool(words & _WORDS['current']) or any(map(is_of_drive, units)),
     )
 
 
@@ -121,17 +119,9 @@ def _of_joints(
     if given:
         found = _matching(names, given, kind)
     else:
-        words = _WORDS[kind]
-        found = [
-            name
-            for name in names
-            if words & (own := _meaning(split_unit(name, kind).stem, joints))
-            and not own & _RATES
-        ]
+        found = [name for name in names if _is_named(name, kind, joints)]
     if kind == 'q' and not given:
-        of_links = [
-            name for name in found if not _meaning(name, joints) & _WORDS['theta']
-        ]
+        of_links = [name for name in found if not _is_named(name, 'theta', joints)]
         found = of_links or found
     named = [_of_joint(found, joint) for joint in joints]
     if all(named):
@@ -212,7 +202,7 @@ def _kind_of(name: str, joints: Sequence[str]) -> str:
 def _is_named(name: str, kind: str, joints: Sequence[str]) -> bool:
     """Return whether a column is q, tau or theta by its name."""
     words = _meaning(split_unit(name, _UNIT_OF[kind]).stem, joints)
-    return bool(_WORDS[kind] & words) and not words & _RATES
+    return bool(_WORDS[kind] & words) and not words & _WORDS['rate']
 
 
 def pattern_of(names: Sequence[str], columns: Sequence[str]) -> str:
@@ -236,9 +226,8 @@ def beginning(names: Sequence[str]) -> str:
 
 
 def _is_of_motor(name: str, joints: Sequence[str]) -> bool:
-    words = _meaning(split_unit(name, 'q').stem, joints)
-    is_position = 'theta' in words or bool(words & _WORDS['q'])
-    return is_position and bool(words & _WORDS['theta']) and not words & _RATES
+    is_position = 'theta' in _meaning(name, joints) or _is_named(name, 'q', joints)
+    return is_position and _is_named(name, 'theta', joints)
 
 
 def _of_joint(columns: Sequence[str], joint: str) -> str | None:
@@ -282,7 +271,7 @@ def _meaning(column: str, joints: Sequence[str]) -> set[str]:
         column = column.replace(joint, ' ')
     spaced = re.sub('([a-z])([A-Z])', r'\1 \2', column)
     words = set(re.findall('[a-z]+', spaced.lower()))
-    return set() if words & _SIDES else words
+    return set() if words & _WORDS['unmeasured'] else words
 
 
 def _time(path: Path, names: Sequence[str], given: str) -> list[Column]:

@@ -14,17 +14,16 @@ the best.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain, combinations, islice, product
+from itertools import chain, combinations, islice, permutations, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.mounting import gravity_columns
-from blf_dsc_controller.identification.recording import TURN, Recording
+from blf_dsc_controller.identification.recording import TURN, Indices, Recording
 from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.run import Floats
 
@@ -51,7 +50,7 @@ class Convention(NamedTuple):
     offsets: Floats  # (n,) rad
 
     @property
-    def unlike(self) -> NDArray[np.intp]:
+    def unlike(self) -> Indices:
         """Numbers of the joints that count otherwise than the URDF."""
         return np.flatnonzero((self.signs < 0.0) | (self.offsets != 0.0))
 
@@ -89,15 +88,15 @@ def likely_conventions(
     rows = rows_of(recording, base_parameters(arm, robot.gravity).model)
     fit = split(rows).fit
     fit = fit[:: max(1, fit.size // _POSTURES)]
-    q = rows.over_windows(lambda at: rows.q[at], rows.g)[fit]
+    q = rows.postures[fit]
     columns = rows.friction(fit, _FRICTION)
     gravity = _Gravity(arm, np.array(robot.gravity), q, rows.u(0.0)[fit], columns)
-    turning = [i for i, joint in enumerate(arm.joints) if joint.kind != 'prismatic']
-    as_is = (_AS_IS,) * q.shape[1]
-    _search(gravity, turning, as_is)
-    most = _BETTER * gravity.cost(as_is)
+    gravity.search()
+    most = _BETTER * gravity.cost(gravity.as_is)
     likely = (each for each in gravity.best() if gravity.cost(each) < most)
-    turned = (gravity.turned(as_is, i) for i in unexplained if i in turning)
+    turned = (
+        gravity.turned(gravity.as_is, i) for i in unexplained if i in gravity.turning
+    )
     ways = chain(islice(likely, _CANDIDATES), islice(turned, _CANDIDATES))
     return [_convention(each) for each in dict.fromkeys(ways)]
 
@@ -119,6 +118,9 @@ class _Gravity:
     ) -> None:
         """Take friction (k, c, n): c columns of each joint, which explain what they can."""
         self._chain = chain
+        self.as_is: _Ways = (_AS_IS,) * q.shape[1]
+        kinds = [joint.kind for joint in chain.joints]
+        self.turning = [i for i, kind in enumerate(kinds) if kind != 'prismatic']
         self._g = g
         self._q = q
         self._u = u
@@ -159,6 +161,37 @@ class _Gravity:
                     break
         return ways
 
+    def search(self) -> None:
+        """Ask for the costs of likely ways in which joints that turn may count.
+
+        Two searches: a direction may look like zeros of others, and the other way round.
+        """
+        for first, then in permutations((self._with_zeros, self._with_directions)):
+            ways = self.as_is
+            for _ in range(_ROUNDS):
+                before = ways
+                ways = then(first(ways))
+                if ways == before:
+                    break
+
+    def _with_zeros(self, ways: _Ways) -> _Ways:
+        """Return these ways with better zeros, of two joints at a time."""
+        for i, j in combinations(self.turning, 2):
+            for one, other in product(_QUARTERS, repeat=2):
+                both = _with(ways, i, (ways[i][0], one))
+                ways = self.better(ways, _with(both, j, (ways[j][0], other)))
+        return ways
+
+    def _with_directions(self, ways: _Ways) -> _Ways:
+        """Return these ways with better directions, first of the joint where it matters most."""
+        for _ in self.turning:
+            turned = (self.turned(ways, i) for i in self.turning)
+            other = self.better(ways, min(turned, key=self.cost))
+            if other == ways:
+                break
+            ways = other
+        return ways
+
     def best(self) -> Iterator[_Ways]:
         """Yield those that were asked for, the best first, but each only in its simplest form.
 
@@ -176,42 +209,3 @@ class _Gravity:
         offsets = sum(quarter != 0 for _, quarter in ways)
         moves = offsets + sum(sign < 0 for sign, _ in ways)
         return round(self.cost(ways) / _BETTER**moves, _DIGITS), offsets
-
-
-def _search(gravity: _Gravity, turning: Sequence[int], as_is: _Ways) -> None:
-    """Ask for the costs of likely ways in which joints that turn may count.
-
-    Two searches: a direction may look like zeros of others, and the other way round.
-    """
-    for first, then in (
-        (_with_zeros, _with_directions),
-        (_with_directions, _with_zeros),
-    ):
-        ways = as_is
-        for _ in range(_ROUNDS):
-            before = ways
-            ways = then(gravity, turning, first(gravity, turning, ways))
-            if ways == before:
-                break
-
-
-def _with_zeros(gravity: _Gravity, turning: Sequence[int], ways: _Ways) -> _Ways:
-    """Return these ways with better zeros, of two joints at a time."""
-    for pair in combinations(turning, 2):
-        for quarters in product(_QUARTERS, repeat=2):
-            other = ways
-            for i, quarter in zip(pair, quarters, strict=True):
-                other = _with(other, i, (other[i][0], quarter))
-            ways = gravity.better(ways, other)
-    return ways
-
-
-def _with_directions(gravity: _Gravity, turning: Sequence[int], ways: _Ways) -> _Ways:
-    """Return these ways with better directions, first of the joint where it matters most."""
-    for _ in turning:
-        turned = (gravity.turned(ways, i) for i in turning)
-        other = gravity.better(ways, min(turned, key=gravity.cost))
-        if other == ways:
-            break
-        ways = other
-    return ways

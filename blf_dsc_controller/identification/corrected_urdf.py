@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from itertools import combinations_with_replacement
 from xml.parsers import expat
 
 import numpy as np
@@ -52,15 +53,9 @@ def _inertial(J: Floats) -> str:
     T = np.eye(4)
     T[:3, 3] = -centre
     I = rotational_inertia(T @ J @ T.T)
-    entries = {
-        'ixx': (0, 0),
-        'ixy': (0, 1),
-        'ixz': (0, 2),
-        'iyy': (1, 1),
-        'iyz': (1, 2),
-    }
     tensor = ' '.join(
-        f'{key}="{I[at]:.12g}"' for key, at in (entries | {'izz': (2, 2)}).items()
+        f'i{"xyz"[a]}{"xyz"[b]}="{I[a, b]:.12g}"'
+        for a, b in combinations_with_replacement(range(3), 2)
     )
     xyz = ' '.join(f'{x:.12g}' for x in centre)
     return (

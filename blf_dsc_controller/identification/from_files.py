@@ -25,7 +25,6 @@ from blf_dsc_controller.identification.motion import recording_of
 from blf_dsc_controller.identification.problem import Effort
 from blf_dsc_controller.identification.recording import Recording, joined
 from blf_dsc_controller.identification.table_files import TABLES
-from blf_dsc_controller.run import Floats
 
 _BAGS = ('.mcap', '.db3', '.bag', '.yaml')
 
@@ -91,11 +90,12 @@ def _read(
         joints = tuple(joint.name for joint in robot.chain(()).joints)
     recordings: list[Recording] = []
     for path in paths:
-        recording = read_recording(
-            path, robot.text, joints, namespace, names, commanded=commanded
+        recordings.append(
+            read_recording(
+                path, robot.text, joints, namespace, names, commanded=commanded
+            )
         )
-        joints = recording.joints
-        recordings.append(recording)
+        joints = recordings[-1].joints
     return recordings
 
 
@@ -108,13 +108,12 @@ def _not_torques(recording: Recording) -> BlfDscError:
 
 
 def _with_gains(recording: Recording, gains: Sequence[float]) -> Recording:
-    """Return the recording with torques that are its efforts times the gains."""
-    factors = _checked_gains(gains, recording.joints)
-    return recording._replace(torque=recording.torque * factors)
+    """Return the recording with torques that are its efforts times the gains.
 
-
-def _checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:
-    """Return the gains (n,); raises BlfDscError if there is not one for each joint, or one is 0."""
+    Raises:
+        BlfDscError: there is not one for each joint, or one is 0.
+    """
+    joints = recording.joints
     if len(gains) != len(joints):
         found = f'{len(joints)} joints: {", ".join(joints)}'
         raise BlfDscError(f'got {len(gains)} gains for {found}')
@@ -124,7 +123,7 @@ def _checked_gains(gains: Sequence[float], joints: Sequence[str]) -> Floats:
                 f'got a gain of {gain:g} for {joint}: give its torque per current, 1 if it is a '
                 'torque'
             )
-    return np.array(gains)
+    return recording._replace(torque=recording.torque * np.array(gains))
 
 
 def read_recording(

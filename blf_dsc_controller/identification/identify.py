@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -90,33 +91,43 @@ def identify_arm(
     Raises:
         BlfDscError: the recording is too short or has no motion.
     """
-    trained = _trained(recording, robot, effort, picked_up, find_signs, begin)
-    found = _completed(trained, begin)
+    trained = partial(
+        _trained,
+        recording=recording,
+        robot=robot,
+        effort=effort,
+        picked_up=picked_up,
+        find_signs=find_signs,
+        begin=tell_nobody,
+    )
+    first = trained(begin=begin)
+    found = _completed(first, begin)
     begin(OTHERS)
+    explained = found.score
+    if first.problem.other_gravity is not None:
+        gravity = tuple(first.problem.other_gravity.tolist())
+        mounted = trained(robot=replace(robot, gravity=gravity))
+        if _left(mounted.score) < _BETTER * _left(explained):
+            found = found._replace(
+                other_gravity=first.problem.other_gravity,
+                reversed=_named(recording.joints, mounted.problem.reversed),
+            )
+            explained = mounted.score
+    is_good = explained.total[2] < _GOOD
     unexplained = unexplained_joints(found)
-    is_good = found.score.total[2] < _GOOD
-    if is_good and not unexplained.size:
+    if is_good and (found.other_gravity is not None or not unexplained.size):
         return found
     if picked_up is None and not is_good:
-        changing = _trained(recording, robot, effort, np.nan, find_signs, tell_nobody)
-        if (load := _better_load(found, changing)) is not None:
+        load = _better_load(found, trained(picked_up=np.nan))
+        if load is not None:
             return found._replace(other_load=load)
     if effort == 'without-gravity':
         return found
-
-    def trained_as(convention: Convention) -> _Trained:
-        other = converted(recording, convention)
-        return _trained(other, robot, effort, picked_up, find_signs, tell_nobody)
-
-    explained = found.score
-    if found.other_gravity is not None:
-        elsewhere = replace(robot, gravity=tuple(found.other_gravity.tolist()))
-        mounted = _trained(
-            recording, elsewhere, effort, picked_up, find_signs, tell_nobody
-        )
-        explained = mounted.score
-    likely = likely_conventions(recording, robot, unexplained.tolist())
-    convention = _better_convention(explained, likely, trained_as)
+    convention = _better_convention(
+        explained,
+        likely_conventions(recording, robot, unexplained.tolist()),
+        lambda convention: trained(recording=converted(recording, convention)),
+    )
     return found._replace(other_convention=convention)
 
 
@@ -196,11 +207,12 @@ def _left(score: Score) -> float:
 
 
 def _trained(
+    *,
     recording: Recording,
     robot: Robot,
     effort: Effort,
     picked_up: float | None,
-    find_signs: bool,  # noqa: FBT001
+    find_signs: bool,
     begin: Callable[[str], None],
 ) -> _Trained:
     """Return the arm that is fitted to a part of the recording: enough to compare others."""
@@ -210,40 +222,31 @@ def _trained(
     begin(SELECTING)
     selected = _selected(problem)
     begin(FITTING)
-    trained = fitted(
-        selected.rows, windows.fit, problem.G, selected.prior, selected.found
-    )
-    score = scored(
-        selected.rows, windows, problem.G, problem.prior.mean, trained.values
-    )
+    trained = fitted(selected.rows, windows.fit, selected.prior, selected.found)
+    score = scored(selected.rows, windows, problem.prior, trained.values)
     return _Trained(recording, problem, selected, trained, score)
 
 
 def _selected(problem: Problem) -> Selected:
     """Return the model of an arm."""
-    return select(problem.rows, problem.windows.fit, problem.G, problem.prior)
+    return select(problem.rows, problem.windows.fit, problem.prior)
 
 
 def _final_fit(problem: Problem, selected: Selected) -> Fit:
     """Return the fit to all of a recording."""
-    return fitted(
-        selected.rows,
-        problem.windows.moving,
-        problem.G,
-        selected.prior,
-        selected.found,
-    )
+    moving = problem.windows.moving
+    return fitted(selected.rows, moving, selected.prior, selected.found)
 
 
 def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
     """Return the arm that is fitted to all of the recording, with its intervals."""
     recording, problem, selected, fit, score = trained
     windows = problem.windows
-    fits = fit_alone(fit.rows, windows.fit, problem.G, problem.prior, COLUMNS)
+    fits = fit_alone(fit.rows, windows.fit, problem.prior, COLUMNS)
     final = _final_fit(problem, selected)
     rows = final.rows
     dynamics = nearest_friction(rows, windows, final.values)
-    size = shares(rows, windows.moving, problem.P, (problem.G @ final.values)[: rows.p])
+    size = shares(rows, windows.moving, problem.P, final.theta[: rows.p])
     compliance = _compliance(problem, recording, final)
     begin(INTERVALS)
     doubted = doubt(problem, selected.prior, final)
@@ -270,7 +273,7 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
         clipped=rows.clipped[windows.moving].mean(axis=0),
         gravity=size.gravity,
         inertia=size.inertia,
-        other_gravity=problem.other_gravity,
+        other_gravity=None,
         other_convention=None,
         other_load=None,
         carried=problem.carried,
@@ -286,7 +289,7 @@ def _compliance(problem: Problem, recording: Recording, fit: Fit) -> Compliance 
     links = fit.values.copy()
     parts(links).terms[:] = 0.0
     parts(links).coupling[:] = 0.0
-    theta = (problem.G @ links)[:-1]
+    theta = problem.prior.G @ links
     moving = problem.windows.moving
     return compliance_of(fit.rows, recording.twist, moving, theta, fit.values[-1])
 
@@ -296,15 +299,12 @@ def ripples_left(problem: Problem, distances: Floats, fit: Fit) -> tuple[Ripples
 
     `distances` (n,) are those of its contacts.
     """
-    theta = problem.G @ fit.values
     length = max(SHORT, SAMPLES * fit.rows.period)
     moving = problem.windows.moving
     model = problem.parameters.model
     parts = max(1, min(PER_HOP, ROWS // moving.size))
-    short = shortened(fit.rows, moving, model, distances, length, parts).with_load(
-        theta[: fit.rows.p]
-    )
-    return ripples_of(short, theta[:-1], theta[-1])
+    short = shortened(fit.rows, moving, model, distances, length, parts)
+    return ripples_of(short.with_load(fit.theta), fit.theta)
 
 
 def _named(joints: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:

@@ -13,13 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.identification.physical import left_of, most_likely
 from blf_dsc_controller.identification.prior import Prior
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.regression import (
     Weighted,
-    correlation_length,
-    triangle,
+    correlation_lengths,
+    sums_of,
 )
-from blf_dsc_controller.identification.windows import COLUMNS, Indices, Rows
+from blf_dsc_controller.identification.windows import COLUMNS, Rows
 from blf_dsc_controller.run import Floats
 
 SIMPLE = ('viscous', 'Coulomb', 'offset')
@@ -38,7 +40,7 @@ _CERTAIN = 5.0  # ... and standard deviations of its Coulomb part
 class Alone(NamedTuple):
     """Fits of n joints, each to its own torque."""
 
-    triangles: Floats  # (n, m + 2, m + 2) R of the rows of each joint: see `Weighted`
+    products: Floats  # (n, m + 2, m + 2) of the rows of each joint: see `Weighted`
     values: Floats  # (n, m + 1) of the unknowns of `Rows`, and delay [s]
     residual: Floats  # (n,) root mean square, N m or N
     torque: Floats  # (n,) likewise
@@ -58,33 +60,30 @@ class Alone(NamedTuple):
 def fit_alone(
     rows: Rows,
     fit: Indices,
-    G: Floats,
     prior: Prior,
     columns: Collection[str] = SIMPLE,
 ) -> Alone:
     """Return the fits to the torques in some windows, with these columns of friction."""
     weighted = Weighted(rows, fit, 0.0)
-    triangles = triangle(np.moveaxis(each, 1, 0) for each in weighted.blocks())
-    scale = _WEAK * np.linalg.norm(G @ prior.D, axis=1)
+    (products,) = weighted.products(1)
+    scale = _WEAK * np.linalg.norm(prior.G @ prior.D, axis=1)
     scale[-1] = _DELAY
     counted = np.sum(rows.weight[fit] ** 2, axis=0)
     fits = []
-    for i, R in enumerate(triangles):
+    for i, of_joint in enumerate(products):
+        used = [*range(rows.p), *_unknowns_of(rows, i, columns), rows.unknowns]
         own = np.zeros_like(scale)
-        used = _unknowns_of(rows, i, columns)
         own[used] = scale[used]
-        fits.append(_fitted(R, own, float(counted[i])))
+        fits.append(_fitted(of_joint, own, float(counted[i])))
     values = np.array([each.values for each in fits])
     of_residuals = np.column_stack((values, np.full(len(values), -1.0)))
-    residuals = np.concatenate(
-        [np.einsum('kia,ia->ki', each, of_residuals) for each in weighted.blocks()]
-    )
+    lengths = correlation_lengths(sums_of(weighted.blocks(), of_residuals))
     signs = [
-        _sign(each, _friction_of(rows, i), correlation_length(residuals[:, i]))
+        _sign(each, _unknowns_of(rows, i, SIMPLE[:2]), float(lengths[i]))
         for i, each in enumerate(fits)
     ]
     return Alone(
-        triangles,
+        products,
         values,
         np.array([each.residual for each in fits]),
         np.array([each.torque for each in fits]),
@@ -108,7 +107,7 @@ class _Fit(NamedTuple):
 
     scale: Floats  # (m + 1,)
     z: Floats  # (m + 1,)
-    R: Floats  # (m + 2, m + 1) of the columns of z
+    products: Floats  # (m + 2, m + 2) of the columns of z, and of the torque
     counted: float  # rows
     residual: float
     torque: float
@@ -116,50 +115,41 @@ class _Fit(NamedTuple):
     @property
     def values(self) -> Floats:
         """Values (m + 1,)."""
-        return np.asarray(self.scale * self.z)
+        return self.scale * self.z
 
 
 def _unknowns_of(rows: Rows, joint: int, columns: Collection[str]) -> list[int]:
-    """Return the unknowns in the torque of a joint: inertias, friction, and the delay."""
+    """Return the unknowns of some columns of a joint."""
     n = rows.speed.size
-    friction = [rows.p + COLUMNS.index(name) * n + joint for name in columns]
-    return [*range(rows.p), *friction, rows.unknowns]
+    return [rows.p + COLUMNS.index(name) * n + joint for name in columns]
 
 
-def _friction_of(rows: Rows, joint: int) -> list[int]:
-    """Return the unknowns of viscous and of Coulomb friction of a joint."""
-    n = rows.speed.size
-    return [rows.p + COLUMNS.index(name) * n + joint for name in ('viscous', 'Coulomb')]
-
-
-def _fitted(triangle: Floats, scale: Floats, counted: float) -> _Fit:
-    """Return the fit from the triangle of a joint's rows, of which so many count."""
-    R = triangle[:, :-1] * scale
-    u = triangle[:, -1]
+def _fitted(products: Floats, scale: Floats, counted: float) -> _Fit:
+    """Return the fit from the products of a joint's rows, of which so many count."""
+    both = np.append(scale, 1.0)
+    products = both[:, None] * products * both
     counted = max(counted - np.count_nonzero(scale), 1.0)
-    torque = float(np.sqrt(u @ u / counted))
+    torque = float(np.sqrt(products[-1, -1] / counted))
     least = _FLOOR * torque + _TINY
     residual = least
     z = np.zeros(scale.size)
     for _ in range(_PASSES):
-        A = R / residual
-        z = np.linalg.solve(A.T @ A + np.eye(z.size), A.T @ u / residual)
-        left = u - R @ z
-        residual = max(float(np.sqrt(left @ left / counted)), least)
-    return _Fit(scale, z, R, counted, residual, torque)
+        z = most_likely(products / residual**2)
+        residual = max(float(np.sqrt(left_of(products, z) / counted)), least)
+    return _Fit(scale, z, products, counted, residual, torque)
 
 
 def _sign(fit: _Fit, friction: list[int], length: float) -> float:
     """Return the sign of clear friction, with residuals of a correlation length."""
-    _, coulomb = friction
-    torque = fit.R[:, friction] @ fit.z[friction]
-    if np.linalg.norm(torque) < _CLEAR * fit.torque * np.sqrt(fit.counted):
+    viscous, coulomb = friction
+    of_torque = fit.products[:, friction] @ fit.z[friction]
+    if fit.z[friction] @ of_torque[friction] < _CLEAR**2 * fit.torque**2 * fit.counted:
         return 0.0
-    work = float(fit.R[:, friction[0]] @ torque)
-    A = fit.R / fit.residual
+    work = float(of_torque[viscous])
+    information = fit.products[:-1, :-1] / fit.residual**2
     one = np.eye(fit.z.size)
-    H = np.linalg.inv(A.T @ A + one)
-    variance = (H @ (one + length * A.T @ A) @ H)[coulomb, coulomb]
+    H = np.linalg.inv(information + one)
+    variance = (H @ (one + length * information) @ H)[coulomb, coulomb]
     value = float(fit.z[coulomb])
     is_certain = abs(value) > _CERTAIN * np.sqrt(variance)
     return float(np.sign(value)) if is_certain and value * work > 0.0 else 0.0

@@ -19,10 +19,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.bags.on_disk import Samples, mapped
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.sliding import DISTANCES
 from blf_dsc_controller.identification.values import (
     COULOMB,
@@ -34,7 +34,6 @@ from blf_dsc_controller.identification.values import (
 )
 from blf_dsc_controller.identification.windows import (
     STILL,
-    Indices,
     Rows,
     add_windows,
     smoothing_width,
@@ -62,7 +61,7 @@ class LeftOut(NamedTuple):
 
     own: Floats  # (R, e, n), N m or N
     elastic: Floats  # (R, n, n) torque of each joint by the twist of each
-    kind: NDArray[np.intp]  # (e n + n,) of each column, in KINDS
+    kind: Indices  # (e n + n,) of each column, in KINDS
 
     def matrix(self, windows: Indices) -> Floats:
         """Return the columns (k, n, e n + n) of some windows."""
@@ -78,7 +77,7 @@ class LeftOut(NamedTuple):
 
 def left_out(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> LeftOut:
     """Return the columns for the values of a fit, and the rows that it has (`Fit`)."""
-    columns = [*_of_friction(rows, values), *_of_torque(rows, (G @ values)[:-1])]
+    columns = [*_of_friction(rows, values), *_of_torque(rows, G @ values)]
     kinds = [KINDS.index(kind) for kind, _ in columns]
     return LeftOut(
         np.stack([column for _, column in columns], axis=1),
@@ -99,8 +98,7 @@ def _of_friction(rows: Rows, values: Floats) -> Iterator[tuple[str, Floats]]:
         yield 'fading', coulomb * rows.stribeck(*fading)
     for a, b in pairwise(sliding):
         yield 'contact', coulomb * (b - a)
-    speeds = rows.over_windows(lambda at: np.abs(rows.dq[at]), rows.g)
-    yield 'direction', viscous * speeds
+    yield 'direction', viscous * rows.speeds
 
 
 def _of_torque(rows: Rows, theta: Floats) -> Iterator[tuple[str, Floats]]:
@@ -130,9 +128,9 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
     n = rows.speed.size
     links = values.copy()
     parts(links).terms[ROTOR_INERTIA] = 0.0
-    theta = (G @ links)[:-1]
+    theta = G @ links
     P = theta[: rows.p]
-    P_loaded = P + rows.load @ theta[-LOAD:]
+    P_loaded = P + rows.load @ theta[rows.unknowns - LOAD : rows.unknowns]
     transmitted = transmitted_torques(rows, values)
     twist = _TWIST / np.maximum(rows.largest_torque, _TINY)
     g, slope = weighting(rows.every * rows.period)
@@ -173,14 +171,11 @@ def transmitted_torques(rows: Rows, values: Floats) -> Samples:
     terms = parts(values).terms
 
     def found(at: slice) -> Floats:
-        first = max(at.start - width, 0)
-        wide = slice(first, at.stop + width)
-        dq = rows.dq[wide]
-        torque = savgol_filter(rows.torque[wide], width, 3, axis=0)
+        dq = rows.dq[at]
+        torque = savgol_filter(rows.torque[at], width, 3, axis=0)
         torque -= terms[ROTOR_INERTIA] * np.gradient(dq, h, axis=0)
-        torque -= terms[VISCOUS] * dq + terms[COULOMB] * rows.sliding[wide]
+        torque -= terms[VISCOUS] * dq + terms[COULOMB] * rows.sliding[at]
         torque -= terms[OFFSET]
-        both = np.hstack((torque, np.gradient(torque, h, axis=0)))
-        return both[at.start - first : at.stop - first]
+        return np.hstack((torque, np.gradient(torque, h, axis=0)))
 
-    return mapped(len(rows.q), found)
+    return mapped(len(rows.q), found, width)

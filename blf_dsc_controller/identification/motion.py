@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.errors import BlfDscError
@@ -22,7 +21,12 @@ from blf_dsc_controller.identification.bad_values import (
     stand_ins,
     unrecorded,
 )
-from blf_dsc_controller.identification.recording import TURN, Recording, resampled
+from blf_dsc_controller.identification.recording import (
+    TURN,
+    Flags,
+    Recording,
+    resampled,
+)
 from blf_dsc_controller.run import Floats, Stamps
 
 _BEYOND = 2.0  # times what a joint reaches, and at least turns: no angle in rad
@@ -46,7 +50,7 @@ class Group(NamedTuple):
         """The values in rad, N m, or m, N."""
         if (self.factors == 1.0).all():
             return self.values  # as in `Motion.select`
-        return np.asarray(self.values * self.factors)
+        return self.values * self.factors
 
 
 class Motion(NamedTuple):
@@ -64,7 +68,7 @@ class Motion(NamedTuple):
     said: Sequence[str] = ()  # of what is odd
     currents: bool = False  # by the names or units of the torques
 
-    def select(self, rows: NDArray[np.bool_]) -> Motion:
+    def select(self, rows: Flags) -> Motion:
         """Return the states of some rows (N,)."""
         if rows.all():
             return self  # a long motion is not copied
@@ -181,7 +185,7 @@ def _speeds(motion: Motion) -> Floats:
     known = steps[np.isfinite(steps).all(axis=1)]
     if not len(known):
         return np.zeros(len(motion.joints))
-    return np.asarray(np.quantile(known, _SHARE, axis=0))
+    return np.quantile(known, _SHARE, axis=0)
 
 
 def _check_torques(motion: Motion) -> None:

@@ -14,7 +14,8 @@ import numpy as np
 from blf_dsc_controller.arms.urdf import Chain, frames
 from blf_dsc_controller.identification.joint_alone import SIMPLE, Alone
 from blf_dsc_controller.identification.plausibility import inertial_torques
-from blf_dsc_controller.identification.windows import Indices, Rows
+from blf_dsc_controller.identification.recording import Indices
+from blf_dsc_controller.identification.windows import Rows
 from blf_dsc_controller.run import Floats
 
 _UNSEEN = 1e-3  # of its deviation, what a component of gravity counts that is not shown
@@ -50,30 +51,23 @@ def _shown_gravity(
     rows: Rows, fit: Indices, chain: Chain, P: Floats, given: Floats, alone: Alone
 ) -> Floats:
     """Return the gravity (3,) that the torques show, with the masses of the URDF."""
-    q = rows.over_windows(lambda at: rows.q[at], rows.g)[fit]
-    of_gravity = gravity_columns(chain, q)
     _, inertial = inertial_torques(rows, fit, P)
-    u = rows.u(alone.delay)[fit]
-    n = u.shape[1]
-    deviation = alone.deviation
     # what friction does not show is taken to be as in most joints
-    most = np.sign(np.sum(alone.friction))
-    signs = np.where(alone.friction == 0.0, most or 1.0, alone.friction)
-    friction = rows.friction(fit, SIMPLE)
-    lines = [_towards(given)]
-    for i in range(n):
-        columns = np.column_stack(
-            (
-                friction[:, :, i],
-                of_gravity[:, i],
-                inertial[:, i],
-                signs[i] * u[:, i],
-            )
-        )
-        weight = rows.weight[fit, i, None] / deviation[i]
-        R = np.asarray(np.linalg.qr(columns * weight, mode='r'))
-        lines.append(R[len(SIMPLE) :, len(SIMPLE) :])  # for any friction
-    A = np.concatenate(lines)
+    most = np.sign(np.sum(alone.friction)) or 1.0
+    signs = np.where(alone.friction == 0.0, most, alone.friction)
+    columns = np.concatenate(
+        (
+            np.swapaxes(rows.friction(fit, SIMPLE), 1, 2),
+            gravity_columns(chain, rows.postures[fit]),
+            inertial[:, :, None],
+            (signs * rows.u(alone.delay)[fit])[:, :, None],
+        ),
+        axis=2,
+    )
+    columns *= (rows.weight[fit] / alone.deviation)[:, :, None]
+    R = np.asarray(np.linalg.qr(np.moveaxis(columns, 1, 0), mode='r'))
+    left = R[:, len(SIMPLE) :, len(SIMPLE) :]  # for any friction
+    A = np.concatenate((_towards(given), *left))
     found, *_ = np.linalg.lstsq(A[:, :-1], A[:, -1], rcond=None)
     # without friction, inertia shows whether all efforts are of the opposite sign
     is_opposite = not alone.friction.any() and found[3] < 0.0

@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.run import Floats
 
 _LAST = 1e-3  # mu; one standard deviation adds 0.5 to the objective
@@ -46,7 +46,7 @@ class Cone(NamedTuple):
 class _Cones(NamedTuple):
     """Cones of one size, g of them."""
 
-    entries: NDArray[np.intp]  # (g, k) of z, on which each depends
+    entries: Indices  # (g, k) of z, on which each depends
     J0: Floats  # (g, d, d)
     E: Floats  # (g, k, d, d)
     power: Floats  # (g,)
@@ -72,11 +72,27 @@ def _by_size(cones: Sequence[Cone]) -> list[_Cones]:
     ]
 
 
-def solve(A: Floats, b: Floats, cones: list[Cone], z: Floats) -> Floats:
-    """Return the minimum, starting from z inside all cones; raises BlfDscError if not found."""
-    mu = max(1.0, float(np.sum((A @ z - b) ** 2)))
-    information = A.T @ A + np.eye(z.size)
-    target = A.T @ b
+def most_likely(products: Floats) -> Floats:
+    """Return the minimum (k,) without cones, for [A | b]^T [A | b] (k + 1, k + 1)."""
+    information = products[:-1, :-1] + np.eye(len(products) - 1)
+    return np.asarray(np.linalg.solve(information, products[:-1, -1]), np.float64)
+
+
+def left_of(products: Floats, z: Floats) -> float:
+    """Return |A z - b|^2 for these products."""
+    both = np.append(z, -1.0)
+    return max(float(both @ products @ both), 0.0)
+
+
+def solve(products: Floats, cones: list[Cone], z: Floats) -> Floats:
+    """Return the minimum for these products, starting from z inside all cones.
+
+    Raises:
+        BlfDscError: it is not found.
+    """
+    mu = max(1.0, left_of(products, z))
+    information = products[:-1, :-1] + np.eye(z.size)
+    target = products[:-1, -1]
     groups = _by_size(cones)
     while mu > _LAST:
         mu = max(_LAST, _REDUCTION * mu)

@@ -11,10 +11,12 @@ from itertools import combinations
 
 import numpy as np
 
+from blf_dsc_controller.identification.physical import left_of, most_likely
 from blf_dsc_controller.identification.prior import Prior
-from blf_dsc_controller.identification.regression import regression, successive
+from blf_dsc_controller.identification.recording import Indices
+from blf_dsc_controller.identification.regression import Weighted, of_prior, regression
 from blf_dsc_controller.identification.values import indices
-from blf_dsc_controller.identification.windows import Carried, Indices, Rows, Split
+from blf_dsc_controller.identification.windows import Carried, Rows, Split
 from blf_dsc_controller.run import Floats
 
 _PER_STEP = 10  # windows from one time to the next at which a load may change, at least
@@ -22,27 +24,28 @@ _MOST_STEPS = 400
 _COARSE = 24  # parts, of which all intervals are tried
 
 
-def carried_load(rows: Rows, windows: Split, G: Floats, prior: Prior) -> Carried:
+def carried_load(rows: Rows, windows: Split, prior: Prior) -> Carried:
     """Return when a load is carried, so that the torques are explained best.
 
     Of a recording in parts all intervals are tried, then all steps around both ends of the best.
     """
     moving = windows.moving
     steps = max(moving.size // _per_step(moving), 2)
-    found = regression(rows, moving, G, prior)
+    found = regression(rows, moving, prior)
     load = indices(prior.joints).load
-    with_load, empty = [], found.folds.sum(axis=(0, 1))
-    for products in successive(moving, G, prior, found, steps):
-        added = _columns(products.sum(axis=0), load)
+    with_load, empty = [], found.products
+    for products in Weighted(found.rows, moving, found.delay).products(steps):
+        added = _columns(of_prior(products, found.deviation, prior.T), load)
         with_load.append(added)
         empty -= added
     # of the load in all steps before each
     before = np.concatenate((np.zeros((1, *empty.shape)), np.cumsum(with_load, axis=0)))
 
     def cost(begin: int, end: int) -> float:
-        least, z = _solved(empty + before[end] - before[begin])
+        products = empty + before[end] - before[begin]
+        z = most_likely(products)
         mass = (prior.mean + prior.D @ z)[load[0]]
-        return least if mass >= 0.0 else np.inf
+        return left_of(products, z) + float(z @ z) if mass >= 0.0 else np.inf
 
     begin, end = _best_interval(cost, steps)
     first = rows.time[[part[0] for part in np.array_split(moving, steps)]]
@@ -95,10 +98,3 @@ def _columns(products: Floats, load: Floats) -> Floats:
     others[load] = 0.0
     others[:, load] = 0.0
     return np.asarray(products - others)
-
-
-def _solved(Q: Floats) -> tuple[float, Floats]:
-    """Return the least cost |A z - b|^2 + |z|^2, and z, for Q = [A | b]^T [A | b]."""
-    b = Q[:-1, -1]
-    z = np.asarray(np.linalg.solve(Q[:-1, :-1] + np.eye(b.size), b), dtype=np.float64)
-    return float(Q[-1, -1] - b @ z), z

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from blf_dsc_controller.arms.urdf import Joint
-from blf_dsc_controller.identification.recording import TURN
-from blf_dsc_controller.identification.windows import Indices, Rows
+from blf_dsc_controller.identification.recording import TURN, Indices
+from blf_dsc_controller.identification.windows import Rows
 from blf_dsc_controller.run import Floats, joint_units
 
 GRAVITY = (0.4, 1.6)
@@ -49,8 +49,7 @@ def shares(rows: Rows, fit: Indices, urdf: Floats, found: Floats) -> Shares:
 
 def outside_range(rows: Rows, joints: Sequence[Joint]) -> Iterator[str]:
     """Yield which joints are mostly outside of their range in the URDF; turns do not count."""
-    positions = rows.over_windows(lambda at: rows.q[at], rows.g)
-    for joint, q in zip(joints, positions.T, strict=True):
+    for joint, q in zip(joints, rows.postures.T, strict=True):
         span = joint.upper - joint.lower
         if not 0.0 < span < np.inf:
             continue
@@ -69,7 +68,7 @@ def outside_range(rows: Rows, joints: Sequence[Joint]) -> Iterator[str]:
 
 def inertial_torques(rows: Rows, windows: Indices, P: Floats) -> tuple[Floats, Floats]:
     """Return the torques (k, n) of gravity, and the other inertial ones, of P (p,)."""
-    gravity = rows.over_windows(lambda at: rows.gravity_torque(P, at), rows.g)[windows]
+    gravity = rows.over_windows(lambda at: rows.gravity_torque(P, at))[windows]
     theta = np.zeros(rows.unknowns)
     theta[: rows.p] = P
     return gravity, rows.torques(windows, theta) - gravity

@@ -21,6 +21,7 @@ from blf_dsc_controller.arms.base_parameters import (
     CENTRE,
     LINKS,
     PAYLOAD_SIZE,
+    BaseParameters,
     deviations,
     payload_inertia,
 )
@@ -41,6 +42,7 @@ from blf_dsc_controller.identification.values import (
     ROTOR_INERTIA,
     STRIBECK,
     VISCOUS,
+    base_matrix,
     indices,
 )
 from blf_dsc_controller.run import Floats
@@ -63,10 +65,17 @@ Entry = tuple[int, ...]
 class Prior(NamedTuple):
     """Values  mean + D z  with z of zero mean and unit covariance; physical inside all cones."""
 
+    G: Floats  # (m + 1, k) from values to the unknowns theta of `Rows`, and the delay [s]
     mean: Floats  # (k,), k = 17 n + 14
     D: Floats  # (k, k)
     cones: list[Cone]
     start: Floats  # (k,) z inside all cones
+
+    @property
+    def T(self) -> Floats:
+        """T (m + 2, k + 1): the rows of `Weighted` times T are [A | b] of z; T (z, -1) is theta."""
+        columns = self.G @ np.column_stack((self.D, -self.mean))
+        return np.vstack((columns, np.eye(1, self.mean.size + 1, self.mean.size)))
 
     @property
     def joints(self) -> int:
@@ -112,7 +121,13 @@ class Prior(NamedTuple):
 
 
 def prior_of(
-    robot: Robot, chain: Chain, torque: Floats, speed: Floats, *, load: bool
+    robot: Robot,
+    chain: Chain,
+    parameters: BaseParameters,
+    torque: Floats,
+    speed: Floats,
+    *,
+    load: bool,
 ) -> Prior:
     """Return the prior of a chain: inertias as for learning, joint terms scaled by the recording.
 
@@ -156,7 +171,7 @@ def prior_of(
     start[at.load[0]] = _FIRST
     of_terms = np.diag(np.append(spread, coupling))
     D = block_diag(*blocks, of_terms, of_load, _DELAY)
-    return Prior(mean, D, cones, start)
+    return Prior(base_matrix(parameters, n), mean, D, cones, start)
 
 
 def _of_body(joint: Joint) -> Floats:
@@ -168,7 +183,7 @@ def _with_payload(D: Floats, chain: Chain, payload: float) -> Floats:
     """Return the deviations (10, 10) of the last body, which may carry a payload [kg]."""
     J = moved(payload_inertia(payload), chain.tip_placement)
     both = np.column_stack((D, deviations(J, 1.0, PAYLOAD_SIZE)))
-    return np.asarray(np.transpose(np.linalg.qr(both.T, mode='r')))
+    return np.transpose(np.linalg.qr(both.T, mode='r'))
 
 
 def _of_load(chain: Chain, payload: float) -> Floats:

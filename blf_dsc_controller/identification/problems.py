@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from blf_dsc_controller.identification.identified import (
     IDLE,
@@ -15,6 +14,7 @@ from blf_dsc_controller.identification.identified import (
     OtherLoad,
 )
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.values import OFFSET
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
@@ -198,7 +198,7 @@ def _value_problems(found: Identified) -> Iterator[str]:
             )
 
 
-def unexplained_joints(found: Identified) -> NDArray[np.intp]:
+def unexplained_joints(found: Identified) -> Indices:
     """Return the joints of whose own torque much is left, the worst first."""
     torque = found.score.torque
     shares = found.score.errors[2] / torque

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Floats, Stamps
 
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
 TURN = 2.0 * np.pi
 """A full turn [rad]."""
 
@@ -33,7 +36,7 @@ class Recording(NamedTuple):
     period: float  # s
     q: Floats  # (N, n) rad, or m
     torque: Floats  # (N, n) N m, or N
-    gap: NDArray[np.bool_]  # (N,) whether nothing was recorded here
+    gap: Flags  # (N,) whether nothing was recorded here
     source: str  # of the torques: a topic, or columns of a table
     currents: bool = False  # whether the columns of the torques are named so
     twist: Floats | None = None  # (N, n) motors minus links, rad or m, if known
@@ -50,7 +53,7 @@ def resampled(
     q: Floats,
     torque: Floats,
     source: str,
-    turning: NDArray[np.bool_],
+    turning: Flags,
     motors: Floats | None = None,
 ) -> Recording:
     """Resample evenly, interpolating over uneven stamps and up to two lost states.
@@ -86,14 +89,14 @@ def resampled(
     return recording._replace(twist=grid.evenly(_twist(q, motors, turning)))
 
 
-def _order(stamp: Stamps, groups: Sequence[Floats]) -> NDArray[np.intp]:
+def _order(stamp: Stamps, groups: Sequence[Floats]) -> Indices:
     """Return the rows in which all values are known, each stamp once, in their order."""
     known = [np.isfinite(each).all(axis=1) for each in groups]
     order = np.flatnonzero(np.all(known, axis=0))
     return order[np.unique(stamp[order], return_index=True)[1]]
 
 
-def _turns(q: Floats, turning: NDArray[np.bool_]) -> Floats:
+def _turns(q: Floats, turning: Flags) -> Floats:
     """Return the full turns (N, n) that the encoders of joints have left out.
 
     From one state to the next, a joint turns by less than half a turn.  A larger step is
@@ -112,7 +115,7 @@ class _Grid(NamedTuple):
     time: Floats  # (N,) of the states, s
     even: Floats  # (M,) s
     period: float  # s
-    gap: NDArray[np.bool_]  # (M,) whether nothing was recorded here
+    gap: Flags  # (M,) whether nothing was recorded here
 
     def evenly(self, values: Floats) -> Floats:
         """Return values (N, n) of the states at the even times."""
@@ -149,7 +152,7 @@ def _grid_of(stamp: Stamps) -> _Grid:
     return _Grid(time, even, period, gap)
 
 
-def _twist(links: Floats, motors: Floats, turning: NDArray[np.bool_]) -> Floats:
+def _twist(links: Floats, motors: Floats, turning: Flags) -> Floats:
     """Return motors minus links (N, n), without what their zeros differ by, and full turns."""
     twist = motors - links
     twist -= np.median(twist, axis=0)
@@ -158,19 +161,12 @@ def _twist(links: Floats, motors: Floats, turning: NDArray[np.bool_]) -> Floats:
 
 
 def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> Floats:
-    """Return the values (N, n) of these times at other times (k,), linearly interpolated."""
+    """Return the values (N, n) of these times at other times (k,), linearly interpolated.
+
+    Before the first time and after the last one, values are those at that time.
+    """
     columns = [np.interp(at, time, column) for column in values.T]
-    return np.asarray(np.transpose(columns))
-
-
-def evenly_interpolated(at: np.ndarray, values: np.ndarray) -> Floats:
-    """Return `interpolated` for values (N, n) at the times 0, 1, ..., N - 1."""
-    if len(values) == 1:
-        return np.repeat(values, at.size, axis=0)
-    before = np.clip(at.astype(np.intp), 0, len(values) - 2)
-    share = np.clip(at - before, 0.0, 1.0)
-    low = values[before]
-    return np.asarray(low + share[:, None] * (values[before + 1] - low))
+    return np.transpose(columns)
 
 
 def joined(first: Recording, *others: Recording) -> tuple[Recording, list[float]]:

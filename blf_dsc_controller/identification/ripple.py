@@ -17,12 +17,12 @@ friction is not, and in both halves of the recording, and stand out of its neigh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from blf_dsc_controller.identification.recording import Flags, Indices
 from blf_dsc_controller.identification.windows import STILL, Rows
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
@@ -92,12 +92,12 @@ NOTHING = Ripples((), (np.inf, 0.0), np.inf, 0.0)
 """What is found of a joint that moved too little."""
 
 
-def ripples_of(short: Rows, theta: Floats, delay: float) -> tuple[Ripples, ...]:
-    """Return the ripples of each joint in short windows, for the unknowns `theta` (m,)."""
+def ripples_of(short: Rows, theta: Floats) -> tuple[Ripples, ...]:
+    """Return the ripples of each joint in short windows, for the unknowns and delay (m + 1,)."""
     windows = np.arange(short.time.size)
-    left = short.u(delay) - short.torques(windows, theta)
-    q = short.over_windows(lambda at: short.q[at], short.g)
-    dq = short.over_windows(lambda at: short.dq[at], short.g)
+    left = short.u(theta[-1]) - short.torques(windows, theta)
+    q = short.postures
+    dq = short.columns['viscous']
     share = _Share(short.g, short.period)
     found = []
     for i in range(short.speed.size):
@@ -198,13 +198,13 @@ class _Share:
 class _Passes(NamedTuple):
     """Rows in which a joint moves, by passes in one direction."""
 
-    rows: NDArray[np.intp]  # (K,)
-    begins: NDArray[np.intp]  # (G,) of passes, in `rows`
-    is_forward: NDArray[np.bool_]  # (G,)
+    rows: Indices  # (K,)
+    begins: Indices  # (G,) of passes, in `rows`
+    is_forward: Flags  # (G,)
     time: Floats  # (G,) s
 
     @classmethod
-    def of(cls, time: Floats, dq: Floats, is_sound: NDArray[np.bool_]) -> _Passes:
+    def of(cls, time: Floats, dq: Floats, is_sound: Flags) -> _Passes:
         """Return those at times (R,) with the speeds (R,)."""
         moves = np.flatnonzero(is_sound & (np.abs(dq) > STILL))
         if moves.size < 2:
@@ -224,7 +224,7 @@ class _Passes(NamedTuple):
 
     def sums(self, values: Floats) -> Floats:
         """Return sums (..., G) of values (..., K) over each pass."""
-        return np.asarray(np.add.reduceat(values, self.begins, axis=-1))
+        return np.add.reduceat(values, self.begins, axis=-1)
 
     def spread(self, values: Floats) -> Floats:
         """Return values (..., G) of passes at their rows (..., K)."""
@@ -241,7 +241,7 @@ class _Passes(NamedTuple):
         is_twin = (apart < 1.0) & ~longer & ~np.eye(length.size, dtype=bool)
         return bool(is_twin.any(axis=1).mean() > 0.5)
 
-    def parts(self) -> Iterator[NDArray[np.bool_]]:
+    def parts(self) -> Iterator[Flags]:
         """Yield the passes (G,) of both directions, and of both halves."""
         first = self.time < np.median(self.time)
         yield from (self.is_forward, ~self.is_forward, first, ~first)
@@ -253,7 +253,7 @@ class _Estimate(NamedTuple):
     A: Floats  # (k, G, 2, 2) products of the columns in each pass
     b: Floats  # (k, G, 2) and of them with what is left
 
-    def of(self, passes: NDArray[np.bool_] | slice = slice(None)) -> Floats:
+    def of(self, passes: Flags | slice = slice(None)) -> Floats:
         """Return the coefficients (k, 2) by some passes."""
         A = self.A[:, passes].sum(axis=1) + _TINY * np.eye(2)
         return np.asarray(
@@ -282,6 +282,26 @@ class _Joint(NamedTuple):
     dq: Floats
     weight: Floats
     share: _Share
+    travel: float  # from one end of its range to the other, rad
+    seen: tuple[float, float]  # N that are searched, from, to
+
+    @property
+    def lobe(self) -> float:
+        """The N within which ripples look alike."""
+        return float(2.0 * np.pi / self.travel)
+
+    @property
+    def grid(self) -> Floats:
+        """The N that are tried (k,)."""
+        return np.arange(*self.seen, self.lobe / _PER_LOBE)
+
+    @property
+    def level(self) -> float:
+        """The F statistic that noise exceeds at one N of the grid by `_CHANCE`."""
+        from scipy.special import fdtri
+
+        chance = _CHANCE / max(self.grid.size / _PER_LOBE, 1.0)
+        return float(fdtri(2.0, self.passes.begins.size - 2.0, 1.0 - chance))
 
     def columns(self, cycles: Floats) -> Floats:
         """Return sine and cosine (k, 2, K) for some N (k,), without their mean of each pass."""
@@ -294,7 +314,7 @@ class _Joint(NamedTuple):
     def centred(self, values: Floats) -> Floats:
         """Return values (..., K) without their weighted mean of each pass."""
         means = self.passes.sums(self.weight * values) / self.passes.sums(self.weight)
-        return np.asarray(values - self.passes.spread(means))
+        return values - self.passes.spread(means)
 
     def estimate(self, cycles: Floats, left: Floats) -> _Estimate:
         """Return the estimate for some N (k,)."""
@@ -321,26 +341,8 @@ class _Joint(NamedTuple):
         return np.asarray(c @ H)
 
 
-class _Search(NamedTuple):
-    """Which N of a joint are searched."""
-
-    middle: float  # of its range, rad
-    travel: float  # from one end of its range to the other, rad
-    seen: tuple[float, float]
-
-    @property
-    def lobe(self) -> float:
-        """The N within which ripples look alike."""
-        return float(2.0 * np.pi / self.travel)
-
-    @property
-    def grid(self) -> Floats:
-        """The N that are tried (k,)."""
-        return np.arange(*self.seen, self.lobe / _PER_LOBE)
-
-
-def _search_of(passes: _Passes, q: Floats, dq: Floats, share: _Share) -> _Search | None:
-    """Return which N the motion of a joint may show, None if it moved too little."""
+def _joint_of(passes: _Passes, q: Floats, dq: Floats, share: _Share) -> _Joint | None:
+    """Return a joint by its rows (K,), None if it moved too little to show any N."""
     forward = passes.is_forward.sum()
     if passes.begins.size < _PASSES or not 3 <= forward <= passes.begins.size - 3:
         return None
@@ -351,28 +353,29 @@ def _search_of(passes: _Passes, q: Floats, dq: Floats, share: _Share) -> _Search
     last = min(_LARGEST, fastest, first + _GRID * lobe / _PER_LOBE)
     if last < first + lobe:
         return None
-    return _Search(0.5 * (low + high), high - low, (first, last))
+    middle = 0.5 * (low + high)
+    travel = high - low
+    return _Joint(passes, q - middle, dq, np.ones(q.size), share, travel, (first, last))
 
 
 def _of_joint(
     passes: _Passes, q: Floats, dq: Floats, left: Floats, share: _Share
 ) -> Ripples:
     """Return the ripples of a joint by its rows (K,)."""
-    search = _search_of(passes, q, dq, share)
-    if search is None:
+    joint = _joint_of(passes, q, dq, share)
+    if joint is None:
         return NOTHING
-    joint = _Joint(passes, q - search.middle, dq, np.ones(q.size), share)
     joint, left = _robust(joint, left)
-    cycles, rest, without = _all_cycles(joint, left, search)
+    cycles, rest, without = _all_cycles(joint, left)
     torque = float(np.sqrt(np.mean(rest**2)))
     found = [_ripple(joint, left, cycles, k) for k in range(len(cycles))]
     found.sort(key=lambda each: -each.amplitude)
     told = tuple(each for each in found if each.amplitude > _FELT * torque)
-    certain_from = float(np.median(_least(without, search.grid.size / _PER_LOBE)))
-    repeats = passes.repeat(q, search.travel)
-    return Ripples(
-        told, search.seen, max(certain_from, _FELT * torque), torque, repeats
-    )
+    # amplitudes (k,) that would be certain
+    variance = 0.5 * np.trace(without.covariance(), axis1=1, axis2=2)
+    least = float(np.median(np.sqrt(2.0 * variance * joint.level)))
+    repeats = passes.repeat(q, joint.travel)
+    return Ripples(told, joint.seen, max(least, _FELT * torque), torque, repeats)
 
 
 def _robust(joint: _Joint, left: Floats) -> tuple[_Joint, Floats]:
@@ -384,64 +387,46 @@ def _robust(joint: _Joint, left: Floats) -> tuple[_Joint, Floats]:
     return joint, joint.centred(left)
 
 
-def _all_cycles(
-    joint: _Joint, left: Floats, search: _Search
-) -> tuple[list[float], Floats, _Estimate]:
+def _all_cycles(joint: _Joint, left: Floats) -> tuple[list[float], Floats, _Estimate]:
     """Return the N of all ripples, what is left without these, and its estimate on the grid.
 
     The strongest is found first, and the next in what it leaves.
     """
-    grid = search.grid
+    grid = joint.grid
     cycles: list[float] = []
     rest = left
     while True:
         estimate = joint.estimate(grid, rest)
         away = np.abs(np.subtract.outer(grid, cycles)).min(axis=1, initial=np.inf)
-        is_new = away > _NEAR * search.lobe
-        is_ripple = _is_ripple(estimate, grid, search.lobe, joint.passes.parts())
-        certain = np.flatnonzero(is_ripple & is_new)
+        is_new = away > _NEAR * joint.lobe
+        certain = np.flatnonzero(_is_ripple(joint, estimate) & is_new)
         if not certain.size or len(cycles) == _MOST:
             return cycles, rest, estimate
         best = certain[np.argmax(estimate.power[certain])]
-        cycles.append(_refined(joint, rest, float(grid[best]), search.lobe))
+        cycles.append(_refined(joint, rest, float(grid[best])))
         rest = left - joint.fitted(cycles, left)
 
 
-def _level(passes: int, cells: float) -> float:
-    """Return the F statistic that noise exceeds in one of so many cells by `_CHANCE`."""
-    from scipy.special import fdtri
-
-    return float(fdtri(2.0, passes - 2.0, 1.0 - _CHANCE / max(cells, 1.0)))
-
-
-def _least(estimate: _Estimate, cells: float) -> Floats:
-    """Return the amplitudes (k,) that would be certain."""
-    variance = 0.5 * np.trace(estimate.covariance(), axis1=1, axis2=2)
-    return np.asarray(np.sqrt(2.0 * variance * _level(estimate.A.shape[1], cells)))
-
-
-def _is_ripple(
-    estimate: _Estimate, grid: Floats, lobe: float, parts: Iterable[NDArray[np.bool_]]
-) -> NDArray[np.bool_]:
+def _is_ripple(joint: _Joint, estimate: _Estimate) -> Flags:
     """Return at which N (k,) of the grid there is a ripple, like in all parts of the passes."""
     c = estimate.of()
     V = estimate.covariance() + _TINY * np.eye(2)
     F = 0.5 * np.einsum('ka,ka->k', c, np.linalg.solve(V, c[..., None])[..., 0])
-    certain = _level(estimate.A.shape[1], grid.size / _PER_LOBE) < F
+    certain = joint.level < F
     amplitude = np.linalg.norm(c, axis=1)
-    for part in parts:
+    for part in joint.passes.parts():
         certain &= np.linalg.norm(estimate.of(part) - c, axis=1) < _LIKE * amplitude
     power = estimate.power
     for k in np.flatnonzero(certain):
-        away = np.abs(grid - grid[k])
-        others = power[(away > _NEAR * lobe) & (away < _FAR * lobe)]
+        away = np.abs(joint.grid - joint.grid[k]) / joint.lobe
+        others = power[(away > _NEAR) & (away < _FAR)]
         certain[k] = others.size > 0 and power[k] > _ABOVE * np.median(others)
     return np.asarray(certain)
 
 
-def _refined(joint: _Joint, left: Floats, cycles: float, lobe: float) -> float:
+def _refined(joint: _Joint, left: Floats, cycles: float) -> float:
     """Return the N near one of the grid that explains most."""
-    step = lobe / _PER_LOBE
+    step = joint.lobe / _PER_LOBE
     for _ in range(3):
         near = cycles + step * np.linspace(-1.0, 1.0, 11)
         cycles = float(near[np.argmax(joint.estimate(near, left).power)])

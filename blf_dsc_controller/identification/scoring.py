@@ -6,32 +6,33 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.identification.identified import Score
+from blf_dsc_controller.identification.prior import Prior
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.values import (
     COULOMB,
     OFFSET,
     VISCOUS,
     parts,
 )
-from blf_dsc_controller.identification.windows import Indices, Rows, Split
+from blf_dsc_controller.identification.windows import Rows, Split
 from blf_dsc_controller.run import Floats
 
 
-def scored(
-    rows: Rows, windows: Split, G: Floats, prior: Floats, values: Floats
-) -> Score:
+def scored(rows: Rows, windows: Split, prior: Prior, values: Floats) -> Score:
     """Return the score of values that were fitted to `windows.fit`."""
-    rows = rows.with_load((G @ values)[: rows.p])
+    rows = rows.with_load(prior.G @ values)
     moving = windows.moving
-    urdf = np.zeros_like(prior)
-    parts(urdf).bodies[:] = parts(prior).bodies
-    corrected = np.zeros_like(prior)
+    urdf = np.zeros_like(values)
+    parts(urdf).bodies[:] = parts(prior.mean).bodies
+    corrected = np.zeros_like(values)
     parts(corrected).bodies[:] = parts(values).bodies
     parts(corrected).load[:] = parts(values).load
     predicted = np.array(
-        [rows.torques(moving, (G @ model)[:-1]) for model in (urdf, corrected, values)]
+        [rows.torques(moving, prior.G @ model) for model in (urdf, corrected, values)]
     )
     columns = _columns_of_urdf(rows, moving)
-    predicted[0] += np.sum(columns * parts(prior).terms[[VISCOUS, COULOMB]], axis=1)
+    friction_of_urdf = parts(prior.mean).terms[[VISCOUS, COULOMB]]
+    predicted[0] += np.sum(columns * friction_of_urdf, axis=1)
     predicted[1] += np.sum(columns * nearest_friction(rows, windows, values), axis=1)
     measured = rows.u(values[-1])[moving]
     shown = np.isin(moving, windows.test)

@@ -14,10 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.identification.physical import most_likely
 from blf_dsc_controller.identification.prior import Entry, Prior
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.regression import FOLDS, Regression, regression
 from blf_dsc_controller.identification.sliding import DISTANCES
-from blf_dsc_controller.identification.windows import Indices, Rows
+from blf_dsc_controller.identification.windows import Rows
 from blf_dsc_controller.run import Floats
 
 # of the squared error of cross-validation, least reduction by what is not the default
@@ -41,11 +43,11 @@ class Selected(NamedTuple):
     found: Regression  # with all terms
 
 
-def select(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Selected:
+def select(rows: Rows, fit: Indices, full: Prior) -> Selected:
     """Return the model that predicts best."""
-    distances = _contacts(rows, fit, G, full)
+    distances = _contacts(rows, fit, full)
     rows = rows.with_sliding(distances)
-    found = regression(rows, fit, G, full, parts=_PARTS)
+    found = regression(rows, fit, full, parts=_PARTS)
     folds = found.folds.sum(axis=1, keepdims=True)
     prior = full.only(_worthwhile(found._replace(folds=folds), full))
     pairs = folds[::2] + folds[1::2]
@@ -55,14 +57,14 @@ def select(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Selected:
     return Selected(distances, rows, widened, widths, found)
 
 
-def _contacts(rows: Rows, fit: Indices, G: Floats, full: Prior) -> Floats:
+def _contacts(rows: Rows, fit: Indices, full: Prior) -> Floats:
     """Return for each joint the distance x_s with which its own torque is predicted best."""
     errors = []
     found: Regression | None = None
     every = np.ones(full.mean.size)
     for distance in DISTANCES:
         slid = rows.with_sliding(np.full(rows.speed.size, distance))
-        found = regression(slid, fit, G, full, found)
+        found = regression(slid, fit, full, found)
         of_joints = cross_validated(found, every).sum(axis=0)
         errors.append(of_joints * found.deviation**2)
     table = np.array(errors)
@@ -104,9 +106,7 @@ def repeats(rows: Rows, fit: Indices) -> bool:
     """Return whether most states of each fifth of the motion are also in the others."""
     from scipy.spatial import cKDTree
 
-    states = np.hstack([rows.over_windows(lambda at: rows.q[at], rows.g), rows.speeds])[
-        fit
-    ]
+    states = np.hstack([rows.postures, rows.speeds])[fit]
     states = states / np.maximum(states.std(axis=0), _TINY)
     folds = np.array_split(states, FOLDS)
     distances = []
@@ -163,7 +163,7 @@ def cross_validated(
     must = np.isin(used, positive or [])
     errors = np.zeros(folds.shape[:2])
     for k, (own, others) in enumerate(zip(folds, rest, strict=True)):
-        z = np.linalg.solve(others[:-1, :-1] + np.eye(used.size), others[:-1, -1])
+        z = most_likely(others)
         if (z[must] <= 0.0).any():
             return np.full(errors.shape, np.inf)
         both = np.append(z, -1.0)

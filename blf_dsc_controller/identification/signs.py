@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.identification.joint_alone import Alone
-from blf_dsc_controller.identification.physical import solve
+from blf_dsc_controller.identification.physical import left_of, solve
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.run import Floats
 
@@ -31,12 +31,12 @@ _MOST = 16  # combinations with physical bodies
 Signs = NDArray[np.float64]
 
 
-def likely_signs(alone: Alone, G: Floats, prior: Prior) -> tuple[Signs, float]:
-    """Return the most likely signs (n,), 1 or -1, and the cost of the fit with them.
+def likely_signs(alone: Alone, prior: Prior) -> Signs:
+    """Return the most likely signs (n,), 1 or -1.
 
     Of signs that are as good, those of most joints are alike, and as recorded.
     """
-    fit = _Fit(alone, G, prior)
+    fit = _Fit(alone, prior)
     combinations = np.array(list(_combinations(alone)))
     bounds = fit.bounds(combinations)
     found: list[tuple[float, Signs]] = []
@@ -46,9 +46,8 @@ def likely_signs(alone: Alone, G: Floats, prior: Prior) -> tuple[Signs, float]:
             break
         found.append((fit.cost(combinations[k]), combinations[k]))
     least = min(cost for cost, _ in found)
-    as_good = [each for each in found if each[0] <= _AS_GOOD * least]
-    cost, signs = min(as_good, key=lambda each: _oddity(each[1]))
-    return signs, cost
+    as_good = [signs for cost, signs in found if cost <= _AS_GOOD * least]
+    return min(as_good, key=_oddity)
 
 
 def _combinations(alone: Alone) -> Iterator[Signs]:
@@ -75,31 +74,34 @@ def _oddity(signs: Signs) -> tuple[int, int]:
 class _Fit:
     """The fit of the whole arm to torques with given signs, without their delay."""
 
-    def __init__(self, alone: Alone, G: Floats, prior: Prior) -> None:
-        R = alone.triangles / alone.deviation[:, None, None]
+    def __init__(self, alone: Alone, prior: Prior) -> None:
+        k = prior.mean.size
+        # from rows of `Weighted` to those of z, of the prior's mean, and of the torques
+        T = np.zeros((alone.products.shape[1], k + 2))
+        T[:-2, :-1] = prior.T[:-2]
+        T[-2:, -1] = -alone.delay, 1.0
+        deviation = alone.deviation[:, None, None]
+        self._products = T.T @ (alone.products / deviation**2) @ T  # (n, k + 2, k + 2)
         self._prior = prior
-        self._A = R[:, :, :-2] @ (G @ prior.D)[:-1]  # (n, m + 2, k)
-        self._mean = R[:, :, :-2] @ (G @ prior.mean)[:-1]  # (n, m + 2)
-        self._u = R[:, :, -1] - alone.delay * R[:, :, -2]
 
     def bounds(self, signs: Signs) -> Floats:
         """Return lower bounds (c,) of the cost with signs (c, n)."""
-        A, u, mean = self._A, self._u, self._mean
-        H = np.einsum('irk,irl->kl', A, A) + np.eye(A.shape[2])
-        targets = np.column_stack(
-            (-np.einsum('irk,ir->k', A, mean), np.einsum('irk,ir->ki', A, u))
-        )
-        y = np.linalg.solve(np.linalg.cholesky(H), targets)
+        products = self._products
+        alike = products.sum(axis=0)
+        L = np.linalg.cholesky(alike[:-2, :-2] + np.eye(len(alike) - 2))
+        targets = np.column_stack((alike[:-2, -2], products[:, :-2, -1].T))
+        y = np.linalg.solve(L, targets)
         explained = np.sum((y[:, 1:] @ signs.T + y[:, :1]) ** 2, axis=0)
-        squares = np.sum(u**2) + np.sum(mean**2)
-        crossed = signs @ np.sum(u * mean, axis=1)
-        return np.asarray(squares - 2.0 * crossed - explained)
+        crossed = signs @ products[:, -2, -1]
+        return np.asarray(alike[-2, -2] + alike[-1, -1] + 2.0 * crossed - explained)
 
     def cost(self, signs: Signs) -> float:
         """Return the squared residuals and deviations of the best physical arm."""
-        A = self._A.reshape(-1, self._A.shape[2])
-        b = (signs[:, None] * self._u - self._mean).ravel()
-        Q, R = np.linalg.qr(A)
-        z = solve(R, Q.T @ b, self._prior.cones, self._prior.start)
-        left = b - A @ z
-        return float(left @ left + z @ z)
+        own = np.tile(
+            np.eye(len(self._products[0]), len(self._products[0]) - 1),
+            (signs.size, 1, 1),
+        )
+        own[:, -1, -1] = signs
+        products = (np.swapaxes(own, 1, 2) @ self._products @ own).sum(axis=0)
+        z = solve(products, self._prior.cones, self._prior.start)
+        return left_of(products, z) + float(z @ z)

@@ -41,7 +41,7 @@ def sliding_direction(
             own[0] = first[elastic]
         follow_contacts(np.ascontiguousarray(q[:, elastic]), distances[elastic], own)
         direction[:, elastic] = own
-    return np.asarray(direction)
+    return direction
 
 
 @kernel

@@ -22,8 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.regression import correlation_length
-from blf_dsc_controller.identification.windows import Indices, Rows
+from blf_dsc_controller.identification.windows import Rows
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
 
@@ -62,17 +63,17 @@ class Compliance(NamedTuple):
     @property
     def is_known(self) -> np.ndarray:
         """Whether intervals (n,) are of finite stiffness."""
-        return np.asarray(self.value > TWO_SIDED * self.deviation)
+        return self.value > TWO_SIDED * self.deviation
 
     @property
     def is_negative(self) -> np.ndarray:
         """Whether joints (n,) twist against their torque."""
-        return np.asarray(self.value < -TWO_SIDED * self.deviation)
+        return self.value < -TWO_SIDED * self.deviation
 
     @property
     def is_computed(self) -> np.ndarray:
         """Whether twists (n,) fit the torque so exactly that they must be computed from it."""
-        return np.asarray(self.is_known & (self.left < _COMPUTED))
+        return self.is_known & (self.left < _COMPUTED)
 
 
 def compliance_of(
@@ -83,7 +84,7 @@ def compliance_of(
     `links` are the identified values without friction, rotors, and the delay [s] of the
     torques.
     """
-    twists = rows.over_windows(lambda at: twist[at], rows.g)[windows]
+    twists = rows.over_windows(lambda at: twist[at])[windows]
     u = rows.u(delay)[windows]
     needed = rows.torques(windows, links)
     rate = np.gradient(needed, rows.time[windows], axis=0)
@@ -91,8 +92,8 @@ def compliance_of(
         *np.moveaxis(rows.friction(windows), 1, 0),
         rows.over_windows(lambda at: rows.dq[at], rows.slope)[windows],
         rate,
-        rows.over_windows(lambda at: np.sin(rows.q[at]), rows.g)[windows],
-        rows.over_windows(lambda at: np.cos(rows.q[at]), rows.g)[windows],
+        rows.over_windows(lambda at: np.sin(rows.q[at]))[windows],
+        rows.over_windows(lambda at: np.cos(rows.q[at]))[windows],
         _sign(rate),
         _sign(needed),
     ))  # fmt: skip
@@ -144,4 +145,4 @@ def _variance(residual: Floats, counted: float) -> float:
 def _without(W: Floats, columns: Floats) -> Floats:
     """Return columns (R, k) without what W (R, m) explains of them."""
     W = W / (np.linalg.norm(W, axis=0) + _TINY)
-    return np.asarray(columns - W @ np.linalg.lstsq(W, columns, rcond=None)[0])
+    return columns - W @ np.linalg.lstsq(W, columns, rcond=None)[0]

@@ -29,7 +29,7 @@ from blf_dsc_controller.identification.values import (
 )
 from blf_dsc_controller.identification.windows import SMOOTHING, WINDOW
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
-from blf_dsc_controller.run import joint_units
+from blf_dsc_controller.run import Floats, joint_units
 
 UNSEEN = 0.5
 """Share of the prior's variance; parameters that keep more are not shown."""
@@ -41,20 +41,22 @@ _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not expl
 
 _NOTHING = 1e-3  # of half of its interval, value that is printed as 0 ...
 _ROUNDING = 1e-9  # ... and value of a URDF
-_OF_OFFSETS = (
-    ', for which a URDF has no place: calibrate the torque sensors, or let the controller learn '
-    'them (learning.bias)'
-)
+_OF_JOINTS = (
+    (
+        ', for which a URDF has no place: calibrate the torque sensors, or let the controller '
+        'learn them (learning.bias)'
+    ),
+    ': these are torques, not noise, and may have shifted values beyond their intervals',
+    ' did not move: rotors and friction of these are guesses',
+    ', so the error in % means little there',
+    (
+        ' are not explained: do not trust the values there before sign, unit and zero are those '
+        'of the URDF'
+    ),
+)  # offsets, lasting residuals, joints that are still, idle, poorly explained
 _OF_REPEATED = (
     'the motion repeats, and with it whatever model and friction err by, which may look like a '
     'ripple: use only what a minute of motion that does not repeat shows, too'
-)
-_OF_POOR = (
-    ' are not explained: do not trust the values there before sign, unit and zero are those of '
-    'the URDF'
-)
-_OF_RESIDUALS = (
-    ': these are torques, not noise, and may have shifted values beyond their intervals'
 )
 _FELT = 0.005  # of the torque, and of the largest: what the model leaves out is told
 _LEFT_OUT = (
@@ -100,18 +102,26 @@ def load_table(found: Identified) -> Iterator[str]:
     if found.carried is None:
         return
     values, deviations = found.load
-    mass = interval(values[0], deviations[0], '.3f')
+    mass, *centre = _mass_and_centre(values, deviations)
     if values[0] < TWO_SIDED * deviations[0]:
         yield f'load: none that shows ({mass} kg)'
         return
-    centre = [
-        interval(1e3 * c, 1e3 * s, '.1f')
-        for c, s in zip(values[1:], deviations[1:], strict=True)
-    ]
     yield (
         f'load {found.carried.when}: {mass} kg, its centre at {", ".join(centre)} mm '
         f'in {found.chain.tip}'
     )
+
+
+def _mass_and_centre(values: Floats, deviations: Floats) -> Iterator[str]:
+    """Yield mass [kg] and centre [mm] of values in kg and m (4,), with their intervals."""
+    for value, deviation, scale, digits in zip(
+        values,
+        deviations,
+        (1.0, 1e3, 1e3, 1e3),
+        ('.3f', '.1f', '.1f', '.1f'),
+        strict=True,
+    ):
+        yield interval(scale * value, scale * deviation, digits)
 
 
 def bodies_table(found: Identified) -> str:
@@ -119,18 +129,13 @@ def bodies_table(found: Identified) -> str:
     rows = [('body', 'mass [kg]', 'centre of mass [mm]')]
     for i, joint in enumerate(found.chain.joints):
         at = slice(10 * i, 10 * i + 4)
-        values, deviations = mass_and_centre(
-            found.values[at], found.covariance[at, at], np.eye(4)
+        mass, *after = _mass_and_centre(
+            *mass_and_centre(found.values[at], found.covariance[at, at], np.eye(4))
         )
         before = joint.inertia[1:4] / joint.inertia[0]
-        after = [
-            interval(1e3 * c, 1e3 * s, '.1f')
-            for c, s in zip(values[1:], deviations[1:], strict=True)
-        ]
         centre = [
             f'{1e3 * old:.1f} -> {new}' for old, new in zip(before, after, strict=True)
         ]
-        mass = interval(values[0], deviations[0], '.3f')
         rows.append(
             (joint.link, f'{joint.inertia[0]:.3f} -> {mass}', ', '.join(centre))
         )
@@ -304,12 +309,9 @@ def _joint_notes(found: Identified) -> Iterator[str]:
     """Yield what is odd with joints: one note for all that share it."""
     score = found.score
     share = score.errors[2] / score.torque
-    offsets: list[str] = []
-    lasting: list[str] = []
-    still: list[str] = []
-    idle: list[str] = []
     unexplained = unexplained_joints(found)
-    poor: list[str] = []
+    shared: dict[str, list[str]] = {ending: [] for ending in _OF_JOINTS}
+    offsets, lasting, still, idle, poor = shared.values()
     for i, joint in enumerate(found.chain.joints):
         name = joint.name
         unit = units_of(joint.kind)[OFFSET]
@@ -330,13 +332,7 @@ def _joint_notes(found: Identified) -> Iterator[str]:
             idle.append(f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit})')
         elif i in unexplained:
             poor.append(f'{100.0 * share[i]:.0f} % of the torque of {name}')
-    for joints, ending in (
-        (offsets, _OF_OFFSETS),
-        (lasting, _OF_RESIDUALS),
-        (still, ' did not move: rotors and friction of these are guesses'),
-        (idle, ', so the error in % means little there'),
-        (poor, _OF_POOR),
-    ):
+    for ending, joints in shared.items():
         if joints:
             yield ', '.join(joints) + ending
 

@@ -59,7 +59,8 @@ def open_table(path: Path) -> Table:
     except BlfDscError:
         raise
     except Exception as error:  # libraries raise nearly anything on damaged files
-        reason = ' '.join(str(error).split()) or type(error).__name__
+        text = getattr(error, 'strerror', '') or str(error)
+        reason = ' '.join(text.split()) or type(error).__name__
         raise BlfDscError(f'{path} cannot be read as {suffix[1:]}: {reason}') from error
 
 

@@ -16,6 +16,7 @@ import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import islice, zip_longest
 from pathlib import Path
 from typing import NamedTuple, TextIO
@@ -106,23 +107,11 @@ class _Layout(NamedTuple):
         at: Sequence[int],
     ) -> Floats:
         """Return some columns (k, m) of numbered lines with so many cells."""
-        lines = [line for _, line in block]
         mark = self.delimiter or None
-        if any(len(line.split(mark)) != width for line in lines):
-            return self._any_numbers(path, block, width, at)
-        lines = [self._with_points(line) for line in lines]
-        try:
-            return np.loadtxt(lines, delimiter=mark, usecols=at, ndmin=2)
-        except ValueError:  # cells that are empty or text
-            return self._any_numbers(path, block, width, at)
-
-    def _any_numbers(
-        self,
-        path: Path,
-        block: Sequence[tuple[int, str]],
-        width: int,
-        at: Sequence[int],
-    ) -> Floats:
+        if all(len(line.split(mark)) == width for _, line in block):
+            lines = [self._with_points(line) for _, line in block]
+            with suppress(ValueError):  # cells that are empty or text
+                return np.loadtxt(lines, delimiter=mark, usecols=at, ndmin=2)
         found = []
         for number, line in block:
             cells = self.cells(line)
@@ -193,21 +182,15 @@ def _named_once(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str
 
 
 def _opened(path: Path) -> TextIO:
-    """Open a text file; raise BlfDscError if there is none."""
-    if path.exists() and not path.is_file():
-        raise BlfDscError(f'{path} is not a regular file, so it is no table')
-    try:
-        with path.open('rb') as raw:
-            begin = raw.read(_LONGEST)
-        packed = next((_PACKED[each] for each in _PACKED if begin.startswith(each)), '')
-        if packed:
+    """Open a text file; raise BlfDscError if it is packed."""
+    with path.open('rb') as raw:
+        begin = raw.read(_LONGEST)
+    for magic, packed in _PACKED.items():
+        if begin.startswith(magic):
             raise BlfDscError(
                 f'{path} is {packed}, not text: unpack it, or write it as CSV'
             )
-        encoding = _encoding_of(begin)
-        return path.open(encoding=encoding)
-    except OSError as error:
-        raise BlfDscError(f'{path} cannot be read: {error.strerror}') from error
+    return path.open(encoding=_encoding_of(begin))
 
 
 def _encoding_of(begin: bytes) -> str:

@@ -4,53 +4,50 @@
 from __future__ import annotations
 
 import re
-from math import pi
 from pathlib import Path
 from typing import NamedTuple
 
 from blf_dsc_controller.errors import BlfDscError
 
-_TIME = {
-    **dict.fromkeys(('s', 'sec', 'secs', 'second', 'seconds'), 1.0),
-    **dict.fromkeys(('ms', 'msec', 'millisecond', 'milliseconds'), 1e-3),
-    **dict.fromkeys(('us', 'usec', 'microsecond', 'microseconds'), 1e-6),
-    **dict.fromkeys(('ns', 'nsec', 'nsecs', 'nanosec', 'nanosecs'), 1e-9),
-    **dict.fromkeys(('nanosecond', 'nanoseconds'), 1e-9),
-    **dict.fromkeys(('min', 'mins', 'minute', 'minutes'), 60.0),
-    **dict.fromkeys(('h', 'hr', 'hour', 'hours'), 3600.0),
-}
-_POSITION = {
-    **dict.fromkeys(('rad', 'radian', 'radians', 'm'), 1.0),
-    **dict.fromkeys(('mrad', 'mm'), 1e-3),
-    'cm': 1e-2,
-    **dict.fromkeys(('deg', 'degs', 'degree', 'degrees', '°'), pi / 180.0),
-    **dict.fromkeys(('rev', 'revs', 'turn', 'turns'), 2.0 * pi),
-}
-_TORQUE = {
-    **dict.fromkeys(('nm', 'n'), 1.0),
-    **dict.fromkeys(('nmm', 'mnm'), 1e-3),
-    'ncm': 1e-2,
-    **dict.fromkeys(('knm', 'kn'), 1e3),
-}
-_CURRENT = {
-    **dict.fromkeys(('a', 'amp', 'amps', 'ampere', 'arms'), 1.0),
-    'ma': 1e-3,
-    **dict.fromkeys(('%', 'percent'), 1.0),
-    '‰': 0.1,
-}
-_OF = {'time': _TIME, 'q': _POSITION, 'tau': {**_TORQUE, **_CURRENT}}
+
+def _table(text: str) -> dict[str, float]:
+    """Return the factors of units from lines that begin with one, and name its units."""
+    lines = map(str.split, text.splitlines())
+    return {unit: float(factor) for factor, *units in lines for unit in units}
+
+
+_TIME = _table("""\
+1 s sec secs second seconds
+1e-3 ms msec millisecond milliseconds
+1e-6 us usec microsecond microseconds
+1e-9 ns nsec nsecs nanosec nanosecs nanosecond nanoseconds
+60 min mins minute minutes
+3600 h hr hour hours""")
+_POSITION = _table("""\
+1 rad radian radians m
+1e-3 mrad mm
+1e-2 cm
+0.017453292519943295 deg degs degree degrees °
+6.283185307179586 rev revs turn turns""")
+_TORQUE = _table("""\
+1 nm n
+1e-3 nmm mnm
+1e-2 ncm
+1e3 knm kn""")
+_CURRENT = _table("""\
+1 a amp amps ampere arms % percent
+1e-3 ma
+0.1 ‰""")
+# units of other quantities, or without a known size
+_OTHERS = _table("""\
+nan count counts tick ticks inc increments raw digits v volt gon
+nan lbfin lbin ftlb lbft kgcm kgfcm ozin""")
+_OF = {'time': _TIME, 'q': _POSITION, 'tau': _TORQUE | _CURRENT, 'other': _OTHERS}
 _EXPECTED = {
     'time': 's, ms, us, ns, min or h',
     'q': 'rad, mrad, deg, rev (or m, cm, mm)',
     'tau': 'N m, N cm, N mm, kN m (or N, kN), or A, mA or % with --gains',
 }
-# units of other quantities, or without a known size
-_OTHERS = frozenset(
-    (
-        *('count', 'counts', 'tick', 'ticks', 'inc', 'increments', 'raw', 'digits'),
-        *('v', 'volt', 'gon', 'lbfin', 'lbin', 'ftlb', 'lbft', 'kgcm', 'kgfcm', 'ozin'),
-    )
-)
 _BRACKETED = re.compile(r'\s*[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]\s*$')
 _INDEX = re.compile(r'[\s_\[(]*\d+[\])]?$')
 _LAST_WORD = re.compile(r'[\s_]+([^\s_]+)$')
@@ -81,9 +78,7 @@ def split_unit(name: str, kind: str) -> Named:
 
 
 def _is_unit(word: str) -> bool:
-    return (
-        '/' in word or word in _OTHERS or any(word in units for units in _OF.values())
-    )
+    return '/' in word or any(word in units for units in _OF.values())
 
 
 def factor_of(path: Path, unit: str, kind: str) -> float:

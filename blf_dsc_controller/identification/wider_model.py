@@ -29,21 +29,23 @@ like another such factor.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from blf_dsc_controller.identification.left_out import KINDS, LARGEST, LeftOut, left_out
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.problem import Problem
+from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.regression import (
     Fit,
     Weighted,
-    correlation_length,
-    to_z,
+    correlation_lengths,
+    products_of,
+    sums_of,
 )
 from blf_dsc_controller.identification.values import LOAD_FRICTION, parts
-from blf_dsc_controller.identification.windows import HOP, Indices
+from blf_dsc_controller.identification.windows import HOP
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
 
@@ -69,10 +71,9 @@ class Doubt(NamedTuple):
 def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
     """Return the doubt in a fit to all motion with this prior."""
     model = problem.parameters.model
-    columns = left_out(fit.rows, model, problem.G, fit.values)
-    wider = _WiderModel(problem, prior, fit, columns)
-    z, H, spread = wider.fit()
-    k = wider.k
+    columns = left_out(fit.rows, model, prior.G, fit.values)
+    z, H, spread = _wider_fit(problem, prior, fit, columns)
+    k = prior.mean.size
     d = prior.D @ z[:k]
     covariance = prior.D @ H[:k, :k] @ prior.D.T + np.outer(d, d)
     scaled = fit.values.copy()
@@ -93,67 +94,42 @@ def _deviation_of_mean(spread: float, n: int) -> float:
     return t * spread / float(np.sqrt(n))
 
 
-class _WiderModel:
-    """The model of a fit, with the columns left out as well.
+def _wider_fit(
+    problem: Problem, prior: Prior, fit: Fit, columns: LeftOut
+) -> tuple[Floats, Floats, float]:
+    """Return the values z of a wider model, their covariance, and the spread of the gains.
 
-    Its values z are k of the model, relative to those of the fit, and one for each
-    column left out.
+    z are k values of the model, relative to those of the fit, and one for each column
+    left out.  Sizes of the kinds, residuals and the linearisation follow from one
+    another, in turns.
     """
-
-    def __init__(
-        self, problem: Problem, prior: Prior, fit: Fit, columns: LeftOut
-    ) -> None:
-        self.k = k = prior.mean.size
-        of_model = np.full(k, len(KINDS))
-        self._kinds = np.concatenate((of_model, columns.kind))
-        self._gains = k + np.flatnonzero(columns.kind == KINDS.index('gain'))
-        self._products = _products(_blocks(problem, prior, fit, columns))
-        self._narrow = self._narrow_values(fit.problem.deviation)
-        self._given = (problem, prior, fit, columns)
-
-    def _narrow_values(self, deviation: Floats) -> Floats:
-        """Return the values of the model alone, with 0 for what it leaves out."""
-        is_of_model = self._kinds == len(KINDS)
-        values, _ = _solved(self._products, is_of_model * 1.0, deviation**2)
-        return values
-
-    def fit(self) -> tuple[Floats, Floats, float]:
-        """Return z and its covariance, and the spread of the gains.
-
-        Sizes of the kinds, residuals and the linearisation follow from one another, in turns.
-        """
-        problem, prior, fit, columns = self._given
-        deviation = fit.problem.deviation
-        lengths = fit.problem.lasting / HOP
-        # the size of what the model has is that of its prior
-        sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
-        z = np.zeros(self._kinds.size)
-        relative = _relative(self._kinds.size, self._gains)
-        for turn in range(_MOST_ROUNDS):
-            about = _linearised(self._narrow, z, self.k, self._gains) @ relative
-            linear = np.swapaxes(about, 1, 2) @ self._products @ about
-            before = z[self._gains]
-            z, sizes = self._sized(linear, sizes, deviation**2 * lengths)
-            left = _left(problem, prior, fit, columns, about @ np.append(z, -1.0))
-            deviation, lengths = _residual(problem, prior, fit, left)
-            change = np.abs(z[self._gains] - before).max()
-            if turn >= _ROUNDS - 1 and change < _AGREE:
-                break
-        z, H = _solved(linear, sizes[self._kinds], deviation**2 * lengths)
-        return z, H, float(sizes[KINDS.index('gain')])
-
-    def _sized(
-        self, linear: Floats, sizes: Floats, variance: Floats
-    ) -> tuple[Floats, Floats]:
-        """Return z, and the sizes of the kinds that it shows, from sizes before.
-
-        `linear` are the products of linearised columns, `variance` (n,) that of the rows.
-        """
-        sizes = sizes.copy()
+    k = prior.mean.size
+    kinds = np.append(np.full(k, len(KINDS)), columns.kind)
+    gains = np.flatnonzero(kinds == KINDS.index('gain'))
+    blocks = _blocks(problem, prior, fit, columns)
+    products = np.asarray(sum(map(products_of, blocks)))
+    deviation = fit.problem.deviation
+    lengths = fit.problem.lasting / HOP
+    # the size of what the model has is that of its prior
+    narrow, _ = _solved(products, (kinds == len(KINDS)) * 1.0, deviation**2)
+    sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
+    z = np.zeros(kinds.size)
+    relative = _relative(kinds.size, gains)
+    for turn in range(_MOST_ROUNDS):
+        about = _linearised(narrow, z, k, gains) @ relative
+        linear = np.swapaxes(about, 1, 2) @ products @ about
+        before = z[gains]
         for _ in range(_STEPS):
-            z, H = _solved(linear, sizes[self._kinds], variance)
-            sizes[:-1] = _sizes(self._kinds, z, H, sizes)
-        return z, sizes
+            z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
+            sizes[:-1] = _sizes(kinds, z, H, sizes)
+        blocks = _blocks(problem, prior, fit, columns)
+        left = sums_of(blocks, about @ np.append(z, -1.0))
+        deviation, lengths = _residual(problem, prior, fit, left)
+        change = np.abs(z[gains] - before).max()
+        if turn >= _ROUNDS - 1 and change < _AGREE:
+            break
+    z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
+    return z, H, float(sizes[KINDS.index('gain')])
 
 
 def _relative(size: int, of_gains: Indices) -> Floats:
@@ -185,30 +161,13 @@ def _blocks(
     """Yield the weighted rows [A | columns left out | b] (., n, k + e n + n + 1) of all motion."""
     rows = fit.rows
     moving = problem.windows.moving
-    T = to_z(problem.G, prior)
+    T = prior.T
     weighted = Weighted(rows, moving, fit.problem.delay)
     for block, own in zip(rows.blocks(moving), weighted.blocks(), strict=True):
         windows = moving[block]
         A, b = np.split(own @ T, (prior.mean.size,), axis=2)
         others = rows.weight[windows][:, :, None] * columns.matrix(windows)
         yield np.concatenate((A, others, b), axis=2)
-
-
-def _left(
-    problem: Problem, prior: Prior, fit: Fit, columns: LeftOut, weights: Floats
-) -> Floats:
-    """Return the sums (., n) of the columns of `_blocks`, times the weights (n, c)."""
-    blocks = _blocks(problem, prior, fit, columns)
-    return np.concatenate([np.einsum('kic,ic->ki', each, weights) for each in blocks])
-
-
-def _products(blocks: Iterator[Floats]) -> Floats:
-    """Return the products (n, c, c) of the columns of blocks (., n, c), for each joint."""
-    products: Any = 0.0
-    for block in blocks:
-        of_joints = np.moveaxis(block, 1, 0)
-        products = products + np.swapaxes(of_joints, 1, 2) @ of_joints
-    return np.asarray(products)
 
 
 def _solved(products: Floats, scale: Floats, variance: Floats) -> tuple[Floats, Floats]:
@@ -240,8 +199,7 @@ def _residual(
     counted = np.sum(weight**2, axis=0) - prior.D.any(axis=0).sum() / left.shape[1]
     deviation = np.sqrt(np.sum(left**2, axis=0) / np.maximum(counted, 1.0))
     floor = _FLOOR * fit.problem.deviation + 1e-12
-    lengths = [correlation_length(column) for column in left.T]
-    return np.maximum(deviation, floor), np.array(lengths)
+    return np.maximum(deviation, floor), correlation_lengths(left)
 
 
 def _torques(problem: Problem, columns: LeftOut, z: Floats) -> Floats:

@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.friction import STRIBECK_SPEED, fadings, slidings
 from blf_dsc_controller.arms.model import regressors_at
@@ -33,14 +32,15 @@ from blf_dsc_controller.bags.on_disk import BLOCK, Samples, blocks_of, mapped
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.recording import (
+    Flags,
+    Indices,
     Recording,
-    evenly_interpolated,
+    interpolated,
 )
 from blf_dsc_controller.identification.sliding import COULOMB_SPEED, sliding_direction
 from blf_dsc_controller.identification.values import COUPLING, LOAD
 from blf_dsc_controller.run import Floats
 
-Indices = NDArray[np.intp]
 OfSamples = Callable[[slice], Floats]
 """Returns values (k, n) of some samples."""
 
@@ -72,9 +72,9 @@ class Carried(NamedTuple):
     begin: float = -np.inf
     end: float = np.inf
 
-    def at(self, time: Floats) -> NDArray[np.bool_]:
+    def at(self, time: Floats) -> Flags:
         """Return at which of the times [s] it is carried."""
-        return np.asarray((time >= self.begin) & (time < self.end))
+        return (time >= self.begin) & (time < self.end)
 
     @property
     def when(self) -> str:
@@ -86,6 +86,9 @@ class Carried(NamedTuple):
         return f'from {self.begin:.1f} to {self.end:.1f} s'
 
 
+_UNKNOWN = np.empty(0)
+
+
 class Rows(NamedTuple):
     """R windows of n joints and m unknowns [P; COLUMNS of all joints; COUPLING; LOAD].
 
@@ -94,27 +97,27 @@ class Rows(NamedTuple):
     all columns but those of friction that they compute.
     """
 
-    time: Floats  # (R,) of their centres, s
-    inertial: Samples  # (R, n, p) columns of P
-    # (R, n) by name, one for each of COLUMNS: of each joint, zero for the others
-    columns: Mapping[str, Floats]
-    coupling: Floats  # (R, 2, 3) columns of COUPLING for the last two joints
-    load: Floats  # (p, 10) columns of P that are those of a load
-    carried: Carried
-    weight: Floats  # (R, n) of each row, at most 1
-    clipped: NDArray[np.bool_]  # (R, n) whether a torque in the window is clipped
-    speeds: Floats  # (R, n) mean speed in each window, rad/s or m/s
-    speed: Floats  # (n,) 95th percentile of each joint's speed, rad/s or m/s
     q: Samples  # (N, n) smoothed positions at all samples
     dq: Samples  # (N, n) their velocities
     torque: Samples | Floats  # (N, n) likewise
-    g: Floats  # (L,) with sum 1
-    slope: Floats  # (L,) g' in 1/s, scaled likewise
-    starts: np.ndarray  # (R,) first sample of each window
     period: float  # s
-    sliding: Samples  # (N, n) s
     gravity: Samples  # (N / every, n, p) regressor of the torque of gravity
     every: int  # samples between its positions
+    speed: Floats  # (n,) 95th percentile of each joint's speed, rad/s or m/s
+    load: Floats  # (p, 10) columns of P that are those of a load
+    carried: Carried
+    starts: Indices  # (R,) first sample of each window
+    clipped: Flags  # (R, n) whether a torque in the window is clipped
+    time: Floats = _UNKNOWN  # (R,) of their centres, s
+    g: Floats = _UNKNOWN  # (L,) with sum 1
+    slope: Floats = _UNKNOWN  # (L,) g' in 1/s, scaled likewise
+    inertial: Samples | Floats = _UNKNOWN  # (R, n, p) columns of P
+    # (R, n) by name, one for each of COLUMNS: of each joint, zero for the others
+    columns: Mapping[str, Floats] = {}
+    coupling: Floats = _UNKNOWN  # (R, 2, 3) columns of COUPLING for the last two joints
+    sliding: Samples | Floats = _UNKNOWN  # (N, n) s
+    weight: Floats = _UNKNOWN  # (R, n) of each row, at most 1
+    speeds: Floats = _UNKNOWN  # (R, n) mean speed in each window, rad/s or m/s
 
     @property
     def p(self) -> int:
@@ -163,10 +166,10 @@ class Rows(NamedTuple):
         return np.asarray(np.sqrt(squares / counted))
 
     def torques(self, windows: Indices, theta: Floats) -> Floats:
-        """Return X theta (k, n) of some windows, which increase."""
+        """Return X theta (k, n) of some windows, which increase, by the first m of `theta`."""
         found = np.zeros((windows.size, self.speed.size))
         for block in self.blocks(windows):
-            found[block] = self.matrix(windows[block]) @ theta
+            found[block] = self.matrix(windows[block]) @ theta[: self.unknowns]
         return found
 
     @property
@@ -184,26 +187,28 @@ class Rows(NamedTuple):
         knots = self.gravity[first : (samples.stop - 1) // self.every + 2]
         torque = knots @ P
         at = np.arange(samples.start, samples.stop) / self.every - first
-        return evenly_interpolated(at, torque)
+        return interpolated(at, np.arange(len(torque)), torque)
 
-    def with_load(self, P: Floats) -> Rows:
-        """Return the rows with load friction for the gravity of P (p,)."""
+    def with_load(self, theta: Floats) -> Rows:
+        """Return the rows with load friction for the gravity of unknowns (m,), or of P (p,)."""
 
         def load(rows: slice) -> Floats:
-            return np.abs(self.gravity_torque(P, rows)) * self.sliding[rows]
+            torque = self.gravity_torque(theta[: self.p], rows)
+            return np.abs(torque) * self.sliding[rows]
 
-        return self.with_column('load', load)
+        columns = {**self.columns, 'load': self.over_windows(load)}
+        return self._replace(columns=columns)
 
     def with_sliding(self, distances: Floats) -> Rows:
         """Return the rows with friction for the distances x_s (n,) of `sliding`.
 
         They have no load friction: `with_load` adds it.
         """
-        sliding = Samples(self._sliding(distances), self.speed.size)
+        sliding = Samples(self._sliding(distances))
         slid = self._replace(sliding=sliding)
         columns = {
             **self.columns,
-            'Coulomb': slid.over_windows(lambda rows: sliding[rows], self.g),
+            'Coulomb': slid.over_windows(lambda rows: sliding[rows]),
             'Stribeck': slid.stribeck(STRIBECK_SPEED, 2.0),
             'load': np.zeros((self.starts.size, self.speed.size)),
         }
@@ -228,22 +233,15 @@ class Rows(NamedTuple):
             over = np.abs(self.dq[rows] / speed) ** (0.5 * exponent)
             return self.sliding[rows] * fadings(over, 1.0)
 
-        return self.over_windows(fading, self.g)
+        return self.over_windows(fading)
 
     def sliding_at_once(self) -> Floats:
         """Return the Coulomb column (R, n) of contacts that do not yield: that of a URDF."""
-        return self.over_windows(
-            lambda at: slidings(self.dq[at], COULOMB_SPEED), self.g
-        )
-
-    def with_column(self, name: str, values: OfSamples) -> Rows:
-        """Return the rows with a column of each joint: the values of the samples, filtered."""
-        column = self.over_windows(values, self.g)
-        return self._replace(columns={**self.columns, name: column})
+        return self.over_windows(lambda at: slidings(self.dq[at], COULOMB_SPEED))
 
     def u(self, delay: float) -> Floats:
         """Return the right-hand side (R, n) of torques recorded `delay` [s] late."""
-        return self.over_windows(self._shifted(delay), self.g)
+        return self.over_windows(self._shifted(delay))
 
     def u_and_rate(self, delay: float) -> tuple[Floats, Floats]:
         """Return `u` and its time derivative (R, n)."""
@@ -258,13 +256,19 @@ class Rows(NamedTuple):
             at = np.arange(rows.start, rows.stop) + shift
             first = int(np.clip(np.floor(at[0]), 0, last))
             until = int(np.clip(np.floor(at[-1]), 0, last)) + 2
-            return evenly_interpolated(at - first, self.torque[first:until])
+            torque = self.torque[first:until]
+            return interpolated(at - first, np.arange(len(torque)), torque)
 
         return shifted
 
-    def over_windows(self, values: OfSamples, factors: Floats) -> Floats:
-        """Return the sums (R, n) of the values in each window times factors (L,)."""
-        (found,) = self._sums(values, factors)
+    @property
+    def postures(self) -> Floats:
+        """Positions (R, n) of the windows."""
+        return self.over_windows(lambda at: self.q[at])
+
+    def over_windows(self, values: OfSamples, factors: Floats | None = None) -> Floats:
+        """Return the sums (R, n) of the values in each window times factors (L,), by default g."""
+        (found,) = self._sums(values, self.g if factors is None else factors)
         return found
 
     def _sums(self, values: OfSamples, *factors: Floats) -> list[Floats]:
@@ -291,29 +295,56 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
     Raises:
         BlfDscError: there are too few.
     """
-    rows = _empty_rows(recording, model)
-    return _filled(rows, model, np.zeros(len(recording.joints)))
+    h = recording.period
+    n = len(recording.joints)
+    near_gap = _near_gap(recording)
+    starts = _starts(near_gap, h)
+    needed = _WINDOWS_OF_JOINT * n
+    if starts.size < needed:
+        raise BlfDscError(
+            f'only {starts.size} windows of {WINDOW:g} s have no gaps: record at least '
+            f'{needed * HOP:.3g} s without losses'
+        )
+    q, dq = _smoothed(recording)
+    every = max(1, round(_GRAVITY / h))
+    rows = Rows(
+        q=q,
+        dq=dq,
+        torque=recording.torque,
+        period=h,
+        gravity=Samples(_at_rest(q[::every], model)),
+        every=every,
+        speed=_fast(dq, ~near_gap),
+        load=np.zeros((model.p, LOAD)),
+        carried=Carried(),
+        starts=starts,
+        clipped=np.zeros((starts.size, n), dtype=bool),
+    )
+    return _filled(rows, model, WINDOW, np.zeros(n))
 
 
-def _filled(rows: Rows, model: SerialChain, distances: Floats) -> Rows:
-    """Return rows that have no columns yet with all but load friction."""
+def _filled(rows: Rows, model: SerialChain, length: float, distances: Floats) -> Rows:
+    """Return rows of windows of so many seconds with all columns but load friction."""
     dq = rows.dq
-    inertial = Samples(_inertial(rows, model), rows.speed.size, model.p)
-    rows = rows._replace(inertial=inertial)
-    rows = rows.with_sliding(distances)
-    rows = rows.with_column('viscous', lambda at: dq[at])
-    rows = rows.with_column('offset', lambda at: np.ones_like(dq[at]))
-    rows = rows.with_column('quadratic', lambda at: dq[at] * np.abs(dq[at]))
-    if rows.speed.size > 1:
-        _set_coupling(rows)
+    n = rows.speed.size
+    g, slope = weighting(rows.period, length)
+    time = np.asarray((rows.starts + 0.5 * (g.size - 1)) * rows.period, np.float64)
+    rows = rows._replace(time=time, g=g, slope=slope)
 
     def in_motion(at: slice) -> Floats:
-        return np.asarray(dq[at] ** 2 / (dq[at] ** 2 + _REST**2))
+        return dq[at] ** 2 / (dq[at] ** 2 + _REST**2)
 
     return rows._replace(
-        weight=rows.over_windows(in_motion, rows.g) ** 2,
-        speeds=rows.over_windows(lambda at: np.abs(dq[at]), rows.g),
-    )
+        inertial=Samples(_inertial(rows, model)),
+        weight=rows.over_windows(in_motion) ** 2,
+        speeds=rows.over_windows(lambda at: np.abs(dq[at])),
+        columns={
+            'viscous': rows.over_windows(lambda at: dq[at]),
+            'offset': np.ones((rows.starts.size, n)),
+            'quadratic': rows.over_windows(lambda at: dq[at] * np.abs(dq[at])),
+        },
+        coupling=_coupling(rows),
+    ).with_sliding(distances)
 
 
 def shortened(
@@ -330,65 +361,17 @@ def shortened(
     friction.
     """
     h = rows.period
-    g, slope = weighting(h, length)
     hop = max(1.0, HOP / h) / parts
-    middle = 0.5 * (rows.g.size - g.size)
+    middle = 0.5 * (rows.g.size - _samples(h, length))
     after = np.round(middle + hop * (np.arange(parts) - 0.5 * (parts - 1)))
     at = (rows.starts[windows, None] + after.astype(np.intp)).ravel()
     starts, first = np.unique(at, return_index=True)
-    short = rows._replace(
-        time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
-        columns={},
-        coupling=np.zeros((starts.size, *rows.coupling.shape[1:])),
-        clipped=np.repeat(rows.clipped[windows], parts, axis=0)[first],
-        g=g,
-        slope=slope,
-        starts=starts,
-    )
-    return _filled(short, model, distances)
+    clipped = np.repeat(rows.clipped[windows], parts, axis=0)[first]
+    short = rows._replace(starts=starts, clipped=clipped)
+    return _filled(short, model, length, distances)
 
 
-def _empty_rows(recording: Recording, model: SerialChain) -> Rows:
-    """Return the windows and what they are taken from, with columns that are zero or missing."""
-    h = recording.period
-    n = len(recording.joints)
-    g, slope = weighting(h)
-    near_gap = _near_gap(recording)
-    starts = _starts(near_gap, g.size, h)
-    needed = _WINDOWS_OF_JOINT * n
-    if starts.size < needed:
-        raise BlfDscError(
-            f'only {starts.size} windows of {WINDOW:g} s have no gaps: record at least '
-            f'{needed * HOP:.3g} s without losses'
-        )
-    q, dq = _smoothed(recording)
-    every = max(1, round(_GRAVITY / h))
-    nothing = Samples(iter(()))
-    return Rows(
-        time=np.asarray((starts + 0.5 * (g.size - 1)) * h, dtype=np.float64),
-        inertial=nothing,
-        columns={},  # those of `with_sliding` and `with_column`
-        coupling=np.zeros((starts.size, min(n, 2), COUPLING)),
-        load=np.zeros((model.p, LOAD)),
-        carried=Carried(),
-        weight=np.empty(0),
-        clipped=np.zeros((starts.size, n), dtype=bool),
-        speeds=np.empty(0),
-        speed=_fast(dq, ~near_gap),
-        q=q,
-        dq=dq,
-        torque=recording.torque,
-        g=g,
-        slope=slope,
-        starts=starts,
-        period=h,
-        sliding=nothing,
-        gravity=Samples(_at_rest(q[::every], model), n, model.p),
-        every=every,
-    )
-
-
-def _near_gap(recording: Recording) -> NDArray[np.bool_]:
+def _near_gap(recording: Recording) -> Flags:
     """Return at which samples (N,) smoothed positions have a gap within."""
     from scipy.ndimage import maximum_filter1d
 
@@ -405,14 +388,11 @@ def _smoothed(recording: Recording) -> tuple[Samples, Samples]:
     size = recording.gap.size
     width = smoothing_width(h)
 
-    def smoothed(rows: slice, derivative: int) -> Floats:
-        first = max(rows.start - width, 0)
-        found = savgol_filter(
-            recording.q[first : rows.stop + width], width, 3, derivative, h, axis=0
-        )
-        return np.asarray(found[rows.start - first : rows.stop - first])
+    def smoothed(at: slice, derivative: int) -> Floats:
+        found = savgol_filter(recording.q[at], width, 3, derivative, h, axis=0)
+        return np.asarray(found)
 
-    q, dq = (mapped(size, partial(smoothed, derivative=k)) for k in range(2))
+    q, dq = (mapped(size, partial(smoothed, derivative=k), width) for k in range(2))
     return q, dq
 
 
@@ -421,7 +401,7 @@ def smoothing_width(h: float) -> int:
     return 2 * max(2, round(0.5 * SMOOTHING / h)) + 1
 
 
-def _fast(dq: Samples, chosen: NDArray[np.bool_]) -> Floats:
+def _fast(dq: Samples, chosen: Flags) -> Floats:
     """Return the 95th percentile of each joint's speed (n,) in the chosen samples."""
     return np.percentile(np.abs(dq[chosen]), 95.0, axis=0, overwrite_input=True)
 
@@ -448,7 +428,7 @@ def _at_rest(postures: Floats, model: SerialChain) -> Iterator[Floats]:
 
 def weighting(h: float, window: float = WINDOW) -> tuple[Floats, Floats]:
     """Return g with sum 1, and g' [1/s], at the samples of a window [s]."""
-    length = round(window / h) + 1
+    length = _samples(h, window)
     turn = np.pi / (length - 1)
     phase = turn * np.arange(length) - 0.5 * np.pi
     g = np.cos(phase) ** 4
@@ -457,18 +437,24 @@ def weighting(h: float, window: float = WINDOW) -> tuple[Floats, Floats]:
     return g / total, slope / total
 
 
-def _starts(near_gap: np.ndarray, length: int, h: float) -> Indices:
+def _samples(h: float, window: float) -> int:
+    """Return the number of samples of a window [s], one each h seconds."""
+    return round(window / h) + 1
+
+
+def _starts(near_gap: np.ndarray, h: float) -> Indices:
     """Return the first sample of each window without gaps."""
+    length = _samples(h, WINDOW)
     hop = max(1, round(HOP / h))
     starts = np.arange(0, near_gap.size - length + 1, hop)
     if not starts.size:
         return starts
     with_gaps = sliding_window_view(near_gap, length)[starts].any(axis=1)
-    return np.asarray(starts[~with_gaps])
+    return starts[~with_gaps]
 
 
-def _set_coupling(rows: Rows) -> None:
-    """Set the columns of one motor that drives the last two joints."""
+def _coupling(rows: Rows) -> Floats:
+    """Return the columns (R, 2, 3) of one motor that drives the last two joints."""
 
     def others(at: slice) -> Floats:
         return rows.dq[at][:, :-3:-1]
@@ -477,9 +463,11 @@ def _set_coupling(rows: Rows) -> None:
         speed = rows.dq[at][:, -2:].sum(axis=1, keepdims=True)
         return np.repeat(slidings(speed, COULOMB_SPEED), 2, axis=1)
 
-    rows.coupling[:, :, 0] = -rows.over_windows(others, rows.slope)
-    rows.coupling[:, :, 1] = rows.over_windows(others, rows.g)
-    rows.coupling[:, :, 2] = rows.over_windows(both, rows.g)
+    if rows.speed.size == 1:
+        return np.zeros((rows.starts.size, 1, COUPLING))
+    inertia = -rows.over_windows(others, rows.slope)
+    friction = (rows.over_windows(each) for each in (others, both))
+    return np.stack((inertia, *friction), axis=2)
 
 
 class Split(NamedTuple):
