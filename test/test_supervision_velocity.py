@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fault_table import MILLISECOND, Rig
@@ -33,8 +36,30 @@ def test_fr3_with_a_wrong_velocity_of_joint_2_comes_to_rest(spoil, at, travel):
     after = arm.run(3.0, spoil=spoil)
     assert "the velocity of joint 'fr3_joint2' is" in arm.text
     assert 'its positions change by' in arm.text
+    assert 'a sensor is stuck' in arm.text
     assert np.abs(after.q - before.q[-1]).max() < travel
     assert after.speed[-1].max() < 0.02
+
+
+def late_velocities(samples):
+    """Deliver velocities so many samples later, with the positions of their time."""
+    held = []
+
+    def spoil(state):
+        held.append(state.dq)
+        return [replace(state, dq=held.pop(0) if len(held) > samples else held[0])]
+
+    return spoil
+
+
+@pytest.mark.parametrize('late', [4, 8])
+def test_late_velocities_are_named_with_their_milliseconds(late):
+    """Beside those of the filter of the preset, 2.5 ms; it was a stuck sensor, or high gains."""
+    arm = Scenario('panda')
+    arm.run(4.0, spoil=late_velocities(late), until=lambda: not arm.is_running)
+    assert 'robot.lag' in arm.text
+    (told,) = re.findall(r'velocities come about (\S+) ms after', arm.text)
+    assert float(told) == pytest.approx(late + 2.5, abs=0.5)
 
 
 def test_velocities_that_are_always_0_name_the_remedy_also_of_an_arm_in_motion():

@@ -22,10 +22,9 @@ from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.loop_outputs import LoopOutputs
 from blf_dsc_controller.control.outputs import Output
 from blf_dsc_controller.errors import BlfDscError, LoopEndedError, check_type
-from blf_dsc_controller.law.weighing import DEVIATION
+from blf_dsc_controller.law.weighing import DEVIATION, MASS, mass_interval
 from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.messages.tip_load import TAKEN_UP, TipLoad
-from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.run import FIRST_STAMP
@@ -462,7 +461,7 @@ class ArmController:
         values = self._loop.guard.controller.state.weighing.load
         if values[DEVIATION] <= 0.0:
             return Load(math.nan, math.nan)
-        return Load(float(values[0]), TWO_SIDED * float(values[DEVIATION]))
+        return Load(float(values[MASS]), mass_interval(values))
 
     def close(self) -> Vector | None:
         """Return the torque (n,) [N m] that a drive may hold from now on.

@@ -46,7 +46,7 @@ from blf_dsc_controller.law.state import (
     signals_of,
     state_of,
 )
-from blf_dsc_controller.law.weighing import DEVIATION
+from blf_dsc_controller.law.weighing import DEVIATION, mass_interval
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference import terms as reference
 
@@ -81,6 +81,8 @@ def fill_sample(
         is_known = load[DEVIATION + k % DEVIATION] > 0.0
         factor = 1.0 if k < DEVIATION else TWO_SIDED
         sample.load[k] = factor * load[k] if is_known else nan
+    if load[DEVIATION] > 0.0:
+        sample.load[DEVIATION] = mass_interval(load)
 
 
 @inner

@@ -46,6 +46,7 @@ from blf_dsc_controller.law import innovation, sums
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.prediction import SETTLED, moving_share, moving_square
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
+from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 _FEWEST_MOTION = 0.5  # s of motion that a part has
 _CHANGING_TIME = 20.0  # s, until the variance of e has grown
@@ -57,6 +58,8 @@ _NOTHING_SIGMAS, _LESS_SIGMAS = 2.0, 4.0  # standard deviations: within, and bel
 BEFORE, OLDER, NEWER, RECENT, LATEST = range(5)
 MASS, DEVIATION = 0, 4  # in `State.load`, each followed by three of the centre
 LOAD = 10  # entries of z
+# of all torques: a mass is as many times too large as what drives are believed to give
+_SCALE_DEVIATION = 0.03
 
 
 class Settings(NamedTuple):
@@ -245,6 +248,16 @@ def held_mass(state: State) -> tuple[float, float]:
     if deviation == 0.0 and not is_first(state):
         return mass, inf
     return mass, deviation
+
+
+@inner
+def mass_interval(load: Array) -> float:
+    """Return half of the 95 % interval [kg] of the mass in a `State.load`.
+
+    Beside what the rows leave open, the scale of the torques is in doubt, which no row shows.
+    """
+    by_scale = _SCALE_DEVIATION * load[MASS]
+    return TWO_SIDED * sqrt(load[DEVIATION] ** 2 + by_scale**2)
 
 
 @inner

@@ -14,6 +14,7 @@ from blf_dsc_controller.supervision import not_sensors
 from blf_dsc_controller.supervision.contact import Contacts, contact_of, untarable
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.reading import Reading
+from blf_dsc_controller.supervision.state_check import late_velocities
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
@@ -131,11 +132,13 @@ class Findings:
         command = self._command
         checks = command.controller.checks
         sensor = checks.sensor
-        fault = command.states.contradicted(sensor.derived, sensor.measured)
+        lags = command.held.recent.velocity_lags
+        fault = command.states.contradicted(sensor.derived, sensor.measured, lags)
         worst = int(np.argmax(sensor.mismatch / (sensor.speed + SLOW**2)))
         cause = command.oscillation.cause if command.supervisor.running else ''
         if cause and is_late(sensor, worst):
-            fault = Fault(Reason.OSCILLATION, cause)
+            late = '' if lags[worst] is None else late_velocities(lags[worst])
+            fault = Fault(Reason.OSCILLATION, '; '.join(filter(None, (late, cause))))
         if command.supervisor.uses_states:
             command.stop(*fault)
         else:

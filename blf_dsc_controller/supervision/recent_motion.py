@@ -6,6 +6,8 @@ error of the inertia, and what it has wound up so far: held as a load, it would 
 joints.  The load that follows from the torques of the last samples contains none of these:
 
     load = mean of tau - H(q, dq, dq, ddq) P^ - friction
+
+They show, too, by how much velocities come after their positions.
 """
 
 from __future__ import annotations
@@ -22,6 +24,10 @@ Array = NDArray[np.float64]
 _GAP_TIME = 0.03  # s, in which an arm that another commands leaves its reference
 _ACCELERATION_TIME = 0.1  # s: the noise of a difference of velocities over it is small
 _BLOCKS = 10  # of it or some more, each with the mean acceleration in it
+_LONGEST_LAG = 0.02  # s, of velocities
+_UNEXPLAINED = (
+    0.25  # of their square, what a lag may leave: a filter makes them smaller, too
+)
 
 
 def shortest_gap(sample_time: float) -> float:
@@ -64,11 +70,45 @@ class RecentMotion:
         self._torques[at] = torque
         self._count += 1
 
+    @property
+    def _order(self) -> NDArray[np.int64]:
+        """Rows of all samples, the last one at the end."""
+        return np.arange(self._count - self.size, self._count) % self.size
+
+    @property
+    def velocity_lags(self) -> list[float | None]:
+        """How long velocities of each joint come after positions [s]; None: no lag shows."""
+        n = self._torques.shape[1]
+        if self._count < self.size:
+            return [None] * n
+        states = self._states[self._order]
+        steps = 1e-9 * np.diff(self._stamps[self._order])  # s
+        changes = np.diff(states[:, :n], axis=0) / steps[:, np.newaxis]
+        speeds = 0.5 * (states[1:, n:] + states[:-1, n:])
+        return [
+            self._lag(change, speed)
+            for change, speed in zip(changes.T, speeds.T, strict=True)
+        ]
+
+    def _lag(self, change: Array, speed: Array) -> float | None:
+        """Return how long a speed (k,) comes after the change (k,) [rad/s] of a position [s]."""
+        if not change @ speed > 0.0:  # beyond a quarter wave it may be a wrong sign
+            return None
+        most = round(_LONGEST_LAG / self._sample_time)
+        left = [
+            float(np.square(speed[most:] - change[most - k : change.size - k]).mean())
+            for k in range(most + 1)
+        ]
+        best = int(np.argmin(left))
+        if left[best] > _UNEXPLAINED * float(np.square(speed[most:]).mean()):
+            return None
+        return best * self._sample_time
+
     def load(self, settings: Settings, estimate: Array) -> Array | None:
         """Return the torque (n,) [N m] that the model lacks; None in the first 0.1 s."""
         if self._count < self.size:
             return None
-        order = np.arange(self._count - self.size, self._count) % self.size
+        order = self._order
         stamps = self._stamps[order[:: self._step]]
         states = self._states[order[:: self._step]]
         torques = self._torques[order[:-1]].reshape(self._blocks, self._step, -1)

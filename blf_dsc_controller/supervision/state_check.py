@@ -29,6 +29,7 @@ _MISSED_TIME = 1.0  # s, over which missed states are
 
 SKIP = Fault(Reason.NONE, '')
 """Returned for a state to ignore."""
+_WRONG = 'a sensor is stuck or has the wrong sign, or the velocities are those of other joints'
 _NO_VELOCITY = 'if the hardware measures none, set safety.velocity to estimated'
 
 
@@ -46,6 +47,15 @@ def rate_mismatch(period: float, sample_time: float) -> str:
         f'{found}set update_rate of controller_manager (100 Hz by default) to '
         f'{1.0 / sample_time:.6g}, or '
         'sample_time to the period of the topic'
+    )
+
+
+def late_velocities(lag: float) -> str:
+    """Return what to do about velocities that come some time [s] after the positions."""
+    return (
+        f'velocities come about {1e3 * lag:.2g} ms after the positions: let the driver filter them '
+        'less, set safety.velocity to estimated, or count that time in robot.lag and lower the '
+        'gains'
     )
 
 
@@ -183,15 +193,21 @@ class StateCheck:
         )
         return Fault(Reason.STAMP_REPEATED, text)
 
-    def contradicted(self, derived: Vector, measured: Vector) -> Fault:
-        """Return the fault of velocities (n,) [rad/s] that contradict the positions."""
+    def contradicted(
+        self, derived: Vector, measured: Vector, lags: Sequence[float | None]
+    ) -> Fault:
+        """Return the fault of velocities (n,) [rad/s] that contradict the positions.
+
+        Of each joint, `lags` has by how much they are late [s]; None: no lag explains it.
+        """
         worst = int(np.argmax(np.abs(derived - measured)))
+        lag = lags[worst]
+        why = _WRONG if lag is None else late_velocities(lag)
         unit = self._units[worst].of('rad/s')
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {measured[worst]:+.3g} {unit}, but '
-            f'its positions change by {derived[worst]:+.3g} {unit}: a sensor is stuck or has the '
-            'wrong sign, or the velocities are those of other joints; they are differenced from '
-            'the positions from now on'
+            f'its positions change by {derived[worst]:+.3g} {unit}: {why}; they are differenced '
+            'from the positions from now on'
         )
         if measured[worst] == 0.0:  # a mean: it has always been 0
             text += f'; {_NO_VELOCITY}'
