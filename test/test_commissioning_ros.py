@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -16,11 +17,10 @@ from ros_rig import PATIENCE
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import BlfDscError
+from blf_dsc_controller.cli import commission_ros
 from blf_dsc_controller.cli.commission_ros import made
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.commissioning import (
-    over_ros,
-)
+from blf_dsc_controller.commissioning import over_ros, postures, proof
 from blf_dsc_controller.commissioning.over_ros import OverRos
 from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.configuration.schema import flatten
@@ -119,6 +119,41 @@ def test_arm_is_measured_and_its_bags_give_gains_with_the_margin(rig, monkeypatc
     words = ['commission', str(bag), '--config', str(rig.file), '--out', str(out)]
     assert main(words) == 0
     assert 'with a modulus margin' in out.read_text()
+
+
+# N m/rad and N m s/rad: about what commissioning chooses for this arm
+CHOSEN = """
+    feedback: {joint_stiffness: [25.0, 8.5], joint_damping: [6.0, 1.5]}
+    reference.type: hold
+"""
+
+
+def test_arm_is_held_after_the_proof_until_ctrl_c(ros, tmp_path, monkeypatch, capfd):
+    """For 0.1 s of its time: without torques an arm whose drives do not hold would fall."""
+    shorten_moves(monkeypatch)
+    monkeypatch.setattr(proof, 'SHARES', (1.0,))
+    monkeypatch.setattr(proof, '_LAST', 0.5)
+    monkeypatch.setattr(postures, 'HOLD', 0.1)
+    rig = Rig(ros, tmp_path, ARM + CHOSEN)
+    monkeypatch.setattr(
+        commission_ros, 'robot_over_ros', lambda *_: nullcontext(rig.robot)
+    )
+    told, held = '', []
+
+    def hold():
+        nonlocal told
+        told += capfd.readouterr().err
+        if 'the arm is held until Ctrl-C' in told:
+            held.append(rig.arm.plant.elapsed_ns)
+            if held[-1] - held[0] > 0.1e9:
+                rig.robot.request_end()
+
+    rig.robot.wait()
+    rig.always = hold
+    words = ['commission', '--ros', '--prove', '--yes', '--config', str(rig.file)]
+    assert main([*words, '--record', str(rig.bags)]) == 0
+    assert held
+    assert rig.speed() < 0.01
 
 
 def test_a_run_goes_on_from_the_torque_that_holds_the_arm(ros, tmp_path):

@@ -103,6 +103,33 @@ def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig
     assert plan.at == pytest.approx(rig.guard.reference.time + 0.01)
 
 
+def test_a_stop_ends_the_motion_that_waits_for_another_to_be_planned(rig):
+    """Else the arm would go there after the next motion, of which nobody thinks any more."""
+    inputs = MotionInput(2, lambda: rig.guard, lambda _: True, Quiet())
+    reasons = []
+
+    def follow(positions):
+        point = TrajectoryPoint(2.0, tuple(positions))
+        made = Trajectory(('joint1', 'joint2'), (point,))
+        inputs.follow(
+            rig.guard,
+            lambda: made,
+            'a test',
+            lambda _: None,
+            lambda _, reason: reasons.append(reason),
+        )
+
+    follow(AT_REST)
+    follow(FIRST)
+    inputs.stop(rig.guard, 'a test')
+    assert reasons == ['the reference was stopped'] * 2
+    follow(AT_REST)
+    while inputs.job is not None:
+        inputs.job.plan.result()
+        inputs.poll(rig.guard)
+    assert reasons[2:] == ['']
+
+
 def moved(rig, seconds):
     """Step the arm; return the state of its reference (k, 3, 2) at each sample."""
     seen = []

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,16 @@ def test_torques_at_the_limit_add_up_if_they_take_more_than_a_fifth_of_the_time(
     assert at_limit.mean() == pytest.approx(1.0 / every, abs=0.05)
     assert (arm.reason == 'torque saturated') == stops
     assert ('needs ' in arm.text) == stops
+
+
+def test_joint_that_lacks_torque_is_named_where_another_needs_and_has_more():
+    limits = {'torque.limit': [LIMIT, 2.0], 'safety.saturation_time': 0.01}
+    arm = Scenario('recommended', limits)
+    arm.run(2.0, until=lambda: not arm.is_running)
+    assert arm.reason == 'torque saturated', arm.text
+    assert re.search(
+        r"'joint2' needs .* N m and has been at its limit of 2 N m", arm.text
+    )
 
 
 @pytest.mark.parametrize(('preset', 'usual'), [('recommended', 1.8), ('fr3', 0.0)])
