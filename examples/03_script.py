@@ -26,7 +26,7 @@ with blf.Drive(config, robot=robot) as arm:
     # through points, at times from now [s]; velocities may follow the positions
     arm.follow([(1.0, start + step), (2.0, start + 0.5 * step), (3.0, start)])
 
-    # a stream: the latest target wins, and the arm brakes when none follows
+    # a stream: the latest target wins, and the arm rests there when none follows
     for k in range(60):
         arm.stream(start + 0.2 * step * np.sin(k / 10.0))
         time.sleep(1.0 / 30.0)

@@ -3,8 +3,8 @@
 
 python examples/04_policy_chunks.py [ROBOT] [CONFIG]    (simulated, panda)
 
-The reference is one interval behind, and smooth also where a new chunk disagrees with
-the last one.  While the policy takes too long, the arm brakes, and then goes on.
+The reference follows as far behind as the arm needs to brake, and smoothly also where a
+new chunk disagrees with the last one.  While the policy takes too long, the arm rests.
 """
 
 import sys

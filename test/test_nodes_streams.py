@@ -77,8 +77,8 @@ def chunks_of(law, k, period):
 
 
 @pytest.mark.parametrize('send', [positions_of, points_of, chunks_of])
-def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send):
-    """At 50 Hz, 20 ms behind at most 0.2 rad/s.
+def test_stream_is_followed_as_far_behind_as_the_arm_brakes_without_a_jump(ros, send):
+    """At 50 Hz, 55 ms behind at most 0.2 rad/s, from which the arm brakes in 35 ms on average.
 
     Chunks at 10 Hz keep their own times.
     """
@@ -101,14 +101,13 @@ def test_stream_is_followed_at_most_an_interval_behind_without_a_jump(ros, send)
     assert rise.max() <= 6.0e-3 * 1.001  # the limit over a millisecond
     mean = 0.5e-3 * (v[1:] + v[:-1])
     np.testing.assert_allclose(np.diff(q, axis=0), mean, atol=2e-6)
-    # one interval and the sample's own, after a second to get under way
+    # after a second to get under way
     t = 1e-3 * np.arange(1000, 2900)
-    behind = 0.0 if send is chunks_of else period
+    behind, off = (0.0, 0.5e-3) if send is chunks_of else (0.055, 1e-3)
     wanted = np.array([sway(each - behind) for each in t])
     first = round(start * 1e3)
     found = q[first + 1000 : first + 2900]
-    # the acceleration, 0.4 rad/s^2, over an interval each way: 0.2 mrad
-    assert np.abs(found - wanted).max() < 0.5e-3
+    assert np.abs(found - wanted).max() < off
     assert law.guard.samples.ratio.max() < 1.0
     assert law.guard.supervisor.phase is blf.Phase.TRACKING
 

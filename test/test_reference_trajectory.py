@@ -309,9 +309,8 @@ def random_target(rng, stream, at, vector):
         at,
         start[0] + 0.05 * start[1] + size * rng.normal(size=2),
         timeout=0.25,
-        fastest=FASTEST,
         velocities=given,
-        ahead=float(rng.uniform(0.0, 0.2)) if given is not None else None,
+        ahead=float(rng.uniform(0.0, 0.2)) if given is not None else 0.0,
     )
 
 

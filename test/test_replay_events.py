@@ -127,7 +127,7 @@ def eventful():
         now = rig.guard.reference.time
         ahead = rig.guard.controller.reference_at(now + 0.03)
         beside = tuple((ahead[0] + 1e-4 * k).tolist())
-        rates = tuple(ahead[1].tolist())
+        rates = tuple(ahead[1].tolist()) if k < 4 else ()  # the last one is to rest at
         target = Target(beside, rates, now + 0.03, now + 0.06, k > 2)
         plan = rig.guard.motions.plan(target, now + 0.004)
         rig.step(4)

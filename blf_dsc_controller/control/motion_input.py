@@ -230,7 +230,6 @@ class MotionInput:
             now,
             self._short_way(guard, self._points, positions),
             timeout=_STREAM_TIMEOUT,
-            fastest=np.array(config.limits.velocity),
             velocities=velocities[order] if velocities.size else None,
             ahead=ahead,
         )
@@ -253,7 +252,6 @@ class MotionInput:
             guard.reference.time,
             self._short_way(guard, self._positions, positions),
             timeout=_STREAM_TIMEOUT,
-            fastest=np.array(guard.config.limits.velocity),
         )
         lead = self._target_lead
         request = _Request(lambda: target, self._report_target, lead, source)

@@ -219,9 +219,10 @@ class Drive:
     def stream(self, positions: ArrayLike) -> None:
         """Give the next positions (n,) [rad] of a stream, and return at once.
 
-        Call it at a steady rate, such as 30 Hz.  The reference is there an interval later,
-        and brakes if nothing follows.  A target that cannot be followed is logged, and so is
-        one far beyond the limits, such as degrees, which is not followed.
+        Call it at a steady rate, such as 30 Hz.  The reference follows as far behind as it
+        needs to brake, and comes to rest at the last target.  A target that cannot be
+        followed is logged, and so is one far beyond the limits, such as degrees, which is
+        not followed.
 
         Raises:
             LoopEndedError: the loop has ended.

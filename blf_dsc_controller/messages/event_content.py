@@ -133,7 +133,7 @@ SCHEMA: Mapping[str, Mapping[str, Field]] = {
     },
     'target': {
         'positions': Field(NUMBERS),  # rad, in the order of `joints`
-        'velocities': Field(NUMBERS),  # rad/s
+        'velocities': Field(NUMBERS),  # rad/s; none: it comes to rest there
         'due': Field(NUMBER),  # s since the start, when the reference should be there
         'until': Field(NUMBER),  # s, when it brakes if nothing follows
         'held': Field(FLAG),  # whether it then returns to the positions

@@ -6,9 +6,9 @@ times at which its jerk changes. The library ruckig computes such profiles (Bers
 and Kroeger, 2021, doi:10.15607/RSS.2021.XVII.015). It is optional: without it,
 `braking` is a polynomial, and a target can only be reached in a given time.
 
-A streamed target is a line that the reference joins, and follows for a while, since the
-next target is on its way; then the reference brakes. So every motion ends at rest by
-itself.
+A streamed target is a place to rest at. With velocities it is a line that the reference
+joins, and follows for a while, since the next target is on its way; then the reference
+returns or brakes. So every motion ends at rest by itself.
 """
 
 from __future__ import annotations
@@ -100,7 +100,10 @@ class PlannedMotion(NamedTuple):
 
 
 class Target(NamedTuple):
-    """A streamed target: a line through positions (n,), with velocities (n,)."""
+    """A streamed target: a line through positions (n,), with velocities (n,).
+
+    Without velocities, the reference comes to rest at the positions when it is due.
+    """
 
     positions: tuple[float, ...]
     velocities: tuple[float, ...]
@@ -313,7 +316,7 @@ def plan_target(
     """
     n = len(config.joints)
     counts = len(target.positions), len(target.velocities)
-    if counts != (n, n):
+    if counts not in ((n, n), (n, 0)):
         given = '{} positions and {} velocities'.format(*counts)
         raise TrajectoryError([f'it has {given} for {n} joints'])
     if not np.isfinite((*target.positions, *target.velocities)).all():
@@ -345,6 +348,8 @@ def _plan_line(
     target: Target, vector: np.ndarray, now: float, config: ControllerConfig
 ) -> PlannedMotion:
     """Return `plan_target` of a valid target; raises MotionError."""
+    if not target.velocities:
+        return _plan_rest(target, vector, now, config)
     q, dq = _within_limits(target, config)
     lead = max(target.due - now, _SOONEST)
     pursuit = _Pursuit(state_at(vector, now), q, dq, target.due, now, lead)
@@ -364,6 +369,23 @@ def _plan_line(
     end = now + sum(part.duration for part in parts)
     _check_positions(term, now, end, config)
     return PlannedMotion(following(vector, term), now + join.duration, end)
+
+
+def _plan_rest(
+    target: Target, vector: np.ndarray, now: float, config: ControllerConfig
+) -> PlannedMotion:
+    """Return `plan_target` to rest: smoothly in time if the limits allow, else the fastest."""
+    limits = config.limits
+    q = np.clip(target.positions, limits.position_lower, limits.position_upper)
+    present = state_at(vector, now)
+    end = np.stack((q, np.zeros_like(q), np.zeros_like(q)))
+    motion = quintic(present, end, max(target.due - now, _SOONEST))
+    if not keeps_limits(motion, config):
+        motion = profile(present, config, end[:2])
+    term = at_rest_after(now, motion)
+    rests = now + motion.duration
+    _check_positions(term, now, rests, config)
+    return PlannedMotion(following(vector, term), rests, rests)
 
 
 def _check_units(target: Target, config: ControllerConfig) -> None:

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams of targets: when each was sent, and with which velocity the sender moves.
+"""Streams of targets: when each was sent, and when the reference is to be there.
 
 The messages carry no time, and arrive late, early or not at all. Their sender is taken
 to be periodic: the arrivals are numbered, each by the whole intervals since the one
-before, and a line of least squares through them is its clock. A velocity that the
-sender does not give is the mean of the last `_SPAN`, at least of the last interval.
+before, and a line of least squares through them is its clock.
 
-The reference is at a target one interval after it was sent, when the next one is due:
-it then interpolates and never has to guess what the sender will do.
+Nobody knows whether another target follows, so every motion is one to rest at the last
+target, a while after it was sent, and the next one replaces it on the way.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ import numpy as np
 
 from blf_dsc_controller.reference.retargeting import Target
 
-_SPAN = 0.02  # s over which a velocity is averaged
+_INTERVALS_TO_REST = 2.0  # from sending, at least ...
+_TO_REST = 0.1  # s, ... and so long
 _COAST = 0.03  # s on the line after its time, at least ...
 _INTERVALS = 2.0  # ... and so many intervals
-_STEP = 1.5  # of the velocity limit; a faster change of positions is a step
 _KEPT = 64  # messages: a clock's error is a quarter of a single arrival's
 _SHORTEST = 1e-3  # s, of an interval
 _RECENT = 15  # gaps between arrivals, by which the interval must not be ...
@@ -39,9 +38,9 @@ class TargetStream:
     def __init__(self) -> None:
         self.interval = 0.0
         self._sent = 0.0  # s, estimated
+        self._due = 0.0  # s, of the last target
         self._arrivals: deque[float] = deque(maxlen=_KEPT)  # s
         self._positions: deque[np.ndarray] = deque(maxlen=_KEPT)
-        self._numbers = np.zeros(1)  # of the messages, in intervals
 
     def restart(self) -> None:
         """Forget all messages: the next one is the first of a stream."""
@@ -63,39 +62,36 @@ class TargetStream:
         positions: np.ndarray,
         *,
         timeout: float,
-        fastest: np.ndarray,
         velocities: np.ndarray | None = None,
-        ahead: float | None = None,
+        ahead: float = 0.0,
     ) -> Target:
         """Return the target of a message.
 
         Args:
             arrived: time since the start [s].
             positions: (n,) [rad].
-            timeout: pause [s] after which a stream begins anew, at rest.
-            fastest: largest velocities (n,) [rad/s]; a step is no motion.
-            velocities: (n,) [rad/s], if the sender gives them.
-            ahead: time [s] from sending to the positions; without, one interval, and the reference
-                rests where it has braked if nothing follows.
+            timeout: pause [s] after which a stream begins anew.
+            velocities: (n,) [rad/s] at the positions, if the sender gives them; without, the
+                reference comes to rest there, two intervals after sending at the earliest.
+            ahead: time [s] from sending to the positions.
         """
         if self._arrivals and arrived - self._arrivals[-1] > timeout:
             self.restart()
+        stays = bool(self._arrivals) and np.array_equal(positions, self._positions[-1])
         self._arrivals.append(arrived)
         self._positions.append(positions)
         self._estimate_clock()
+        where = tuple(positions.tolist())
         if velocities is None:
-            velocities = self._velocity(fastest)
-        due = self._sent + (self.interval if ahead is None else ahead)
+            if not stays:
+                span = max(_INTERVALS_TO_REST * self.interval, _TO_REST, ahead)
+                self._due = self._sent + span
+            return Target(where, (), self._due, self._due, held=True)
+        due = self._sent + ahead
         coast = min(max(_INTERVALS * self.interval, _COAST), timeout)
         if self.interval == 0.0 and not np.any(velocities):
             coast = 0.0
-        return Target(
-            tuple(positions.tolist()),
-            tuple(velocities.tolist()),
-            due,
-            due + coast,
-            held=ahead is not None,
-        )
+        return Target(where, tuple(velocities.tolist()), due, due + coast, held=True)
 
     def _estimate_clock(self) -> None:
         """Estimate the interval, and when the last message was sent."""
@@ -104,7 +100,6 @@ class TargetStream:
         if gaps.size == 0:
             self.interval = 0.0
             self._sent = arrivals[0]
-            self._numbers = np.zeros(1)
             return
         recent = np.sort(gaps[-_RECENT:])
         mean = max(float(np.mean(recent)), _SHORTEST)
@@ -120,36 +115,11 @@ class TargetStream:
             self._estimate_clock()
             return
         passed = _whole_intervals(gaps / self.interval)
-        self._numbers = np.concatenate(([0.0], np.cumsum(passed)))
-        centred = self._numbers - np.mean(self._numbers)
+        numbers = np.concatenate(([0.0], np.cumsum(passed)))
+        centred = numbers - np.mean(numbers)
         slope = centred @ arrivals / (centred @ centred)
         self.interval = max(float(slope), _SHORTEST)
         self._sent = float(np.mean(arrivals) + self.interval * centred[-1])
-
-    def _velocity(self, fastest: np.ndarray) -> np.ndarray:
-        """Return the velocity (n,) [rad/s] at the last target; zero after a step.
-
-        It is the slope of the parabola through the last target and two before, or of
-        the line.
-        """
-        if self.interval == 0.0:
-            return np.zeros_like(fastest)
-        wanted = max(1, int(_SPAN / self.interval))
-        x, slope = self._slope(wanted)
-        farther, chord = self._slope(2 * wanted)
-        velocity = slope
-        if farther > x:
-            velocity = (farther * slope - x * chord) / (farther - x)
-        velocity = velocity / self.interval
-        velocity[np.abs(velocity) > _STEP * fastest] = 0.0
-        return velocity
-
-    def _slope(self, intervals: int) -> tuple[float, np.ndarray]:
-        """Return time and mean rise, both in intervals, since a target at least so long ago."""
-        before = self._numbers[-1] - self._numbers
-        i = max(int(np.count_nonzero(before >= intervals)) - 1, 0)
-        passed = float(before[i])
-        return passed, (self._positions[-1] - self._positions[i]) / passed
 
 
 def _whole_intervals(gaps: np.ndarray) -> np.ndarray:
