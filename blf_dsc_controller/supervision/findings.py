@@ -137,7 +137,8 @@ class Findings:
         worst = int(np.argmax(sensor.mismatch / (sensor.speed + SLOW**2)))
         cause = command.oscillation.cause if command.supervisor.running else ''
         if cause and is_late(sensor, worst):
-            late = '' if lags[worst] is None else late_velocities(lags[worst])
+            lag = lags[worst]
+            late = '' if lag is None else late_velocities(lag)
             fault = Fault(Reason.OSCILLATION, '; '.join(filter(None, (late, cause))))
         if command.supervisor.uses_states:
             command.stop(*fault)
