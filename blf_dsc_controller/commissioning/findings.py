@@ -218,9 +218,7 @@ def _out_of_phase(response: Response) -> Floats:
     rows = (response.frequency >= _PHASED * high) & (response.frequency <= high)
     rate = 2.0 * np.pi * response.frequency[rows]
     D = np.linalg.inv(response.position[rows])
-    sizes = np.linalg.norm(
-        D, axis=1
-    )  # (f, n): what friction of a joint disturbs is its column
+    sizes = np.linalg.norm(D, axis=1)  # (f, n), of columns, which friction disturbs
     own = np.diagonal(D, axis1=1, axis2=2)
     turned = np.exp(-1j * rate * _LAGS[:, None])[..., None] * own  # (lags, f, n)
     across = turned.imag / sizes

@@ -25,9 +25,8 @@ _GAP_TIME = 0.03  # s, in which an arm that another commands leaves its referenc
 _ACCELERATION_TIME = 0.1  # s: the noise of a difference of velocities over it is small
 _BLOCKS = 10  # of it or some more, each with the mean acceleration in it
 _LONGEST_LAG = 0.02  # s, of velocities
-_UNEXPLAINED = (
-    0.25  # of their square, what a lag may leave: a filter makes them smaller, too
-)
+# of their square, what a lag may leave: a filter makes them smaller, too
+_UNEXPLAINED = 0.25
 
 
 def shortest_gap(sample_time: float) -> float:
