@@ -172,10 +172,10 @@ def _arrays(
         name: None if (messages := sources[source]) is None else messages.field(field)
         for name, (source, field) in _ARRAYS.items()
     }
+    errors, known = sources['errors'], sources['references']
     if errors is not None:
         # Errors are not decimated: q - xi1 is the reference at every sample. Where the
         # positions may wrap, the controller's is whole turns off.
-        known = sources['references']
         if known is None or may_wrap:
             known = states.select(np.full(states.size, -1))
         arrays['reference'] = Values(known, 0, (states.field(0), errors.field(0)))
