@@ -173,31 +173,6 @@ def test_inertia_and_lags_are_found():
     assert findings.jitter < 1e-12  # s, of rounding
 
 
-@pytest.mark.parametrize(('delay', 'filtered'), [(0, 0.008), (4, 0.002), (9, 0.0)])
-def test_delays_are_those_of_the_arm(delay, filtered):
-    """Of torques [samples], less what springs that damp lead; of a filter of velocities [s].
-
-    The last torque was not told at all, and velocities 8 ms late were 5.4 ms.
-    """
-    pole = 1.0 / filtered if filtered else 0.0
-    late = change(ARM, {'actuator.delay': delay, 'sensor.velocity_pole': pole})
-    findings = result_of(CONFIG, simulated.measured(planned(), late)).findings
-    assert findings.drive_lag == pytest.approx((delay + 0.5) * 1e-3, abs=5.1e-4)
-    # a filter has the newest sample at once
-    told = max(0.0, filtered - 5e-4)
-    assert findings.velocity_lag == pytest.approx(told, abs=1e-4)
-
-
-def test_delay_of_torques_is_that_of_an_arm_whose_drives_damp_its_gears():
-    """It was 6.1 ms, with what the damping of the loop at the joint torque sensors adds."""
-    loop = blf.load_loop('panda')
-    plant = change(loop.plant, {'actuator.delay': 3, 'actuator.time_constant': 5e-4})
-    motion = blf.Commissioning(loop.controller).motion(plant.initial.position)
-    run = simulated.measured(motion, plant)
-    findings = result_of(loop.controller, run).findings
-    assert findings.drive_lag == pytest.approx(4e-3, abs=5e-4)
-
-
 def test_lag_of_the_drives_is_written():
     """Of 5 samples of delay and half of one, beside the 1.5 ms that every loop has."""
     late = change(ARM, {'actuator.delay': 5})

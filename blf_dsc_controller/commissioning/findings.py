@@ -8,19 +8,15 @@ diagonal what each joint asks for while the others are held, with a lag on the w
 
 so inertia J and damping F (friction in motion acts like it) follow by least squares, tau with
 them.  That lag is no more than a part of the fit: at these frequencies friction turns D by more
-than drives do, and not by the same at all of them where joints stick at times.  Theirs is taken
-from higher ones.  Without lag, D is real there but for the damping F of the motor, and c of the
-motor behind a spring, or of a loop at joint torque sensors,
+than drives do.  Theirs is taken from higher ones, where gears and what carries the arm answer in
+phase or against it, below and above their resonances: but for the damping, D is real without lag,
 
-    Im(D_jj e^(-i omega tau)) = F omega - c omega^3,        F, c >= 0
-
-tau is the same for all joints.  Of a drive that lags like a filter it is the delay of the phase at
-these frequencies, a little less than its time constant; springs that damp make it less, too.
+    Im(D_jj e^(-i omega tau)) = F omega
 
 An inertia that asks for less than the damping is not seen, nor is one that fits best with
 the longest lag that is tried: friction and noise turn D by as much.  The lag of velocities is
-that of G_v against i omega G_y, while the arm is rigid.  Where a joint is free, gears show as an
-antiresonance, at which the link absorbs what its motor does, and a resonance above it.
+that of G_v against i omega G_y.  Where a joint is free, gears show as an antiresonance, at
+which the link absorbs what its motor does, and a resonance above it.
 """
 
 from __future__ import annotations
@@ -45,8 +41,7 @@ LONGEST_LAG = 0.03
 """Lag from a torque to its motion, up to which one is looked for [s]."""
 
 _LAGS = np.linspace(0.0, LONGEST_LAG, 301)  # s
-# Hz, up to which the lag of the drives shows, and the part of that from which friction hides less
-_FASTEST, _PHASED = 75.0, 1.0 / 3.0
+_PHASED = (8.0, 40.0)  # Hz, of the lag of the drives
 _OUT_OF_PHASE = 0.1  # mean square of what is left of D, that is believed to be a lag
 _SHOWN = 10.0  # times the doubt of a response, from which it shows resonances
 _PEAK = 1.5  # over its neighbours
@@ -198,49 +193,45 @@ def _largest(values: Floats) -> Floats:
 
 
 def _drive_lag(responses: Sequence[Response]) -> float:
-    """Return the lag [s] from torques to motion, of all joints alike; nan: none shows it."""
-    left = np.concatenate([_out_of_phase(each) for each in responses])
-    within = left.argmin(axis=1) < _LAGS.size - 1  # else more would fit better
-    known = left[within & (left.min(axis=1) < _OUT_OF_PHASE)]
-    if not known.size:
-        return float('nan')
-    return float(_LAGS[np.log(known).sum(axis=0).argmin()])
+    """Return the lag [s] from torques to motion, in the median; nan: no joint shows it."""
+    found = [_lags_by_phase(each) for each in responses]
+    lags, left = (np.concatenate(each) for each in zip(*found, strict=True))
+    known = lags[(left < _OUT_OF_PHASE) & (lags < LONGEST_LAG)]
+    return float(np.median(known)) if known.size else float('nan')
 
 
-def _out_of_phase(response: Response) -> Floats:
-    """Return the mean square (n, lags) of what is left of D of each joint with each lag.
+def _lags_by_phase(response: Response) -> tuple[Floats, Floats]:
+    """Return the lag (n,) [s] of each joint, and the mean square (n,) of what is left of D.
 
-    It is a share of its column of D: a half, if it is alone and its phase is any.
+    It is a share of D: a half, if its phase is any.
     """
-    from scipy.optimize import nnls
-
-    high = min(_FASTEST, float(response.frequency[-1]))
-    rows = (response.frequency >= _PHASED * high) & (response.frequency <= high)
+    low, high = _PHASED
+    rows = (response.frequency >= low) & (response.frequency <= high)
     rate = 2.0 * np.pi * response.frequency[rows]
-    D = np.linalg.inv(response.position[rows])
-    sizes = np.linalg.norm(D, axis=1)  # (f, n), of columns, which friction disturbs
-    own = np.diagonal(D, axis1=1, axis2=2)
-    turned = np.exp(-1j * rate * _LAGS[:, None])[..., None] * own  # (lags, f, n)
-    across = turned.imag / sizes
-    powers = np.column_stack((rate / rate[-1], -((rate / rate[-1]) ** 3)))
-    damped = rate[-1] * powers[..., None] / sizes[:, None]  # (f, 2, n)
-    left = [
-        [nnls(damped[..., j], at_lag)[1] for at_lag in across[..., j]]
-        for j in range(own.shape[1])
-    ]
-    return np.square(left) / rate.size
+    own = np.diagonal(np.linalg.inv(response.position[rows]), axis1=1, axis2=2)
+    turns = np.exp(-1j * rate * _LAGS[:, None])  # (lags, f)
+    lags, left = [], []
+    for D in own.T:
+        across = (turns * D).imag / np.abs(D)
+        damped = rate / np.abs(D)
+        F = (across @ damped / (damped @ damped)).clip(0.0)
+        squares = ((across - F[:, None] * damped) ** 2).mean(axis=1)
+        lags.append(_LAGS[squares.argmin()])
+        left.append(squares.min())
+    return np.array(lags), np.array(left)
 
 
 def _velocity_lag(response: Response) -> float:
-    """Return the lag [s] of velocities, by the joints' own responses while the arm is rigid."""
-    low, high = _RIGID
-    rows = (response.frequency >= low) & (response.frequency <= high)
-    rate = 2.0 * np.pi * response.frequency[rows, None]
-    position, velocity = (
-        np.diagonal(each[rows], axis1=1, axis2=2)
-        for each in (response.position, response.velocity)
-    )
-    return float(np.median((1j * rate * position / velocity).imag / rate))
+    """Return the lag [s] of velocities, by the phase of the joints' own responses."""
+    s = 2j * np.pi * response.frequency[:, None]
+    own = [
+        np.diagonal(each, axis1=1, axis2=2)
+        for each in (response.velocity, response.position)
+    ]
+    rows = response.frequency >= _RIGID[0]
+    phase = np.angle(own[0] / (s * own[1]))[rows]
+    lags = -phase / (2.0 * np.pi * response.frequency[rows, None])
+    return float(np.median(lags))
 
 
 def _resonances(response: Response, posture: int) -> list[Resonance]:
