@@ -72,7 +72,7 @@ class ExpectedLoad:
         self._check(load, parameters, interval, q)
         law, p = self._controller, parameters.size
         estimate = law.state.estimate[:p]
-        if self.load == NOTHING and not self._steps:
+        if self.load.mass == 0.0 and not self._steps:
             self._empty = estimate.copy()
         law.expect(parameters)
         law.state.change.announced[0] = 1.0
@@ -100,7 +100,7 @@ class ExpectedLoad:
 
     def apply_again(self) -> None:
         """Expect the same load after the settings were replaced."""
-        if self.load != NOTHING:
+        if self.load.mass > 0.0:
             self._controller.expect(self._parameters(self.load))
 
     def forget(self) -> None:
