@@ -51,6 +51,7 @@ COMMANDS = {
     'export': 'export bag --out table.csv',
     'export to parquet': 'export bag --out table.parquet',
     'report as pictures': 'report bag --png pictures',
+    'export-c': 'export-c --config arm.yaml --out law',
     'commission': 'commission --config arm.yaml --write motions.yaml',
     'excite': 'excite motion.yaml --config arm.yaml --starts 1 --harmonics 1',
     'identify': 'identify run.csv --urdf pendulum.urdf --out new.urdf --report i.html',

@@ -37,7 +37,6 @@ from blf_dsc_controller.warnings.table import refuse
 if not SLOW:
     from blf_dsc_controller.compiled.linked import object_file_of
 
-HEADER = 'blf_dsc_law.h'
 _FLAGS = (
     'SUSPECT',
     'OUTSIDE',
