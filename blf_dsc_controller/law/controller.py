@@ -115,8 +115,8 @@ class Controller:
     def reset(self) -> None:
         """Return to the initial state: initial estimate, empty filters and window."""
         self.state_vector.fill(0.0)
-        self.state.estimate[:] = self.settings.prior_mean
-        self.state.latch.anchor[:] = self.settings.prior_mean
+        self.state.estimate[:] = self.settings.initial_estimate
+        self.state.latch.anchor[:] = self.settings.initial_estimate
         self.state.window.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
         self.state.latch.active.fill(1.0)
         self.state.rotors.gain_scale.fill(1.0)
