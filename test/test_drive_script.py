@@ -97,7 +97,7 @@ def test_load_that_the_script_knows_is_carried_at_once(tmp_path):
         arm.expect_load(1.0, (0.0, 0.0, 0.05), interval=0.1)
         with pytest.raises(blf.DriveError, match='none has been weighed'):
             arm.expect_load(remember=True)
-        with pytest.raises(blf.DriveError, match='whose limit is'):
+        with pytest.raises(blf.DriveError, match='but robot'):
             arm.expect_load(500.0)
         with pytest.raises(blf.DriveError, match="interval: got 'soon'"):
             arm.expect_load(1.0, interval='soon')

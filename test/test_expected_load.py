@@ -104,7 +104,8 @@ def test_reset_carries_the_box_on():
         ((-1.0,), 'got -1.0 kg'),
         (('two',), "got 'two' kg"),
         ((1.0, (0.0, 0.1)), 'three coordinates'),
-        ((2000.0,), 'would need .* at joint .*, whose limit is'),
+        ((20.0,), 'got 20 kg, but robot.payload'),
+        ((1.0, (0.0, 0.0, 50.0)), 'would need .* at joint .*, whose limit is'),
         ((1.0, (0.0, 0.0, 0.0), -0.1), 'between 0 and 10 s'),
     ],
 )

@@ -43,9 +43,8 @@ class ExpectedLoad:
         self.load = NOTHING
         self.weighed: TipLoad | None = None
         self._config, self._controller = config, controller
-        self._empty = np.zeros(
-            0
-        )  # P^ (p,) when the tip last held nothing that was expected
+        # P^ (p,) when the tip last held nothing that was expected
+        self._empty = np.zeros(0)
         self._step = np.zeros(0)  # of P^, in a sample
         self._steps = 0  # that are left
         self._seen = 0.0  # kg, the mass that was weighed last, sure or not
@@ -124,6 +123,13 @@ class ExpectedLoad:
             raise BlfDscError(
                 f'expected load: got an interval of {interval:g} s, but one between 0 and '
                 f'{LONGEST:g} s is needed'
+            )
+        rated = config.robot.payload
+        carried = 0.0 if self.weighed is None else self.weighed.mass
+        if load.mass > max(rated, carried):
+            raise BlfDscError(
+                f'expected load: got {load.mass:g} kg, but robot.payload, which the arm is rated '
+                f'for, is {rated:g} kg: give kg, or the true robot.payload'
             )
         (H,) = regressors_at(settings.model, q[np.newaxis], *np.zeros((3, 1, q.size)))
         weight = np.abs(H @ parameters)
