@@ -263,7 +263,9 @@ def drive_bodies(config: PlantConfig) -> np.ndarray:
     chain = robot.chain(config.joints)
     inertias = robot.drive_inertias(chain, true_inertias(chain, config.drive))
     return pack(
-        rigid_bodies(chain, robot.gravity, inertias, np.zeros(len(chain.joints)))
+        rigid_bodies(
+            chain, robot.known_drive_gravity, inertias, np.zeros(len(chain.joints))
+        )
     )
 
 

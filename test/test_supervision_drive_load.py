@@ -16,6 +16,7 @@ from sim_plant.settings import plant_settings
 
 HELD = {'events.begin': [4.0], 'events.duration': [12.0], 'events.payload': [2.0]}
 GIVEN = {'load.tell_drive': True, 'safety.torque': 'hold_gravity'}
+HOLD = {'reference.type': 'hold', 'safety.torque': 'hold_gravity'}
 
 
 def test_load_is_declared_in_steps_kept_over_a_reset_and_taken_back():
@@ -111,3 +112,40 @@ def test_told_load_is_left_as_it_is_until_another_is_weighed():
         load[:] = (mass, 0.01, -0.02, 0.05, *SURE)
         declared.append(arm.controller.load_to_tell() is not None)
     assert declared == [False, True, True]
+
+
+CEILING = [0.0, 0.0, 9.81]
+UPRIGHT = [0.0, 0.0, -9.81]
+
+
+def on_ceiling(preset, drive_gravity):
+    robot = {'robot.gravity': CEILING, 'robot.drive_gravity': drive_gravity}
+    robot['robot.drive_compensates'] = 'gravity'
+    common = {'sim_plant': robot, 'blf_dsc_controller': robot | HOLD}
+    return Scenario(blf.load_loop(preset, common))
+
+
+@pytest.mark.parametrize('drive_gravity', [CEILING, UPRIGHT])
+def test_arm_on_the_ceiling_is_held_whatever_its_drives_take_for_down(drive_gravity):
+    arm = on_ceiling('panda', drive_gravity)
+    held = arm.run(1.0)
+    assert arm.is_running, arm.text
+    assert held.ratio < 0.1
+    arm.controller.stop()
+    stopped = arm.run(2.0)
+    assert np.abs(stopped.q - stopped.q[0]).max() < 0.02
+    assert stopped.speed.max() < 0.05
+
+
+def test_arm_that_upright_drives_cannot_hold_is_not_started():
+    arm = on_ceiling('fr3_direct', UPRIGHT)
+    arm.run(0.01)
+    assert 'the first torque would step' in arm.text
+    assert 'drive_compensates to gravity' not in arm.text
+
+
+@pytest.mark.parametrize('gravity', [[1.0, 0.0, -9.7], CEILING, [0.0, 0.0, 0.0]])
+def test_drives_that_compensate_on_a_tilted_base_say_by_which_gravity(gravity):
+    given = {'robot.gravity': gravity}
+    with pytest.raises(blf.ConfigurationError, match='the base is tilted'):
+        blf.load_loop('fr3', {'sim_plant': given, 'blf_dsc_controller': given})

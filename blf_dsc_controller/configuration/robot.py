@@ -36,6 +36,7 @@ from blf_dsc_controller.configuration.files import (
 from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Vector,
+    format_value,
     non_negative,
     parameter,
     suggestion,
@@ -69,6 +70,7 @@ UNKNOWN_FRICTION = 0.05
 _SLOWEST = {'revolute': 2.0, 'prismatic': 0.5}  # rad/s or m/s, of the drives of arms
 # relative; the product of a decimal fraction and 1e9 is off by a few 1e-16
 _ROUNDING = 1e-12
+_TURN_ROUNDING = 1e-5  # of angles in a URDF, which may have six digits
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,14 @@ class Robot:
     drive_compensates: Literal['none', 'gravity', 'gravity_and_friction'] = _fixed(
         'none', 'what the drives add to a commanded torque by themselves'
     )
+    drive_gravity: Vector = _fixed(
+        (),
+        'gravity by which the drives compensate, in the base frame; (0, 0, -9.81) of drives '
+        'that take the base for upright, however it is mounted; empty: robot.gravity, if it points '
+        'down along z',
+        'm/s^2',
+        omittable=True,
+    )
     drive_payload: float = _magnitude(
         0.0, 'payload configured in the drives that the URDF lacks', 'kg'
     )
@@ -152,6 +162,22 @@ class Robot:
                 f'drive_payload: got {self.drive_payload:g} kg, but drive_compensates is none: the '
                 'drives compensate no payload'
             )
+        if self.drive_compensates == 'none' and self.drive_gravity:
+            yield 'drive_gravity: got some, but drive_compensates is none: the drives add none'
+        if self.drive_compensates != 'none' and not (
+            self.drive_gravity or _points_down(self.gravity)
+        ):
+            yield (
+                'drive_gravity: the base is tilted (robot.gravity '
+                f'{format_value(self.gravity)}), and drives that take it for upright would drop '
+                'the arm or throw it up: give robot.gravity once more if the drives know how the '
+                'base is mounted, or [0.0, 0.0, -9.81] if they do not'
+            )
+
+    @property
+    def known_drive_gravity(self) -> tuple[float, ...]:
+        """Gravity (3,) [m/s^2] by which the drives compensate, in the base frame."""
+        return self.drive_gravity or self.gravity
 
     @property
     def text(self) -> str:
@@ -287,6 +313,12 @@ class Robot:
         return HEAVIER_DRIVE * self.rotors(chain) * counts
 
 
+def _points_down(gravity: tuple[float, ...]) -> bool:
+    """Whether gravity (3,) is along -z of the base, up to the rounding of its orientation."""
+    x, y, z = gravity
+    return z < 0.0 and math.hypot(x, y) <= _TURN_ROUNDING * -z
+
+
 def _by_kind(values: Mapping[JointUnits, float], chain: Chain) -> np.ndarray:
     """Return the value (n,) of each joint, as it turns or slides."""
     return np.array([values[joint_units(joint.kind)] for joint in chain.joints])
@@ -373,7 +405,7 @@ def drive_model(robot: Robot, joints: tuple[str, ...]) -> tuple[np.ndarray, np.n
         (i, entry) for i in range(len(chain.joints)) for entry in range(_MOMENTS)
     ]
     inertias = robot.drive_inertias(chain, chain.inertias)
-    return serial_chain(chain, robot.gravity, columns).vector, inertias[
+    return serial_chain(chain, robot.known_drive_gravity, columns).vector, inertias[
         :, :_MOMENTS
     ].ravel()
 

@@ -93,7 +93,7 @@ def check_first_torque(
     text = _too_large_step(config, torque, held)
     if not text:
         return
-    if is_like(torque, gravity):
+    if config.robot.drive_compensates == 'none' and is_like(torque, gravity):
         text += (
             ': this is the gravity of the URDF. If the drives compensate it themselves, set '
             'robot.drive_compensates to gravity, or to gravity_and_friction'
