@@ -37,7 +37,6 @@ from blf_dsc_controller.factory.inertia import joint_inertia
 from blf_dsc_controller.factory.laws import law_of, with_memory
 from blf_dsc_controller.law import (
     adaptation,
-    apparent_inertia,
     barrier,
     columns,
     contact,
@@ -93,7 +92,6 @@ def settings_of_config(config: ControllerConfig) -> Settings:
     model = model_of(config)
     learned = columns_of(config)
     row = _row(config)
-    inertia = _joint_inertia(config)
     settings = filled(
         Settings,
         config.learning,
@@ -103,9 +101,8 @@ def settings_of_config(config: ControllerConfig) -> Settings:
         m=model.p + len(learned),
         memory=0,
         has_barrier=int(law_of(config).has_barrier),
-        joint_inertia=inertia,
+        joint_inertia=_joint_inertia(config),
         friction=None,  # follows from the others
-        rotors=_rotors(config, row.lag, inertia),
         **_parts_of_feedback(config, model.p, row.lag),
         **_parts_of_learning(config, model.p, learned, row),
     )
@@ -312,8 +309,6 @@ def _excitation(config: ControllerConfig) -> excitation.Settings:
 
     The first must be full (27), unless its rows are compared with a prior from the start.
     Rows that are not exact contradict each other on any arm, which is not taken for a change.
-    With feedback through the inertia matrix it must be, too: there drives lighter than
-    guessed are measured first.
     """
     least = _least_floor(config)
     is_urdf = config.model == 'urdf'
@@ -408,33 +403,6 @@ def _joint_inertia(config: ControllerConfig) -> np.ndarray:
     if config.model != 'urdf':
         return np.ones(len(config.joints))
     return joint_inertia(config, law_gains(config).initial_estimate)
-
-
-def _rotors(
-    config: ControllerConfig, lag: float, inertia: np.ndarray
-) -> apparent_inertia.Settings:
-    """Return what `apparent_inertia` needs to measure assumed rotors.
-
-    `inertia` (n,) [kg m^2] is m of each joint, `lag` [s] that of `robot.lag`.
-    """
-    n = len(config.joints)
-    rotors = apparent_inertia.Settings(
-        unsure=0,
-        lag=lag,
-        rotor=np.zeros(n),
-        joint=inertia,
-        link=np.ones(n),
-    )
-    if not _follows_inertia(config) or config.robot.rotor_inertia:
-        return rotors
-    robot = config.robot
-    chain = robot.chain(config.joints)
-    links = parameters_of(robot, chain).of(chain.inertias, np.zeros(n))
-    return rotors._replace(
-        unsure=1,
-        rotor=robot.rotors(chain),
-        link=joint_inertia(config, tuple(links)),
-    )
 
 
 def _weighing(

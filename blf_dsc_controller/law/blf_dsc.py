@@ -14,8 +14,6 @@ Where it departs from the paper, and why:
 - The barrier's torque -dV/dxi1 continues past a stiffness that a sampled loop can hold: `barrier`.
 - A bound that narrows adds xi1 k'/k to the virtual control: `barrier`.
 - K_p xi2 may lag, where gears give way: `feedback`.
-- The feedback of an arm whose rotor inertias are guessed follows those that it measures:
-  `apparent_inertia`.
 - f, zero in the paper, is what is known of beta2' if `known_rate` of `surface.Settings` is 1.
 - beta2 is held for a sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the factor
   exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with lambda = 2 dt the
@@ -29,7 +27,7 @@ from typing import NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import barrier, feedback, learning
-from blf_dsc_controller.law.compensation import compensated, follow_rotors
+from blf_dsc_controller.law.compensation import compensated
 from blf_dsc_controller.law.lag import filter_gain
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.law.surface import known_rate, virtual_control
@@ -51,7 +49,6 @@ class BlfDsc(NamedTuple):
         """Compute the torque (28)."""
         compute_surface(settings, state, signals, dt)
         learning.observe(settings, state, signals, t, dt)
-        follow_rotors(settings, state, signals, dt)
         begins = state.samples[0] == 0.0
         feedback.advance(settings.feedback, state.feedback, signals.xi2, begins, dt)
         for i in range(settings.n):

@@ -146,8 +146,7 @@ def check_sample(
     )
     effect.average_steps(checks.effect, now)
     is_sound = is_sound and not may_oscillate(checks)
-    scale = state.rotors.gain_scale
-    kept_estimates.keep_consistent(estimates, scale, ratio, is_sound, begins, T)
+    kept_estimates.keep_consistent(estimates, ratio, is_sound, begins, T)
     is_missing, moves = effect.check_effect(
         settings.torque, checks.effect, checks.sensor, now
     )

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import apparent_inertia, columns, feedback, friction
+from blf_dsc_controller.law import columns, feedback, friction
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -106,43 +106,6 @@ def fill_known_torque(
         signals.model_torque[i] = signals.friction.torque[i]
         for j in range(settings.m):
             signals.model_torque[i] += H[i, j] * settings.initial_estimate[j]
-
-
-@inner
-def follow_rotors(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Where rotors are guessed, measure their error J~, and let the feedback follow it."""
-    if settings.rotors.unsure == 1:
-        measure_rotors(settings, state, signals, dt)
-        correct_feedback(settings, state, signals)
-
-
-@inner
-def measure_rotors(
-    settings: Settings, state: State, signals: Signals, dt: float
-) -> None:
-    """Update J~ from the last interval."""
-    part, now, work = settings.rotors, state.rotors, signals.scratch.rotors
-    if state.samples[0] <= 1.0:  # the first torque has had no effect yet
-        apparent_inertia.begin(now, signals.dq, signals.applied)
-        return
-    apparent_inertia.pass_band(part, now, work, signals.dq, signals.applied, dt)
-    if apparent_inertia.has_settled(state.samples[0], dt):
-        momentum, P0 = signals.scratch.momentum, settings.initial_estimate
-        settings.model.momentum_regressor(
-            signals.q, work.acceleration, momentum.Yp, momentum.Yr
-        )
-        apparent_inertia.update(part, now, work, momentum.Yp, P0, dt)
-
-
-@inner
-def correct_feedback(settings: Settings, state: State, signals: Signals) -> None:
-    """Add the torque of J~ for what the feedback accelerates to H P^(0)."""
-    for i in range(settings.n):
-        signals.model_torque[i] += state.rotors.error[i] * (
-            signals.feedback.acceleration[i] - signals.ddqr[i]
-        )
 
 
 @inner

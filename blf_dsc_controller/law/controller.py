@@ -119,7 +119,6 @@ class Controller:
         self.state.latch.anchor[:] = self.settings.initial_estimate
         self.state.window.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
         self.state.latch.active.fill(1.0)
-        self.state.rotors.gain_scale.fill(1.0)
         friction.begin(self.settings.friction, self.state.friction)
 
     def begin(self, start: Start) -> None:

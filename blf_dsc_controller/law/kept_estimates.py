@@ -21,8 +21,6 @@ class State(NamedTuple):
     kept: Annotated[Array, 'm + n']  # of the last sample that was not suspect
     moved: Annotated[Array, 'm + n']  # of when a joint last moved
     consistent: Annotated[Array, 'm + n']  # from before the error grew
-    # measured inertia of each joint over the assumed, of the same sample
-    consistent_scale: Annotated[Array, 'n']
     # |xi1| / k of the sample that `consistent` is of, relaxed since
     least_ratio: Cell
 
@@ -52,7 +50,6 @@ def keep_moved(state: State) -> None:
 @inner
 def keep_consistent(
     state: State,
-    gain_scale: Array,
     ratio: float,
     is_sound: bool,
     begins: bool,
@@ -60,8 +57,7 @@ def keep_consistent(
 ) -> None:
     """Keep the estimates of the smallest recent error, whose largest |xi1| / k is `ratio`.
 
-    `gain_scale` (n,) is the measured inertia of each joint over the assumed.  `is_sound`: the
-    arm does not oscillate, and r of `load_observer` is not in doubt.
+    `is_sound`: the arm does not oscillate, and r of `load_observer` is not in doubt.
     """
     least = state.least_ratio[0] * (1.0 + dt / _RELAXED)
     least = max(_SMALL, least)
@@ -71,5 +67,3 @@ def keep_consistent(
     state.least_ratio[0] = ratio
     for j in range(state.kept.size):
         state.consistent[j] = state.kept[j]
-    for i in range(gain_scale.size):
-        state.consistent_scale[i] = gain_scale[i]

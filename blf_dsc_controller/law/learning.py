@@ -339,7 +339,7 @@ def transfer_friction(settings: Settings, state: State, signals: Signals) -> Non
 def follow_disturbance(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Advance d^3 by `dt` [s]: (30), with gamma (M(q, P^(0)) + J~) / m on an arm of a URDF."""
+    """Advance d^3 by `dt` [s]: (30), with gamma M(q, P^(0)) / m where the feedback acts through it."""
     work = signals.scratch.disturbance
     disturbance.fill_step(
         settings.disturbance, work, state.disturbance, signals.xi2, dt
@@ -355,12 +355,12 @@ def follow_disturbance(
 def scale_by_inertia(
     settings: Settings, state: State, signals: Signals, x: Array
 ) -> None:
-    """Replace x (n,) by (M(q, P^(0)) + J~) x / m."""
+    """Replace x (n,) by M(q, P^(0)) x / m."""
     momentum = signals.scratch.momentum
     for i in range(settings.n):
         x[i] /= settings.joint_inertia[i]
     settings.model.momentum_regressor(signals.q, x, momentum.Yp, momentum.Yr)
     for i in range(settings.n):
-        x[i] *= state.rotors.error[i]
+        x[i] = 0.0
         for j in range(settings.p):
             x[i] += momentum.Yp[i, j] * settings.initial_estimate[j]

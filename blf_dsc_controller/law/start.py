@@ -27,7 +27,6 @@ _LEARNED = (
     'latch',
     'change',
     'friction',
-    'rotors',
     'memory',
     'window',
 )

@@ -18,7 +18,6 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell, Passed, size_of, view_of
 from blf_dsc_controller.law import (
     adaptation,
-    apparent_inertia,
     barrier,
     change,
     columns,
@@ -75,7 +74,6 @@ class Settings(NamedTuple):
     external: external_torque.Settings
     contact: contact.Settings
     friction: friction.Settings
-    rotors: apparent_inertia.Settings
     weighing: weighing.Settings
 
 
@@ -99,7 +97,6 @@ class State(NamedTuple):
     external: external_torque.State
     contact: contact.State
     friction: friction.State
-    rotors: apparent_inertia.State
     weighing: weighing.State
     memory: Annotated[Array, 'memory']  # of a law of a file
     window: window.State
@@ -125,7 +122,6 @@ class Scratch(NamedTuple):
     adaptation: adaptation.Work
     external: external_torque.Work
     contact: contact.Work
-    rotors: apparent_inertia.Work
     weighing: weighing.Work
 
 

@@ -13,7 +13,6 @@ from blf_dsc_controller.law import adaptation
 from blf_dsc_controller.law.compensation import (
     compute_regressors_at_state,
     fill_learned,
-    follow_rotors,
 )
 from blf_dsc_controller.law.state import Settings, Signals, State
 
@@ -39,7 +38,6 @@ def follow(
         signals.feedback.restoring[i] = -weight * signals.xi1[i]
     compute_regressors_at_state(settings, state, signals)
     fill_learned(settings, state, signals, dt)
-    follow_rotors(settings, state, signals, dt)
 
 
 @inner

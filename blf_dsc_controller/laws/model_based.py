@@ -16,7 +16,6 @@ from blf_dsc_controller.law.compensation import (
     compensated,
     compute_regressors_at_state,
     fill_learned,
-    follow_rotors,
 )
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.numerics.elementary import sin
@@ -44,7 +43,6 @@ class ModelBased(NamedTuple):
         compute_surface(settings, state, signals, dt)
         compute_regressors_at_state(settings, state, signals)
         fill_learned(settings, state, signals, dt)
-        follow_rotors(settings, state, signals, dt)
         known = self.constant + self.amplitude * sin(self.frequency * t + self.phase)
         for i in range(settings.n):
             torque = -settings.feedback.gain[i] * signals.xi2[i]

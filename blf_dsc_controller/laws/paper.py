@@ -27,7 +27,6 @@ from blf_dsc_controller.law.compensation import (
     compensated,
     compute_regressors_at_state,
     fill_learned,
-    follow_rotors,
 )
 from blf_dsc_controller.law.state import Settings, Signals, State
 from blf_dsc_controller.numerics.elementary import exp
@@ -128,7 +127,6 @@ class Paper(NamedTuple):
         compute_regressors_at_state(settings, state, signals)
         fill_learned(settings, state, signals, dt)
         observe(settings, state, signals, self.omega, t, dt)
-        follow_rotors(settings, state, signals, dt)
         begins = state.samples[0] == 0.0
         feedback.advance(settings.feedback, state.feedback, signals.xi2, begins, dt)
         for i in range(settings.n):

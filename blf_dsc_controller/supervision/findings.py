@@ -130,8 +130,7 @@ class Findings:
     def _distrust_velocities(self, reading: Reading) -> None:
         """Stop, and difference all velocities from the positions from this state on."""
         command = self._command
-        checks = command.controller.checks
-        sensor = checks.sensor
+        sensor = command.controller.checks.sensor
         lags = command.held.recent.velocity_lags
         fault = command.states.contradicted(sensor.derived, sensor.measured, lags)
         worst = int(np.argmax(sensor.mismatch / (sensor.speed + SLOW**2)))
@@ -146,9 +145,5 @@ class Findings:
             command.supervisor.add(fault.text)
             command.hold.start_observing()  # this has let the error grow
         command.readings.difference_velocities(reading)
-        # What the wrong velocities showed of the rotors is as wrong.
-        command.controller.state.rotors.gain_scale[:] = (
-            checks.estimates.consistent_scale
-        )
         # Else the change from the wrong velocity would pass for an acceleration.
         command.readings.last.dq[:] = reading.dq

@@ -34,8 +34,6 @@ FADE_TIME = 0.5
 
 _RESTED = 10.0 / OBSERVER[1]  # s at rest, in which the observed load settles
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
-# of the damping: an elastic joint that oscillates passes for a light one
-_LIGHTEST = 0.5
 
 
 class Load(Enum):
@@ -84,8 +82,6 @@ class Hold:
         missed_change: change (n,) [N m] of the commands since the stop to which the arm has not
             answered, for the torque that showed it; else None.
         longest_step: time [s] for which one torque may change at the rate limit.
-        scale: factor (n,) on the damping: measured inertia of the joints over the assumed; at
-            least a half of it is used.
     """
 
     def __init__(
@@ -98,7 +94,6 @@ class Hold:
         n = settings.n
         self.commanded = np.zeros(n)
         self.load = np.zeros(n)
-        self.scale = np.ones(n)
         self.missed_change: Vector | None = None
         self.configure(settings, estimate, period)
         self._last, self._sensor = readings.last, readings.sensor
@@ -239,7 +234,7 @@ class Hold:
         """
         settings, last = self._settings, self._last
         kept = 1.0 if self.carries else max(0.0, 1.0 - last.age / FADE_TIME)
-        damping = self._swing.share * np.maximum(self.scale, _LIGHTEST) * damping
+        damping = self._swing.share * damping
         torque = np.zeros(settings.n)
         with np.errstate(over='ignore', invalid='ignore'):  # the caller limits it
             if kind == 'damping':

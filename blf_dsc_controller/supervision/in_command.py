@@ -96,7 +96,6 @@ class InCommand:
             self.estimates.estimate,
             config.sample_time,
         )
-        self.hold.scale = self.controller.state.rotors.gain_scale
         self.envelope = envelope_of(config, self.controller.settings)
         self.held = HeldTorque(config, self.controller, self.estimates)
         self.safe_stop = SafeStop(

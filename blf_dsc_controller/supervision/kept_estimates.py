@@ -48,7 +48,6 @@ class KeptEstimates:
     def begin(self) -> None:
         """Take the kept ones for those of all past samples: a start has no others."""
         self._past.consistent[:] = self._past.kept
-        self._past.consistent_scale[:] = self._controller.state.rotors.gain_scale
         self._past.moved[:] = self._past.kept
 
     def return_to_consistent(self) -> None:

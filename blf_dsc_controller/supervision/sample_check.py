@@ -25,8 +25,6 @@ Vector = NDArray[np.float64]
 # of the torque limit: an effort that is so much below its command, on average and now,
 # explains an error past the bound
 _SHORT_TORQUE, _SHORT_TORQUE_NOW = 0.05, 0.1
-_LIGHT_INERTIA = 0.5  # of the assumed inertia: less is worth saying
-_NO_INERTIA = 0.02  # of it: no drive has so little
 _AGAINST_TORQUE = 0.1  # of the torque limit, beyond the torque of the model at rest
 # s without saturation that make up for one with it: more than a fifth adds up
 _UNSATURATED_RELIEF = 4
@@ -224,32 +222,13 @@ class SampleCheck:
             text += f'; {in_words(at_tool)}'
         given = self._with_cause(text)
         if given == text:
-            given += self._lightness(worst) or self._imbalance(worst)
+            given += self._imbalance(worst)
         return Fault(Reason.OUTSIDE_BOUND, given)
 
     def _with_cause(self, text: str) -> str:
         """Return a text after what the arm suffers from, if it is known."""
         cause = self._cause.text(self.saturated_time)
         return '; '.join(filter(None, (cause, text)))
-
-    def _lightness(self, joint: int) -> str:
-        """Return a text if the inertia of a joint's drive is far below the assumed."""
-        settings = self._controller.settings
-        state = self._controller.state
-        if state.rotors.gain_scale[joint] > _LIGHT_INERTIA:
-            return ''
-        assumed = settings.rotors.rotor[joint]
-        error = state.rotors.error[joint]
-        if assumed + error < _NO_INERTIA * assumed:
-            return (
-                '; it moves as if nothing were commanded: release the brakes, and activate the '
-                'effort controller'
-            )
-        return (
-            f'; its drive seems to have {assumed + error:.2g} {self._units[joint].inertia} instead '
-            f'of the assumed {assumed:.2g}, too little for these gains: give robot.rotor_inertia, '
-            'or a wider bound'
-        )
 
     def _imbalance(self, joint: int) -> str:
         """Return what may be wrong if a joint leaves against the torque that it is sent.
