@@ -5,16 +5,14 @@ The margin is that of the linear loop (`linear_loop`) above the frequencies of t
 arm, in several postures, with and without the rated payload, with motors that are lighter
 and heavier than stated, and with encoders on either side of the gears.
 
-Without a torque loop the gains are those of joints, each on its own, with damping in
-proportion to the motors.  A torque loop makes the motors follow the links, so that
-feedback through the inertia matrix is right, and far stiffer in the directions in which
-an arm is heavy; the inertia that a drive then adds is that of its motor over 1 + k_T.
+The gains are those of joints, each on its own, with damping in proportion to the motors.
+A torque loop makes the motors follow the links: the inertia that a drive then adds is that
+of its motor over 1 + k_T.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -117,20 +115,11 @@ class GearedArm(NamedTuple):
         def feedback(rate: float) -> Feedback:
             return linear(gains(rate), self.inertia, len(self.links))
 
-        return gains(self._stiffest(feedback, _SLOWEST, _FASTEST))
-
-    def stiffness(self, feedback: Callable[[float], Feedback]) -> float:
-        """Return the largest `feedback.stiffness` with the margin, of laws by stiffness."""
-        return self._stiffest(feedback, _SLOWEST / _FASTEST, 1.0)
-
-    def _stiffest(
-        self, feedback: Callable[[float], Feedback], low: float, high: float
-    ) -> float:
-        """Return the largest number between two whose law has the margin, else the lower."""
+        low, high = _SLOWEST, _FASTEST
         for _ in range(_BISECTIONS):
             middle = math.sqrt(low * high)
             if self.margin(feedback(middle)).value >= MARGIN:
                 low = middle
             else:
                 high = middle
-        return low
+        return gains(low)

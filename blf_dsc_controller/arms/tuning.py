@@ -29,13 +29,12 @@ import numpy as np
 from blf_dsc_controller.arms.base_parameters import BaseParameters, prior_factor
 from blf_dsc_controller.arms.joint_gains import (
     BESIDE,
-    SURFACE,
     JointGains,
     barriers,
     funnel_rate,
 )
 from blf_dsc_controller.arms.known_gears import GearedArm, Gears
-from blf_dsc_controller.arms.linear_loop import Feedback, Timing
+from blf_dsc_controller.arms.linear_loop import Timing
 from blf_dsc_controller.arms.model import free_inertias, inertia_matrices, regressors_at
 from blf_dsc_controller.arms.urdf import Chain
 
@@ -272,23 +271,6 @@ def _learning_of(arm: Design) -> dict[str, Value]:
     }
 
 
-def through_inertia(M0: np.ndarray, rate: float) -> Feedback:
-    """Return the law at small errors whose whole feedback acts through M0 (k, n, n) [kg m^2].
-
-    `rate` is omega_b [1/s].
-    """
-    n = M0.shape[-1]
-    return Feedback(
-        position=M0 * (_BARRIER * rate**2),
-        surface=M0 * (_DAMPING * rate),
-        inertia=M0,
-        integral=M0 * (_INTEGRAL * rate**2),
-        rate=np.full(n, (_SURFACE[0] / 2.0 + _SURFACE[1]) * rate),
-        time_constant=SURFACE,
-        known_rate=True,
-    )
-
-
 def geared_arm(arm: Design, gears: Gears) -> GearedArm:
     """Return an arm with its gears, in a few postures, without and with its payload."""
     none = np.zeros(len(arm.rotors))
@@ -302,23 +284,6 @@ def geared_arm(arm: Design, gears: Gears) -> GearedArm:
     return GearedArm(
         np.concatenate(links), gears, Timing(arm.sample_time, 1, half, half)
     )
-
-
-def with_known_gears(arm: Design, gears: Gears) -> Design:
-    """Return the arm with the stiffest gains that its gears bear (`known_gears`).
-
-    They are those of joints if `arm.joints` is given, else those through the inertia.
-    """
-    known = geared_arm(arm, gears)
-    if arm.joints is not None:
-        return arm._replace(joints=known.joint_gains())
-    fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
-    M0 = known.links + np.diag(arm.rotors)
-
-    def feedback(stiffness: float) -> Feedback:
-        return through_inertia(M0, stiffness * fastest)
-
-    return arm._replace(stiffness=float(f'{known.stiffness(feedback):.3g}'))
 
 
 class Postures(NamedTuple):

@@ -55,9 +55,9 @@ def used_design(
     """Return what the gains follow from: as given, by known gears, or of an unknown arm."""
     arm, gears = stated_design(given, robot, chain, base)
     chosen = _given_gains(given, len(chain.joints)) is not None
-    if arm.joints is None:
-        chosen = 'feedback.stiffness' in given
-    return arm if chosen or gears is None else tuning.with_known_gears(arm, gears)
+    if chosen or gears is None or arm.joints is None:
+        return arm
+    return arm._replace(joints=tuning.geared_arm(arm, gears).joint_gains())
 
 
 def stated_design(
@@ -70,7 +70,7 @@ def stated_design(
     motors = robot.rotors(chain)
     gears = _gears(robot, chain, motors)
     is_own = given.get('law', OWN) in (OWN, PAPER)
-    usual = 'whole' if not is_own or (gears and gears.has_torque_loop) else 'none'
+    usual = 'none' if is_own else 'whole'
     is_whole = given.get('feedback.inertia', usual) != 'none'
     gains = _given_gains(given, len(motors)) or unknown_arm(motors)
     share = largest_share(has_torque_loop=robot.torque_loop)
