@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -568,23 +568,25 @@ FAULTS = (
 )
 
 
-def rows() -> Iterator[str]:
-    """Yield the rows of the table, as measured."""
+RULE = '| --- | --- | --- |\n'
+
+
+def measured() -> str:
+    """Return the rows of the faults that stop the loop, and the list of the others."""
+    stops, tolerated = [], []
     for fault in FAULTS:
         outcome = run(fault)
-        stopped = outcome.noticed >= 0
-        noticed = f'{outcome.noticed}' if stopped else 'tolerated'
-        largest = f'{np.abs(outcome.after).max():.3g}' if len(outcome.after) else 'none'
-        yield f'| {fault.name} | {noticed} | {outcome.reason} | {largest} |\n'
-
-
-RULE = '| --- | --- | --- | --- |\n'
+        if outcome.noticed < 0:
+            tolerated.append(f'- {fault.name}\n')
+        else:
+            stops.append(f'| {fault.name} | {outcome.noticed} | {outcome.reason} |\n')
+    return ''.join([*stops, '\nTolerated:\n\n', *tolerated])
 
 
 def page(text: str) -> str:
-    """Return the text of the page with the table as measured."""
+    """Return the text of the page with the outcomes as measured."""
     head, _, rest = text.partition(RULE)
-    return head + RULE + ''.join(rows()) + rest[rest.index('\n\n') + 1 :]
+    return head + RULE + measured() + rest[rest.index('\n## ') :]
 
 
 if __name__ == '__main__':
