@@ -2,7 +2,7 @@
 """The law of an arm from a URDF in plain numpy: the tests' oracle.
 
 It is written from doc/theory.md, learning.md and stability.md, and from the docstrings that they
-name.  The regressors are pinocchio's.  Change detection and light drives are off.
+name.  The regressors are pinocchio's.  Change detection is off.
 """
 
 from __future__ import annotations

@@ -85,4 +85,6 @@ def test_simulated_arm_tells_its_limit_cycle_after_its_errors(capsys, monkeypatc
     commission._prove(None)
     first, second = capsys.readouterr().out.splitlines()
     assert 'follows its own motion for 4 s' in first
-    assert second.startswith('wrist shakes by 2.9 mrad at 6.3 Hz in motion: friction')
+    assert second.startswith(
+        'wrist oscillates by 2.9 mrad at 6.3 Hz in motion: friction'
+    )

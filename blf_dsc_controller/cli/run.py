@@ -52,7 +52,7 @@ def run(options: Namespace) -> int:
     refuse_existing(options.out)  # before warnings, and what takes seconds
     if options.offline and options.mode == 'realtime':
         raise BlfDscError(
-            '--mode realtime needs ROS: leave out --offline, which simulates as fast as it goes'
+            '--mode realtime needs ROS: leave out --offline, which does not wait for the clock'
         )
     with announced_compilation(print_notice):
         config = loop_configuration(options)
@@ -111,7 +111,11 @@ def _begun(plant: PlantConfig, *, offline: bool) -> str:
     if offline:
         return f'simulating {plant.duration:g} s, at some ten times real time'
     length = f'{plant.duration:g} s' if plant.duration else 'until Ctrl-C'
-    clock = 'as fast as it goes' if plant.mode == 'lockstep' else 'by the wall clock'
+    clock = (
+        'without waiting for the clock'
+        if plant.mode == 'lockstep'
+        else 'by the wall clock'
+    )
     return f'starting the nodes, some seconds; then they run {length}, {clock}'
 
 
@@ -147,8 +151,8 @@ def _show_expectations(given: str, config: LoopConfig) -> None:
         print_notice(f'warning: {ignored}')
     if load(path, DRIVE, DriveConfig).feedback == 'motor':
         raise BlfDscError(
-            'drive.feedback is motor, and over a bus, which this simulates, its gains may shake '
-            f'the arm: blf_dsc drive --robot simulated --config {given} simulates the motors'
+            'drive.feedback is motor, and over a bus, which this simulates, its gains may make '
+            f'the arm oscillate: blf_dsc drive --robot simulated --config {given} simulates the motors'
         )
     controller = config.controller
     if turned := _turned_reference(config):

@@ -145,13 +145,13 @@ def _of_margin(found: Commissioned) -> Iterator[str]:
     if choice.by_inertia.any():
         names = ', '.join(np.array(found.joints)[choice.by_inertia])
         yield (
-            f'{names}: limited by inertia; with these delays a rigid joint bears no more'
+            f'{names}: limited by inertia; with these delays a rigid joint is not stable with more'
         )
     doubt = _doubt_at(found)
     if doubt > LITTLE:
         yield (
             f'noise costs {doubt:.2g} of the margin: a larger --torque may show that the arm '
-            'bears more'
+            'is stable with more'
         )
 
 
@@ -187,14 +187,16 @@ def _of_observer(found: Commissioned) -> Iterator[str]:
     if pole == 0.0:
         slowest = f'the slowest pole, {POLES[0]:g} rad/s'
         yield 'NO LOAD OBSERVER: ' + (
-            f'noise, friction or play hide whether {slowest}, is borne'
+            f'noise, friction or backlash hide whether the arm is stable with {slowest}'
             if noise_hides
             else f'with {slowest}, it would leave a modulus margin of {limit.value:.2g} {where}, '
             'or too little for a load'
         )
         return
     if noise_hides:
-        limited = 'noise, friction or play hide whether a faster one is borne'
+        limited = (
+            'noise, friction or backlash hide whether it is stable with a faster one'
+        )
     elif pole == POLES[-1]:
         limited = 'a faster one gains little'
     else:
@@ -257,7 +259,7 @@ def _of_friction(found: Commissioned, *, is_simulated: bool) -> Iterator[str]:
     if rubbing.any():
         remedy = '' if is_simulated else ', so prove the gains (--prove)'
         yield (
-            f'friction damps {", ".join(names[rubbing])} more than the gains do while shaken, and '
+            f'friction damps {", ".join(names[rubbing])} more than the gains do while excited, and '
             f'less in a steady motion: the true margin is smaller{remedy}'
         )
     if found.coulomb is not None:
@@ -330,7 +332,7 @@ def _wider(found: Commissioned) -> dict[str, list[str]]:
 def of_limit_cycle(cycle: LimitCycle) -> str:
     """Return in a sentence how a joint shakes, and what to do."""
     return (
-        f'{cycle.joint} shakes by {1e3 * cycle.amplitude:.2g} m{cycle.unit} at '
+        f'{cycle.joint} oscillates by {1e3 * cycle.amplitude:.2g} m{cycle.unit} at '
         f'{two_digits(cycle.frequency)} Hz {cycle.when}: friction makes it stick and slip, '
         'which no check stops. More feedback.joint_damping of this joint makes it smaller, at '
         'the cost of the margin; softer gains make it larger'

@@ -157,7 +157,7 @@ class Feedback:
     )
     joint_stiffness: PerJoint = _from_urdf(
         'with inertia none: stiffness of each joint, from which gains follow; empty: '
-        'what arms with elastic joints bear of which nothing is known',
+        'gains with which nearly any arm with elastic joints is stable',
         'N m/rad',
     )
     joint_damping: PerJoint = _from_urdf(
@@ -171,7 +171,7 @@ class Feedback:
     )
     joint_damping_lag: PerJoint = non_negative(
         (),
-        'lag of the damping of each joint; empty: none. A few ms where gears give way and '
+        'lag of the damping of each joint; empty: none. A few ms where joints are elastic and '
         'encoders are at the links',
         's',
         read_only='it sets the size of the state of the law',

@@ -333,7 +333,7 @@ OF_PLANT = (
         'actuator.time_constant',
         's',
         lambda config: (config.actuator.time_constant, LONGEST_LAG),
-        'no loop bears more than',
+        'no loop is stable with more than',
         'ms',
         applies=lambda _: True,
     ),

@@ -339,22 +339,20 @@ def transfer_friction(settings: Settings, state: State, signals: Signals) -> Non
 def follow_disturbance(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Advance d^3 by `dt` [s]: (30), with gamma M(q, P^(0)) / m where the feedback acts through it."""
+    """Advance d^3 by `dt` [s]: (30), with gamma M(q, P^(0)) / m if the feedback acts through it."""
     work = signals.scratch.disturbance
     disturbance.fill_step(
         settings.disturbance, work, state.disturbance, signals.xi2, dt
     )
     if settings.feedback.follows_inertia == 1:
-        scale_by_inertia(settings, state, signals, work.step)
+        scale_by_inertia(settings, signals, work.step)
     for i in range(settings.n):
         state.disturbance[i] -= work.step[i]
         friction.follow_observer(state.friction, signals.friction, i, -work.step[i])
 
 
 @inner
-def scale_by_inertia(
-    settings: Settings, state: State, signals: Signals, x: Array
-) -> None:
+def scale_by_inertia(settings: Settings, signals: Signals, x: Array) -> None:
     """Replace x (n,) by M(q, P^(0)) x / m."""
     momentum = signals.scratch.momentum
     for i in range(settings.n):

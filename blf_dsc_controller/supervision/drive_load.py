@@ -81,7 +81,7 @@ class DriveLoads:
         if self._robot.drive_compensates == 'none':
             raise BlfDscError(
                 'robot.drive_compensates: got none: these drives add no weight, so no load '
-                'can be declared to them; the law weighs and carries it by itself'
+                'can be declared to them; the law estimates and carries it by itself'
             )
         self._is_used = True
 

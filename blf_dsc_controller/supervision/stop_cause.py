@@ -92,7 +92,7 @@ class StopCause:
         if self._controller.signals.saturation.cuts[i] >= RATE_CUT:
             return (
                 f'{demands}, and torque.rate_limit delays what it gets: raise it to what the drive '
-                'bears, or lower the gains'
+                'tolerates, or lower the gains'
             )
         remedies = 'follow a slower reference, carry less, or give the true limit as torque.limit'
         if self._controller.checks.effect.compares[0] == 0.0:  # no effort shows it

@@ -53,7 +53,7 @@ def _width(case: Case) -> Iterator[str]:
                 f'{config.joints[j]} is expected to be up to {needed[j]:.2g} '
                 f'{config.units[j].position} from its '
                 'reference with these gains. Give less robot.payload, if the arm carries less, or '
-                'stiffer gains, if it bears them; then narrow the bound'
+                'stiffer gains, if it is stable with them; then narrow the bound'
             )
     yield f'{name}: {wide} bounds nothing: {remedy}'
 
@@ -75,9 +75,7 @@ def _of_unmodelled(case: Case) -> Iterator[str]:
     units = config.units[worst]
     unit = units.position
     parameter = 'barrier.bound'
-    remedy = (
-        f'{_wide_enough(errors[worst], units)} stiffer gains, if the arm bears them'
-    )
+    remedy = f'{_wide_enough(errors[worst], units)} stiffer gains, if the arm is stable with them'
     if of_tool := _tool_parameter(config):
         parameter = of_tool
         wider = float(errors[worst] / bound[worst])
@@ -149,7 +147,7 @@ def _remedy_of_pick_up(config: ControllerConfig, share: float) -> str:
     """Return the change that reduces the error of a pick-up to this share of it."""
     lag = config.robot.lag
     if config.feedback.inertia == 'none':
-        return 'a larger feedback.stiffness, if the arm bears it'
+        return 'a larger feedback.stiffness, if the arm is stable with it'
     stiffer = config.feedback.stiffness / share**_STIFFENING
     if stiffer <= 1.0:
         return f'a feedback.stiffness of {math.ceil(100.0 * stiffer) / 100.0:g}'

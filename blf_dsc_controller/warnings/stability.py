@@ -110,7 +110,7 @@ def _advice(case: Case) -> str:
     arm = case.arm
     gains = arm.joint_gains()
     if arm.margin(linear(gains, arm.inertia, len(arm.links))).value < MARGIN:
-        return '. Lower it, or measure what the arm bears: `blf_dsc commission`'
+        return '. Lower it, or measure its stability limit: `blf_dsc commission`'
     stiffness, damping = (
         [float(f'{each:.2g}') for each in values]
         for values in (gains.stiffness, gains.damping)
@@ -119,7 +119,7 @@ def _advice(case: Case) -> str:
     if any(case.config.feedback.joint_damping_lag):
         without = ', without feedback.joint_damping_lag'
     return (
-        f'. It bears feedback.joint_stiffness: {stiffness} and feedback.joint_damping: '
+        f'. It is stable with feedback.joint_stiffness: {stiffness} and feedback.joint_damping: '
         f'{damping}{without}'
     )
 
@@ -159,7 +159,9 @@ def _unmeasured(case: Case) -> Iterator[str]:
     is_unknown = not (feedback.joint_stiffness or config.robot.joint_stiffness)
     if feedback.inertia == 'none' and is_unknown:
         return
-    unmeasured = 'commissioning: nobody has measured whether this arm bears its gains'
+    unmeasured = (
+        'commissioning: nobody has measured whether this arm is stable with its gains'
+    )
     if case.in_motors:
         yield (
             f'{unmeasured}, which its motors close, and `blf_dsc commission` measures torques over '
