@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Design rules for joints whose gears give way: each has a stiffness and a damping of its own.
+"""Design rules for elastic joints: each has a stiffness and a damping of its own.
 
 A geared joint is a motor behind a spring.  Beyond the resonance of both, a torque moves
 the motor alone, so feedback through the inertia matrix of the links is too high there by

@@ -152,7 +152,8 @@ def _show_expectations(given: str, config: LoopConfig) -> None:
     if load(path, DRIVE, DriveConfig).feedback == 'motor':
         raise BlfDscError(
             'drive.feedback is motor, and over a bus, which this simulates, its gains may make '
-            f'the arm oscillate: blf_dsc drive --robot simulated --config {given} simulates the motors'
+            'the arm oscillate: '
+            f'blf_dsc drive --robot simulated --config {given} simulates the motors'
         )
     controller = config.controller
     if turned := _turned_reference(config):

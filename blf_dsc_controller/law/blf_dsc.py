@@ -13,7 +13,7 @@ Where it departs from the paper, and why:
 - tau_m, the torque of the model, is in `compensation`: what is learned acts along the reference.
 - The barrier's torque -dV/dxi1 continues past a stiffness that a sampled loop can hold: `barrier`.
 - A bound that narrows adds xi1 k'/k to the virtual control: `barrier`.
-- K_p xi2 may lag, where gears give way: `feedback`.
+- K_p xi2 may lag, where joints are elastic: `feedback`.
 - f, zero in the paper, is what is known of beta2' if `known_rate` of `surface.Settings` is 1.
 - beta2 is held for a sample, in which alpha2' decays from (beta2 - alpha2) / lambda by the factor
   exp(-dt / lambda).  The torque is held too, so it uses the mean of alpha2': with lambda = 2 dt the
