@@ -309,6 +309,7 @@ def _excitation(config: ControllerConfig) -> excitation.Settings:
 
     The first must be full (27), unless its rows are compared with a prior from the start.
     Rows that are not exact contradict each other on any arm, which is not taken for a change.
+    With feedback through the inertia matrix it must be, too.
     """
     least = _least_floor(config)
     is_urdf = config.model == 'urdf'
