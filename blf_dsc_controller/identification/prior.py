@@ -31,7 +31,6 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.physical import Cone
 from blf_dsc_controller.identification.values import (
     COULOMB,
-    COUPLING,
     JOINT_TERMS,
     LOAD,
     LOAD_FRICTION,
@@ -42,8 +41,10 @@ from blf_dsc_controller.identification.values import (
     ROTOR_INERTIA,
     STRIBECK,
     VISCOUS,
+    Parts,
     base_matrix,
     indices,
+    parts,
 )
 from blf_dsc_controller.run import Floats
 
@@ -78,21 +79,20 @@ class Prior(NamedTuple):
         return np.vstack((columns, np.eye(1, self.mean.size + 1, self.mean.size)))
 
     @property
-    def joints(self) -> int:
-        """Number of joints."""
-        return (self.mean.size - COUPLING - LOAD - 1) // (10 + len(JOINT_TERMS))
+    def at(self) -> Parts:
+        """Indices of the parts of the values, and of z."""
+        return parts(np.arange(self.mean.size))
 
     @property
     def optional(self) -> list[Entry]:
         """Entries of z that are in the model together or not at all: friction, the coupling."""
-        at = indices(self.joints)
-        friction = at.terms[list(OPTIONAL)].ravel().tolist()
-        return [*((k,) for k in friction), tuple(at.coupling.tolist())]
+        friction = self.at.terms[list(OPTIONAL)].ravel().tolist()
+        return [*((k,) for k in friction), tuple(self.at.coupling.tolist())]
 
     @property
     def groups(self) -> dict[str, Entry]:
         """Entries of z whose width is one guess, by name."""
-        at = indices(self.joints)
+        at = self.at
         friction = at.terms[[VISCOUS, COULOMB]]
         return {
             'bodies': tuple(at.bodies.ravel().tolist()),

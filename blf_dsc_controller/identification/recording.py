@@ -68,25 +68,24 @@ def resampled(
     groups = [q, torque] if motors is None else [q, torque, motors]
     order = _order(stamp, groups)
     if not np.array_equal(order, np.arange(stamp.size)):
-        stamp, q, torque = stamp[order], q[order], torque[order]
-        motors = None if motors is None else motors[order]
+        stamp = stamp[order]
+        groups = [each[order] for each in groups]
+    q, torque, *others = groups
     grid = _grid_of(stamp)
     turns = _turns(q, turning)
     if turns.any():
         q = q + TURN * turns
         names = ', '.join(np.array(joints)[turns.any(axis=0)])
         source = f'{source} (positions of {names} are wrapped: full turns added)'
-    recording = Recording(
+    return Recording(
         joints=joints,
         period=grid.period,
         q=grid.evenly(q),
         torque=grid.evenly(torque),
         gap=grid.gap,
         source=source,
+        twist=grid.evenly(_twist(q, others[0], turning)) if others else None,
     )
-    if motors is None:
-        return recording
-    return recording._replace(twist=grid.evenly(_twist(q, motors, turning)))
 
 
 def _order(stamp: Stamps, groups: Sequence[Floats]) -> Indices:
