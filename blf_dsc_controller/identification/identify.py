@@ -27,10 +27,10 @@ from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alon
 from blf_dsc_controller.identification.plausibility import outside_range, shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
 from blf_dsc_controller.identification.problems import (
+    convention_problem,
     is_usable,
-    of_convention,
-    of_load,
-    of_mounting,
+    load_problem,
+    mounting_problem,
     unexplained_joints,
 )
 from blf_dsc_controller.identification.recording import Recording
@@ -110,7 +110,7 @@ def identify_arm(
         mounted = trained(robot=replace(robot, gravity=tuple(gravity.tolist())))
         if _left(mounted.score) < _BETTER * _left(explained):
             found = found._replace(
-                other=of_mounting(gravity),
+                other=mounting_problem(gravity),
                 reversed=_named(recording.joints, mounted.problem.reversed),
             )
             explained = mounted.score
@@ -131,7 +131,7 @@ def identify_arm(
     )
     if better is None:
         return found
-    return found._replace(other=of_convention(found.joints, found.score, *better))
+    return found._replace(other=convention_problem(found.joints, found.score, *better))
 
 
 def find_ripples(
@@ -169,7 +169,7 @@ def _better_load(score: Score, trained: _Trained) -> str:
     mass, deviation = (float(each[0]) for each in changing.load)
     if mass < _SHOWN * deviation or not is_usable(changing):
         return ''
-    return of_load(score, carried, mass, error)
+    return load_problem(score, carried, mass, error)
 
 
 def _better_convention(

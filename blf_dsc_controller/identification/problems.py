@@ -68,7 +68,7 @@ def verdict_of(found: Identified, effort: str) -> str:
     )
 
 
-def of_mounting(gravity: Floats) -> str:
+def mounting_problem(gravity: Floats) -> str:
     """Return which gravity (3,) [m/s^2] in the base would explain the torques."""
     words = ' '.join(f'{value:.3g}' for value in gravity)
     return (
@@ -77,7 +77,7 @@ def of_mounting(gravity: Floats) -> str:
     )
 
 
-def of_load(score: Score, carried: Carried, mass: float, error: float) -> str:
+def load_problem(score: Score, carried: Carried, mass: float, error: float) -> str:
     """Return which load [kg], carried for a part of the recording, would explain the torques.
 
     `score` is that without, and `error` that of the torques held back with it [% of their rms].
@@ -89,7 +89,7 @@ def of_load(score: Score, carried: Carried, mass: float, error: float) -> str:
     )
 
 
-def of_convention(
+def convention_problem(
     joints: Sequence[str], score: Score, convention: Convention, better: Score
 ) -> str:
     """Return which zeros and directions of joints would explain the torques `better`."""
