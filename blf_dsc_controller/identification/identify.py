@@ -21,6 +21,7 @@ from blf_dsc_controller.identification.conventions import (
     Convention,
     converted,
     likely_conventions,
+    simpler,
 )
 from blf_dsc_controller.identification.identified import Identified, Score
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
@@ -197,11 +198,11 @@ def _simplest(
 ) -> tuple[Convention, Score]:
     """Return the convention without signs and offsets that are not needed, and its score."""
     most = _AS_GOOD * _left(score)
-    for i in convention.unlike:
-        for simpler in convention.simpler(i):
-            other = trained_as(simpler)
-            if _left(other.score) < most:
-                convention, score = simpler, other.score
+    for i in range(len(convention)):
+        for other in simpler(convention, i):
+            trained = trained_as(other)
+            if _left(trained.score) < most:
+                convention, score = other, trained.score
                 break
     return convention, score
 

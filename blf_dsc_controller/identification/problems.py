@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from blf_dsc_controller.identification.conventions import Convention
+from blf_dsc_controller.identification.conventions import Convention, signs_and_offsets
 from blf_dsc_controller.identification.identified import IDLE, Identified, Score
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
 from blf_dsc_controller.identification.recording import Indices
@@ -93,7 +93,7 @@ def convention_problem(
     joints: Sequence[str], score: Score, convention: Convention, better: Score
 ) -> str:
     """Return which zeros and directions of joints would explain the torques `better`."""
-    signs, offsets = convention
+    signs, offsets = signs_and_offsets(convention)
     steps, differ = [], []
     if (signs < 0.0).any():
         names = ', '.join(np.array(joints)[signs < 0.0])
