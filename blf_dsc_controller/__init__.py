@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from blf_dsc_controller.analysis.figures import draw as draw
     from blf_dsc_controller.analysis.metrics import measure as measure
-    from blf_dsc_controller.bags.reader import read_run as read_run
+    from blf_dsc_controller.analysis.recorded import read_run as read_run
     from blf_dsc_controller.bags.sources import BagError as BagError
     from blf_dsc_controller.commissioning.commissioning import (
         Commissioning as Commissioning,
@@ -78,7 +78,7 @@ _PUBLIC = {
     'NotInTimeError': 'errors',
     'Phase': 'supervision.supervisor',
     'PlantConfig': 'configuration.plant',
-    'read_run': 'bags.reader',
+    'read_run': 'analysis.recorded',
     'Run': 'run',
     'run_chunk': 'studies.runs',
     'share_folder': 'configuration.files',

@@ -22,9 +22,9 @@ from blf_dsc_controller.analysis.event_times import change_times, latch_time, ou
 from blf_dsc_controller.analysis.metrics import measure
 from blf_dsc_controller.analysis.metrics_table import rows, sentences
 from blf_dsc_controller.analysis.panels import COLOURS, INK, PIECES, Panel, panels
+from blf_dsc_controller.analysis.recorded import recorded_run
 from blf_dsc_controller.analysis.verdict import figures_of, verdict_of
 from blf_dsc_controller.bags.content import NO_NAMES, Content, NameMap, read_content
-from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.messages.codecs import typestore
 from blf_dsc_controller.messages.topics import DIAGNOSTICS

@@ -34,7 +34,6 @@ METADATA = 'metadata.yaml'
 _ROS1 = '.bag'
 FILES = {'.mcap', '.db3', '.bag'}
 """Suffixes of the files of a bag."""
-_TABLES = {'.csv', '.tsv', '.txt', '.npz', '.mat', '.parquet', '.feather'}
 NOTHING_RECORDED = (
     'it is empty: nothing was recorded, as on a full disk: give another bag'
 )
@@ -245,9 +244,11 @@ def _no_room(error: Exception) -> str:
 
 
 def _reason(path: Path, error: Exception) -> str:
+    from blf_dsc_controller.tables.table_files import TABLES  # a recorder needs none
+
     if not path.exists():
         return f'there is none{near(path)}'
-    if path.suffix in _TABLES:
+    if path.suffix in TABLES:
         return 'it is a table, which only blf_dsc identify reads: give a bag'
     files = sorted(path.glob('*.mcap')) if path.is_dir() else [path]
     is_mcap = bool(files) and files[0].suffix == '.mcap'

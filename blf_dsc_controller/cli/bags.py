@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from blf_dsc_controller.bags import reader, recovery, table
+from blf_dsc_controller.analysis.recorded import recorded_run
+from blf_dsc_controller.bags import recovery, table
 from blf_dsc_controller.bags.content import NameMap, read_content
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.errors import BlfDscError
@@ -70,7 +71,7 @@ def _draw(options: Namespace) -> None:
 def _run(options: Namespace, bag: Path) -> Run:
     """Read the run of a bag, and print what is left out."""
     names = NameMap.parse(options.map)
-    run = reader.recorded_run(read_content(bag, options.namespace, names))
+    run = recorded_run(read_content(bag, options.namespace, names))
     for note in run.notes:
         print(f'note: {note}')
     return run

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from blf_dsc_controller.analysis.recorded import recorded_run
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.cli.domains import check_network
 from blf_dsc_controller.cli.result_folder import BAG, make_folder, refuse_existing
 from blf_dsc_controller.cli.start import INTERRUPTED

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.analysis.recorded import recorded_run
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.bags.reader import recorded_run
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.run import Run

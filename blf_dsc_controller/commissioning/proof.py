@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.reader import read_run
+from blf_dsc_controller.analysis.recorded import read_run
 from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
 from blf_dsc_controller.commissioning.limit_cycle import (
     IN_MOTION,

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from blf_dsc_controller.arms.urdf import Chain, frames
 
 _LEAST = 1e-6  # m, length of a line; shorter ones are points of the next line
+_ORIGIN = np.array((0.0, 0.0, 0.0, 1.0))
 _CARRIED = 2  # joints, counted from the base, that may be near the floor
 
 
@@ -28,29 +27,22 @@ class Clearance:
         self._chain = chain
         self._radius = radius
         self._floor = floor
-        centres = [joint.inertia[:4] / joint.inertia[0] for joint in chain.joints]
-        self._centres = [np.append(centre[1:], 1.0) for centre in centres]
-        self._aside = [False] * len(centres)
-        origins = self.corners(np.zeros(len(centres)))
-        self._aside = self._centres_aside(origins)
+        # corners of the lines: a frame (base, joints, tip), and a place in it
+        self._points = [(k, _ORIGIN) for k in range(len(chain.joints) + 2)]
+        posture = np.zeros(len(chain.joints))
+        placements = frames(chain, posture)
+        origins = self.corners(posture)
+        for k, joint in reversed([*enumerate(chain.joints, 1)]):
+            place = np.append(joint.inertia[1:4] / joint.inertia[0], 1.0)
+            centre = (placements[k] @ place)[:3]
+            if distance(centre, centre, origins[k], origins[k + 1]) > radius:
+                self._points.insert(k + 1, (k, place))
         pairs = self._pairs(origins)
         self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
 
-    def _centres_aside(self, origins: np.ndarray) -> list[bool]:
-        """Return which links have a centre of mass off their line, between these origins."""
-        placements = frames(self._chain, np.zeros(len(self._centres)))[1:]
-        aside = []
-        for i, (begin, end) in enumerate(pairwise(origins[1:])):
-            centre = (placements[i] @ self._centres[i])[:3]
-            off = distance(centre, centre, begin, end)
-            aside.append(bool(off > self._radius))
-        return aside
-
     def _pairs(self, origins: np.ndarray) -> list[tuple[int, int]]:
         """Return the pairs of lines to check, of links whose joints have these origins."""
-        links = [0]  # of each line
-        for i, aside in enumerate(self._aside, 1):
-            links += [i] * (1 + aside)
+        links = [k for k, _ in self._points[:-1]]  # of each line
         length = np.linalg.norm(np.diff(origins, axis=0), axis=1)
         end = np.cumsum(length)
         begin = end - length
@@ -65,14 +57,8 @@ class Clearance:
     def corners(self, q: np.ndarray) -> np.ndarray:
         """Return base, joints, centres of mass aside, and tip (..., k, 3) [m], at q (..., n)."""
         placements = frames(self._chain, q)
-        corners = [placements[0][..., :3, 3]]
-        for placement, centre, aside in zip(
-            placements[1:], self._centres, self._aside, strict=False
-        ):
-            corners.append(placement[..., :3, 3])
-            if aside:
-                corners.append((placement @ centre)[..., :3])
-        return np.stack([*corners, placements[-1][..., :3, 3]], axis=-2)
+        corners = [placements[k] @ place for k, place in self._points]
+        return np.stack(corners, axis=-2)[..., :3]
 
     def room(self, q: np.ndarray) -> np.ndarray:
         """Return the room (..., k) of the pairs of links, then of the corners above the floor.
@@ -87,9 +73,8 @@ class Clearance:
         apart = distance(
             begin[..., a, :], end[..., a, :], begin[..., b, :], end[..., b, :]
         )
-        above = (
-            corners[..., 1 + _CARRIED + sum(self._aside[:_CARRIED]) :, 2] - self._floor
-        )
+        beyond = [k > _CARRIED for k, _ in self._points]
+        above = corners[..., beyond, 2] - self._floor
         room = (apart / (2.0 * self._radius), above / self._radius)
         return np.concatenate(room, axis=-1) - 1.0
 

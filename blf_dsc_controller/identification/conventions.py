@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import chain, combinations, islice, permutations, product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.mounting import gravity_columns
-from blf_dsc_controller.identification.recording import TURN, Indices, Recording
+from blf_dsc_controller.identification.recording import TURN, Recording
 from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.run import Floats
 
@@ -36,38 +35,32 @@ _BETTER = 0.9  # times the cost, at most, of ways that are fitted: masses may be
 _DIGITS = 6  # of a cost that are compared
 _CANDIDATES = 2  # that are fitted, of all joints and of unexplained ones each
 
-_Way = tuple[
-    int, int
-]  # sign and quarter turns: a joint of the URDF is at sign q + turns
-_Ways = tuple[_Way, ...]
-_AS_IS: _Way = (1, 0)
+Way = tuple[int, int]
+"""Sign and quarter turns: a joint of the URDF is at sign q + turns; (1, 0): as recorded."""
+
+Convention = tuple[Way, ...]
+"""How each joint counts."""
+
+_AS_IS: Way = (1, 0)
 
 
-class Convention(NamedTuple):
-    """How n joints count: those of the URDF are at signs q + offsets."""
+def signs_and_offsets(convention: Convention) -> tuple[Floats, Floats]:
+    """Return the signs of positions and efforts, and what is added to the former [rad] (n,)."""
+    signs, quarters = np.array(convention, dtype=float).T
+    return signs, 0.25 * TURN * quarters
 
-    signs: Floats  # (n,) 1 or -1, of positions and efforts
-    offsets: Floats  # (n,) rad
 
-    @property
-    def unlike(self) -> Indices:
-        """Numbers of the joints that count otherwise than the URDF."""
-        return np.flatnonzero((self.signs < 0.0) | (self.offsets != 0.0))
-
-    def simpler(self, i: int) -> Iterator[Convention]:
-        """Yield other ways of convention, in which joint i is as in the URDF, or has its zero."""
-        for sign in dict.fromkeys((1.0, float(self.signs[i]))):
-            signs, offsets = self.signs.copy(), self.offsets.copy()
-            signs[i], offsets[i] = sign, 0.0
-            simpler = Convention(signs, offsets)
-            is_other = sign != self.signs[i] or self.offsets[i] != 0.0
-            if is_other and simpler.unlike.size:
-                yield simpler
+def simpler(convention: Convention, i: int) -> Iterator[Convention]:
+    """Yield others, in which joint i is as in the URDF, or has its zero, but not all joints."""
+    for way in dict.fromkeys((_AS_IS, (convention[i][0], 0))):
+        other = _with(convention, i, way)
+        if other != convention and {*other} != {_AS_IS}:
+            yield other
 
 
 def converted(recording: Recording, convention: Convention) -> Recording:
     """Return the recording as if it had been counted as the URDF does."""
-    signs, offsets = convention
+    signs, offsets = signs_and_offsets(convention)
     twist = recording.twist
     return recording._replace(
         q=signs * recording.q + offsets,
@@ -98,15 +91,10 @@ def likely_conventions(
         gravity.turned(gravity.as_is, i) for i in unexplained if i in gravity.turning
     )
     ways = chain(islice(likely, _CANDIDATES), islice(turned, _CANDIDATES))
-    return [_convention(each) for each in dict.fromkeys(ways)]
+    return list(dict.fromkeys(ways))
 
 
-def _convention(ways: _Ways) -> Convention:
-    signs, quarters = np.array(ways, dtype=float).T
-    return Convention(signs, 0.25 * TURN * quarters)
-
-
-def _with(ways: _Ways, i: int, way: _Way) -> _Ways:
+def _with(ways: Convention, i: int, way: Way) -> Convention:
     return (*ways[:i], way, *ways[i + 1 :])
 
 
@@ -118,7 +106,7 @@ class _Gravity:
     ) -> None:
         """Take friction (k, c, n): c columns of each joint, which explain what they can."""
         self._chain = chain
-        self.as_is: _Ways = (_AS_IS,) * q.shape[1]
+        self.as_is: Convention = (_AS_IS,) * q.shape[1]
         kinds = [joint.kind for joint in chain.joints]
         self.turning = [i for i, kind in enumerate(kinds) if kind != 'prismatic']
         self._g = g
@@ -128,12 +116,12 @@ class _Gravity:
         joints = range(q.shape[1])
         self._bases = [np.linalg.qr(friction[:, :, i])[0] for i in joints]
         self._scale = np.maximum(np.linalg.norm(u, axis=0), 1e-9)
-        self._known: dict[_Ways, float] = {}
+        self._known: dict[Convention, float] = {}
 
-    def cost(self, ways: _Ways) -> float:
+    def cost(self, ways: Convention) -> float:
         """Return the squares that remain if joints count in other ways."""
         if ways not in self._known:
-            signs, offsets = _convention(ways)
+            signs, offsets = signs_and_offsets(ways)
             weight = gravity_columns(self._chain, signs * self._q + offsets) @ self._g
             left = (self._u - signs * weight) / self._scale
             explained = [Q.T @ own for Q, own in zip(self._bases, left.T, strict=True)]
@@ -142,21 +130,20 @@ class _Gravity:
             )
         return self._known[ways]
 
-    def turned(self, ways: _Ways, i: int) -> _Ways:
+    def turned(self, ways: Convention, i: int) -> Convention:
         """Return the best ways in which joint i counts in the other direction."""
         sign = -ways[i][0]
         return min((_with(ways, i, (sign, k)) for k in _QUARTERS), key=self.cost)
 
-    def better(self, ways: _Ways, other: _Ways) -> _Ways:
+    def better(self, ways: Convention, other: Convention) -> Convention:
         """Return the other ways if they are clearly better."""
         return other if self.cost(other) < _CLEAR * self.cost(ways) else ways
 
-    def simplest(self, ways: _Ways) -> _Ways:
+    def simplest(self, ways: Convention) -> Convention:
         """Return the ways without what hardly matters: of each joint all, or its offset."""
-        for i, way in enumerate(ways):
-            for simpler in (_AS_IS, (way[0], 0)):
-                other = _with(ways, i, simpler)
-                if other != ways and _CLEAR * self.cost(other) <= self.cost(ways):
+        for i in range(len(ways)):
+            for other in simpler(ways, i):
+                if _CLEAR * self.cost(other) <= self.cost(ways):
                     ways = other
                     break
         return ways
@@ -174,7 +161,7 @@ class _Gravity:
                 if ways == before:
                     break
 
-    def _with_zeros(self, ways: _Ways) -> _Ways:
+    def _with_zeros(self, ways: Convention) -> Convention:
         """Return these ways with better zeros, of two joints at a time."""
         for i, j in combinations(self.turning, 2):
             for one, other in product(_QUARTERS, repeat=2):
@@ -182,7 +169,7 @@ class _Gravity:
                 ways = self.better(ways, _with(both, j, (ways[j][0], other)))
         return ways
 
-    def _with_directions(self, ways: _Ways) -> _Ways:
+    def _with_directions(self, ways: Convention) -> Convention:
         """Return these ways with better directions, first of the joint where it matters most."""
         for _ in self.turning:
             turned = (self.turned(ways, i) for i in self.turning)
@@ -192,7 +179,7 @@ class _Gravity:
             ways = other
         return ways
 
-    def best(self) -> Iterator[_Ways]:
+    def best(self) -> Iterator[Convention]:
         """Yield those that were asked for, the best first, but each only in its simplest form.
 
         Each sign and offset must explain something: there are others with the same gravity.
@@ -204,7 +191,7 @@ class _Gravity:
                 found.add(simplest)
                 yield simplest
 
-    def _rank(self, ways: _Ways) -> tuple[float, int]:
+    def _rank(self, ways: Convention) -> tuple[float, int]:
         """Return what counts against these ways; of what is as good, directions are likelier."""
         offsets = sum(quarter != 0 for _, quarter in ways)
         moves = offsets + sum(sign < 0 for sign, _ in ways)

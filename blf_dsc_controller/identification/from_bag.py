@@ -17,12 +17,12 @@ from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.identification.bad_values import stand_ins
-from blf_dsc_controller.identification.columns import Column, beginning
 from blf_dsc_controller.identification.motion import Group, Motion, checked
 from blf_dsc_controller.identification.recording import GAP, interpolated
-from blf_dsc_controller.identification.units import factor_of, is_of_drive
 from blf_dsc_controller.messages.topics import JOINT_STATES, MOTOR_STATES
 from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.tables.columns import Column, beginning
+from blf_dsc_controller.tables.units import factor_of, is_of_drive
 
 _BRACKETED = re.compile(r'\s*\[\s*([^\[\]]+?)\s*\]\s*')
 _OF_EFFORTS = 'record measured efforts, or take the commands: --effort command'

@@ -24,7 +24,7 @@ from blf_dsc_controller.identification.identify import (
 from blf_dsc_controller.identification.motion import recording_of
 from blf_dsc_controller.identification.problem import Effort
 from blf_dsc_controller.identification.recording import Recording, joined
-from blf_dsc_controller.identification.table_files import TABLES
+from blf_dsc_controller.tables.table_files import TABLES
 
 _BAGS = ('.mcap', '.db3', '.bag', '.yaml')
 

@@ -17,18 +17,18 @@ from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import NameMap
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.bad_values import stand_ins
-from blf_dsc_controller.identification.columns import (
+from blf_dsc_controller.identification.motion import Group, Motion
+from blf_dsc_controller.identification.recording import LONGEST_PERIOD
+from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.tables.columns import (
     KINDS,
     Column,
     Columns,
     choose_columns,
     pattern_of,
 )
-from blf_dsc_controller.identification.motion import Group, Motion
-from blf_dsc_controller.identification.recording import LONGEST_PERIOD
-from blf_dsc_controller.identification.table_files import Table, open_table
-from blf_dsc_controller.identification.units import split_unit
-from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.tables.table_files import Table, open_table
+from blf_dsc_controller.tables.units import split_unit
 
 _EXPORTED = ('stamp [ns]', 'received [ns]', 'time [s]')
 _LEAST = 2  # rows

@@ -9,7 +9,6 @@ import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.identification.conventions import Convention
 from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.identification.stiffness import Compliance
 from blf_dsc_controller.identification.values import Parts, indices, parts
@@ -46,21 +45,6 @@ class Score(NamedTuple):
         return np.asarray(self.errors[2] / np.maximum(self.torque, least))
 
 
-class OtherConvention(NamedTuple):
-    """Directions and zeros of joints with which the torques are explained far better."""
-
-    convention: Convention
-    score: Score  # with them
-
-
-class OtherLoad(NamedTuple):
-    """A load that is not always carried, with which the torques are explained far better."""
-
-    carried: Carried
-    mass: float  # kg
-    error: float  # of the torques held back with it, % of their rms
-
-
 class Identified(NamedTuple):
     """An identified arm of n bodies; values are ordered as in `Parts`."""
 
@@ -88,12 +72,7 @@ class Identified(NamedTuple):
     # share of the URDF's gravity in that of the values; NaN if it would hardly show
     gravity: float
     inertia: float  # share of its other inertial torque, likewise
-    # (3,) gravity that explains the torques far better than the given one, m/s^2
-    other_gravity: Floats | None
-    # that explains the torques, if the URDF's does not
-    other_convention: OtherConvention | None
-    # that explains the torques, if a constant one does not
-    other_load: OtherLoad | None
+    other: str  # what explains the torques far better, as a sentence; empty: nothing
     carried: Carried | None  # when the arm carried the load that was weighed
     # of gears, if positions of motors and links are known
     compliance: Compliance | None

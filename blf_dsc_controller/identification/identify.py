@@ -21,17 +21,19 @@ from blf_dsc_controller.identification.conventions import (
     Convention,
     converted,
     likely_conventions,
+    simpler,
 )
-from blf_dsc_controller.identification.identified import (
-    Identified,
-    OtherConvention,
-    OtherLoad,
-    Score,
-)
+from blf_dsc_controller.identification.identified import Identified, Score
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.plausibility import outside_range, shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
-from blf_dsc_controller.identification.problems import is_usable, unexplained_joints
+from blf_dsc_controller.identification.problems import (
+    convention_problem,
+    is_usable,
+    load_problem,
+    mounting_problem,
+    unexplained_joints,
+)
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.regression import Fit, fitted
 from blf_dsc_controller.identification.ripple import (
@@ -104,31 +106,33 @@ def identify_arm(
     found = _completed(first, begin)
     begin(OTHERS)
     explained = found.score
-    if first.problem.other_gravity is not None:
-        gravity = tuple(first.problem.other_gravity.tolist())
-        mounted = trained(robot=replace(robot, gravity=gravity))
+    gravity = first.problem.other_gravity
+    if gravity is not None:
+        mounted = trained(robot=replace(robot, gravity=tuple(gravity.tolist())))
         if _left(mounted.score) < _BETTER * _left(explained):
             found = found._replace(
-                other_gravity=first.problem.other_gravity,
+                other=mounting_problem(gravity),
                 reversed=_named(recording.joints, mounted.problem.reversed),
             )
             explained = mounted.score
     is_good = explained.total[2] < _GOOD
     unexplained = unexplained_joints(found)
-    if is_good and (found.other_gravity is not None or not unexplained.size):
+    if is_good and (found.other or not unexplained.size):
         return found
     if picked_up is None and not is_good:
-        load = _better_load(found, trained(picked_up=np.nan))
-        if load is not None:
-            return found._replace(other_load=load)
+        load = _better_load(found.score, trained(picked_up=np.nan))
+        if load:
+            return found._replace(other=load)
     if effort == 'without-gravity':
         return found
-    convention = _better_convention(
+    better = _better_convention(
         explained,
         likely_conventions(recording, robot, unexplained.tolist()),
         lambda convention: trained(recording=converted(recording, convention)),
     )
-    return found._replace(other_convention=convention)
+    if better is None:
+        return found
+    return found._replace(other=convention_problem(found.joints, found.score, *better))
 
 
 def find_ripples(
@@ -156,25 +160,25 @@ class _Trained(NamedTuple):
     score: Score
 
 
-def _better_load(found: Identified, trained: _Trained) -> OtherLoad | None:
-    """Return the load that was found if it explains the torques far better, or None."""
+def _better_load(score: Score, trained: _Trained) -> str:
+    """Return what to say of the load that was found if it explains the torques far better."""
     error = float(trained.score.total[2])
     carried = trained.problem.carried
-    if carried is None or not error < _BETTER * found.score.total[2]:
-        return None
+    if carried is None or not error < _BETTER * score.total[2]:
+        return ''
     changing = _completed(trained, tell_nobody)
     mass, deviation = (float(each[0]) for each in changing.load)
     if mass < _SHOWN * deviation or not is_usable(changing):
-        return None
-    return OtherLoad(carried, mass, error)
+        return ''
+    return load_problem(score, carried, mass, error)
 
 
 def _better_convention(
     explained: Score,
     likely: Sequence[Convention],
     trained_as: Callable[[Convention], _Trained],
-) -> OtherConvention | None:
-    """Return the first of likely ones that explains the torques far better, or None."""
+) -> tuple[Convention, Score] | None:
+    """Return the first of likely ones that explains the torques far better, and its score."""
     for convention in likely:
         other = trained_as(convention)
         is_better = _left(other.score) < _BETTER * _left(explained)
@@ -183,22 +187,24 @@ def _better_convention(
         # zeros that are not needed are left out below, so ranges mean nothing yet
         completed = _completed(other, tell_nobody)._replace(outside=())
         if is_usable(completed):
-            return _simplest(OtherConvention(convention, other.score), trained_as)
+            return _simplest(convention, other.score, trained_as)
     return None
 
 
 def _simplest(
-    best: OtherConvention, trained_as: Callable[[Convention], _Trained]
-) -> OtherConvention:
-    """Return the convention without signs and offsets that are not needed."""
-    most = _AS_GOOD * _left(best.score)
-    for i in best.convention.unlike:
-        for simpler in best.convention.simpler(i):
-            other = trained_as(simpler)
-            if _left(other.score) < most:
-                best = OtherConvention(simpler, other.score)
+    convention: Convention,
+    score: Score,
+    trained_as: Callable[[Convention], _Trained],
+) -> tuple[Convention, Score]:
+    """Return the convention without signs and offsets that are not needed, and its score."""
+    most = _AS_GOOD * _left(score)
+    for i in range(len(convention)):
+        for other in simpler(convention, i):
+            trained = trained_as(other)
+            if _left(trained.score) < most:
+                convention, score = other, trained.score
                 break
-    return best
+    return convention, score
 
 
 def _left(score: Score) -> float:
@@ -273,9 +279,7 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
         clipped=rows.clipped[windows.moving].mean(axis=0),
         gravity=size.gravity,
         inertia=size.inertia,
-        other_gravity=None,
-        other_convention=None,
-        other_load=None,
+        other='',
         carried=problem.carried,
         compliance=compliance,
         ripples=ripples_left(problem, selected.distances, final),

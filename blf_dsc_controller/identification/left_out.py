@@ -133,6 +133,7 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
     P_loaded = P + rows.load @ theta[rows.unknowns - LOAD : rows.unknowns]
     transmitted = transmitted_torques(rows, values)
     twist = _TWIST / np.maximum(rows.largest_torque, _TINY)
+    steps = np.vstack((np.zeros(n), np.diag(_STEP * twist)))
     g, slope = weighting(rows.every * rows.period)
     regressors = np.zeros((2, n, rows.p))
     found = np.zeros((rows.starts.size, n, n))
@@ -142,23 +143,16 @@ def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Float
             each[samples][:: rows.every] for each in (rows.q, rows.dq, transmitted)
         )
         starts = np.minimum(starts, len(q) - g.size).astype(np.intp)
-
         carries = rows.carried.at(rows.time[block, None])
         P_of = np.where(carries, P_loaded, P)
-
-        def torque(
-            q: Floats, dq: Floats, starts: Indices = starts, P_of: Floats = P_of
-        ) -> Floats:
+        torques = []  # of rigid joints, and with each of them giving way
+        for step in steps:
             X = np.zeros((starts.size, n, rows.p))
-            add_windows(model, q, dq, g, slope, starts, regressors, X)
-            return np.asarray(np.einsum('kip,kp->ki', X, P_of))
-
-        rigid = torque(q, dq)
-        for j in range(n):
-            step = np.zeros(n)
-            step[j] = _STEP * twist[j]
-            off = torque(q - step * s[:, :n], dq - step * s[:, n:])
-            found[block, :, j] = (off - rigid) / _STEP
+            at, speed = q - step * s[:, :n], dq - step * s[:, n:]
+            add_windows(model, at, speed, g, slope, starts, regressors, X)
+            torques.append(np.einsum('kip,kp->ki', X, P_of))
+        rigid, *others = torques
+        found[block] = (np.stack(others, axis=2) - rigid[:, :, None]) / _STEP
     return found
 
 

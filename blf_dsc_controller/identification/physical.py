@@ -29,47 +29,30 @@ _SHORTEST = 1e-9  # step of the line search
 _ROUNDED = float(np.finfo(float).eps)  # of the objective
 
 
-class Cone(NamedTuple):
-    """A symmetric matrix (d, d) that must be positive definite: J0 + sum_a z[at + a] E[a]."""
+class Cones(NamedTuple):
+    """Symmetric matrices (d, d) that must be positive definite: J0 + sum_a z[entries[a]] E[a].
 
-    at: int
-    J0: Floats  # (d, d)
-    E: Floats  # (k, d, d)
-    power: float = 0.0  # of its determinant in the density of the prior
-
-    @property
-    def entries(self) -> slice:
-        """The entries of z on which the matrix depends."""
-        return slice(self.at, self.at + self.E.shape[0])
-
-
-class _Cones(NamedTuple):
-    """Cones of one size, g of them."""
+    There are g of one size.
+    """
 
     entries: Indices  # (g, k) of z, on which each depends
     J0: Floats  # (g, d, d)
     E: Floats  # (g, k, d, d)
-    power: Floats  # (g,)
+    power: Floats  # (g,) of their determinants in the density of the prior
 
-    def of(self, z: Floats) -> Floats:
+    @classmethod
+    def of(cls, each: Sequence[tuple[Indices, Floats, Floats, float]]) -> Cones:
+        """Return the cones with these entries (k,), J0, E and powers."""
+        return cls(*map(np.array, zip(*each, strict=True)))
+
+    def but(self, entries: Sequence[int]) -> Cones:
+        """Return the cones that depend on none of these entries."""
+        is_kept = ~np.isin(self.entries, entries).any(axis=1)
+        return Cones._make(each[is_kept] for each in self)
+
+    def matrices(self, z: Floats) -> Floats:
         """Return the matrices (g, d, d) at z."""
         return np.asarray(self.J0 + np.einsum('ga,gaij->gij', z[self.entries], self.E))
-
-
-def _by_size(cones: Sequence[Cone]) -> list[_Cones]:
-    """Return the cones, those of one size together."""
-    of_size: dict[tuple[int, ...], list[Cone]] = {}
-    for cone in cones:
-        of_size.setdefault(cone.E.shape, []).append(cone)
-    return [
-        _Cones(
-            np.array([cone.at + np.arange(shape[0]) for cone in same]),
-            np.array([cone.J0 for cone in same]),
-            np.array([cone.E for cone in same]),
-            np.array([cone.power for cone in same]),
-        )
-        for shape, same in of_size.items()
-    ]
 
 
 def most_likely(products: Floats) -> Floats:
@@ -84,7 +67,7 @@ def left_of(products: Floats, z: Floats) -> float:
     return max(float(both @ products @ both), 0.0)
 
 
-def solve(products: Floats, cones: list[Cone], z: Floats) -> Floats:
+def solve(products: Floats, cones: Sequence[Cones], z: Floats) -> Floats:
     """Return the minimum for these products, starting from z inside all cones.
 
     Raises:
@@ -93,15 +76,14 @@ def solve(products: Floats, cones: list[Cone], z: Floats) -> Floats:
     mu = max(1.0, left_of(products, z))
     information = products[:-1, :-1] + np.eye(z.size)
     target = products[:-1, -1]
-    groups = _by_size(cones)
     while mu > _LAST:
         mu = max(_LAST, _REDUCTION * mu)
-        z = _centred(information, target, groups, z, mu)
+        z = _centred(information, target, cones, z, mu)
     return z
 
 
 def _centred(
-    information: Floats, target: Floats, cones: list[_Cones], z: Floats, mu: float
+    information: Floats, target: Floats, cones: Sequence[Cones], z: Floats, mu: float
 ) -> Floats:
     """Return the minimum for one mu, as far as the objective's digits show it."""
     for _ in range(_STEPS):
@@ -110,7 +92,7 @@ def _centred(
         for group in cones:
             own = group.entries
             power = np.maximum(mu, group.power)
-            T = np.linalg.solve(group.of(z)[:, None], group.E)
+            T = np.linalg.solve(group.matrices(z)[:, None], group.E)
             slope = power[:, None] * np.einsum('gaii->ga', T)
             curvature = power[:, None, None] * np.einsum('gaij,gbji->gab', T, T)
             np.subtract.at(gradient, own, slope)
@@ -133,13 +115,13 @@ def _centred(
 
 
 def _objective(
-    information: Floats, target: Floats, cones: list[_Cones], z: Floats, mu: float
+    information: Floats, target: Floats, cones: Sequence[Cones], z: Floats, mu: float
 ) -> float:
     """Return the objective, up to a constant; infinite outside a cone."""
     value = 0.5 * float(z @ information @ z) - float(target @ z)
     for group in cones:
         try:
-            L = np.linalg.cholesky(group.of(z))
+            L = np.linalg.cholesky(group.matrices(z))
         except np.linalg.LinAlgError:
             return np.inf
         power = np.maximum(mu, group.power)

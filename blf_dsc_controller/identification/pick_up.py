@@ -15,7 +15,6 @@ from blf_dsc_controller.identification.physical import left_of, most_likely
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.regression import Weighted, of_prior, regression
-from blf_dsc_controller.identification.values import indices
 from blf_dsc_controller.identification.windows import Carried, Rows, Split
 from blf_dsc_controller.run import Floats
 
@@ -32,7 +31,7 @@ def carried_load(rows: Rows, windows: Split, prior: Prior) -> Carried:
     moving = windows.moving
     steps = max(moving.size // _per_step(moving), 2)
     found = regression(rows, moving, prior)
-    load = indices(prior.joints).load
+    load = prior.at.load
     with_load, empty = [], found.products
     for products in Weighted(found.rows, moving, found.delay).products(steps):
         added = _columns(of_prior(products, found.deviation, prior.T), load)

@@ -12,7 +12,7 @@ deviation d is largest at 0, s times that density at d, next to its mean of 0.8 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,10 +28,9 @@ from blf_dsc_controller.arms.base_parameters import (
 from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
 from blf_dsc_controller.arms.urdf import Chain, Joint
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.physical import Cone
+from blf_dsc_controller.identification.physical import Cones
 from blf_dsc_controller.identification.values import (
     COULOMB,
-    COUPLING,
     JOINT_TERMS,
     LOAD,
     LOAD_FRICTION,
@@ -42,8 +41,10 @@ from blf_dsc_controller.identification.values import (
     ROTOR_INERTIA,
     STRIBECK,
     VISCOUS,
+    Parts,
     base_matrix,
     indices,
+    parts,
 )
 from blf_dsc_controller.run import Floats
 
@@ -68,7 +69,7 @@ class Prior(NamedTuple):
     G: Floats  # (m + 1, k) from values to the unknowns theta of `Rows`, and the delay [s]
     mean: Floats  # (k,), k = 17 n + 14
     D: Floats  # (k, k)
-    cones: list[Cone]
+    cones: Sequence[Cones]
     start: Floats  # (k,) z inside all cones
 
     @property
@@ -78,21 +79,20 @@ class Prior(NamedTuple):
         return np.vstack((columns, np.eye(1, self.mean.size + 1, self.mean.size)))
 
     @property
-    def joints(self) -> int:
-        """Number of joints."""
-        return (self.mean.size - COUPLING - LOAD - 1) // (10 + len(JOINT_TERMS))
+    def at(self) -> Parts:
+        """Indices of the parts of the values, and of z."""
+        return parts(np.arange(self.mean.size))
 
     @property
     def optional(self) -> list[Entry]:
         """Entries of z that are in the model together or not at all: friction, the coupling."""
-        at = indices(self.joints)
-        friction = at.terms[list(OPTIONAL)].ravel().tolist()
-        return [*((k,) for k in friction), tuple(at.coupling.tolist())]
+        friction = self.at.terms[list(OPTIONAL)].ravel().tolist()
+        return [*((k,) for k in friction), tuple(self.at.coupling.tolist())]
 
     @property
     def groups(self) -> dict[str, Entry]:
         """Entries of z whose width is one guess, by name."""
-        at = indices(self.joints)
+        at = self.at
         friction = at.terms[[VISCOUS, COULOMB]]
         return {
             'bodies': tuple(at.bodies.ravel().tolist()),
@@ -106,15 +106,15 @@ class Prior(NamedTuple):
         dropped = [k for entry in self.optional if entry not in kept for k in entry]
         D = self.D.copy()
         D[:, dropped] = 0.0
-        cones = [cone for cone in self.cones if cone.at not in dropped]
+        cones = [each.but(dropped) for each in self.cones]
         return self._replace(D=D, cones=cones)
 
     def widened(self, factors: Floats) -> Prior:
         """Return the prior with deviations (k,) times as wide."""
-        cones = []
-        for cone in self.cones:
-            own = factors[cone.entries]
-            cones.append(cone._replace(E=cone.E * own[:, None, None]))
+        cones = [
+            each._replace(E=each.E * factors[each.entries][:, :, None, None])
+            for each in self.cones
+        ]
         return self._replace(
             D=self.D * factors, cones=cones, start=self.start / factors
         )
@@ -141,7 +141,7 @@ def prior_of(
     mean = np.zeros(at.delay[0] + 1)
     start = np.zeros_like(mean)
     mean[at.bodies] = chain.inertias
-    cones = []
+    bodies = []  # entries, J0, E and power of their cones
     blocks = []
     for i, joint in enumerate(chain.joints):
         D = _of_body(joint)
@@ -151,26 +151,30 @@ def prior_of(
         own = pseudo_inertia(joint.inertia) - joint.held
         inside = inertia_of(_inside(own, joint.inertia[0]) + joint.held)
         start[at.bodies[i]] = np.linalg.solve(D, inside - joint.inertia)
-        cones.append(Cone(at.bodies[i, 0], own, _pseudo_inertias(D), _EXTENT))
+        bodies.append((at.bodies[i], own, _pseudo_inertias(D), _EXTENT))
     rotors = robot.rotors(chain)
     mean[at.terms[ROTOR_INERTIA]] = rotors
     mean[at.terms[VISCOUS]] = [joint.damping for joint in chain.joints]
     mean[at.terms[COULOMB]] = [joint.friction for joint in chain.joints]
     spread = _of_terms(rotors, torque, speed)
     coupling = spread[[ROTOR_INERTIA, VISCOUS, COULOMB], -1]
-    for k, deviation in (
-        *zip(at.terms[:POSITIVE].ravel(), spread[:POSITIVE].ravel(), strict=True),
-        *zip(at.coupling, coupling, strict=True),
-    ):
-        cones.append(Cone(int(k), mean[[[k]]], np.full((1, 1, 1), deviation)))
-        start[k] = _FIRST
+    positive = np.append(at.terms[:POSITIVE], at.coupling).astype(np.intp)
+    deviation = np.append(spread[:POSITIVE], coupling)
+    start[positive] = _FIRST
+    terms = Cones(
+        positive[:, None],
+        mean[positive][:, None, None],
+        deviation[:, None, None, None],
+        np.zeros(positive.size),
+    )
     of_load = np.zeros((LOAD, LOAD))
     if load:
         of_load = _of_load(chain, robot.payload)
-        cones.append(Cone(at.load[0], np.zeros((4, 4)), _pseudo_inertias(of_load)))
+        bodies.append((at.load, np.zeros((4, 4)), _pseudo_inertias(of_load), 0.0))
     start[at.load[0]] = _FIRST
     of_terms = np.diag(np.append(spread, coupling))
     D = block_diag(*blocks, of_terms, of_load, _DELAY)
+    cones = Cones.of(bodies), terms
     return Prior(base_matrix(parameters, n), mean, D, cones, start)
 
 

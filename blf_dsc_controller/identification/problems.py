@@ -3,20 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from blf_dsc_controller.identification.identified import (
-    IDLE,
-    Identified,
-    OtherConvention,
-    OtherLoad,
-)
+from blf_dsc_controller.identification.conventions import Convention, signs_and_offsets
+from blf_dsc_controller.identification.identified import IDLE, Identified, Score
 from blf_dsc_controller.identification.plausibility import GRAVITY, INERTIA
 from blf_dsc_controller.identification.recording import Indices
 from blf_dsc_controller.identification.values import OFFSET
+from blf_dsc_controller.identification.windows import Carried
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
+from blf_dsc_controller.run import Floats
 
 _POOR = 0.2  # of the torque, largest accepted error on the part held back
 _GOOD = 0.02  # likewise, error that is accepted whatever else is possible
@@ -35,18 +33,8 @@ _RELEVANT = 0.02  # ... if it is so much of the largest torque
 
 def problems_of(found: Identified, effort: str) -> Iterator[str]:
     """Yield why the efforts or the result are doubtful."""
-    if found.other_load is not None:
-        yield _load_problem(found, found.other_load)
-        return
-    if found.other_convention is not None:
-        yield _convention_problem(found, found.other_convention)
-        return
-    if found.other_gravity is not None:
-        words = ' '.join(f'{value:.3g}' for value in found.other_gravity)
-        yield (
-            f'ANOTHER MOUNTING: the torques show gravity along ({words}) in the base frame: give '
-            f'--gravity {words}, or correct the mounting in the URDF'
-        )
+    if found.other:
+        yield found.other
         return
     yield from _size_problems(found, effort)
     if not is_explained(found):
@@ -80,41 +68,53 @@ def verdict_of(found: Identified, effort: str) -> str:
     )
 
 
-def _load_problem(found: Identified, load: OtherLoad) -> str:
-    """Return which load, carried for a part of the recording, would explain the torques."""
+def mounting_problem(gravity: Floats) -> str:
+    """Return which gravity (3,) [m/s^2] in the base would explain the torques."""
+    words = ' '.join(f'{value:.3g}' for value in gravity)
     return (
-        f'THE LOAD CHANGES: the torque error is {load.error:.3g} instead of '
-        f'{found.score.total[2]:.3g} % with {load.mass:.2g} kg {load.carried.when}. Give '
+        f'ANOTHER MOUNTING: the torques show gravity along ({words}) in the base frame: give '
+        f'--gravity {words}, or correct the mounting in the URDF'
+    )
+
+
+def load_problem(score: Score, carried: Carried, mass: float, error: float) -> str:
+    """Return which load [kg], carried for a part of the recording, would explain the torques.
+
+    `score` is that without, and `error` that of the torques held back with it [% of their rms].
+    """
+    return (
+        f'THE LOAD CHANGES: the torque error is {error:.3g} instead of '
+        f'{score.total[2]:.3g} % with {mass:.2g} kg {carried.when}. Give '
         '--payload, which weighs them, or a recording in which the load stays the same'
     )
 
 
-def _convention_problem(found: Identified, other: OtherConvention) -> str:
-    """Return which zeros and directions of joints would explain the torques."""
-    signs, offsets = other.convention
-    reversed_joints = [found.joints[i] for i in np.flatnonzero(signs < 0.0)]
-    moved = ', '.join(
-        f'{offset:+.5g} rad to {name}'
-        for name, offset in zip(found.joints, offsets, strict=True)
-        if offset
-    )
+def convention_problem(
+    joints: Sequence[str], score: Score, convention: Convention, better: Score
+) -> str:
+    """Return which zeros and directions of joints would explain the torques `better`."""
+    signs, offsets = signs_and_offsets(convention)
     steps, differ = [], []
-    if reversed_joints:
-        names = ', '.join(reversed_joints)
+    if (signs < 0.0).any():
+        names = ', '.join(np.array(joints)[signs < 0.0])
         steps.append(f'positions and efforts are negated of {names}')
         differ.append('directions')
-    if moved:
-        steps.append(f'there is added to the positions: {moved}')
+    if offsets.any():
+        moved = (
+            f'{offset:+.5g} rad to {name}'
+            for offset, name in zip(offsets, joints, strict=True)
+            if offset
+        )
+        steps.append(f'there is added to the positions: {", ".join(moved)}')
         differ.append('zeros')
-    i = int(np.argmax(found.score.shares - other.score.shares))
-    shares = (f'{100.0 * each.shares[i]:.2g}' for each in (other.score, found.score))
-    of_joint = ' instead of '.join(shares)
+    i = int(np.argmax(score.shares - better.shares))
     return (
         f'OTHER {" AND ".join(differ).upper()}: the torque error is '
-        f'{other.score.total[2]:.3g} instead of {found.score.total[2]:.3g} % (of '
-        f'{found.joints[i]} {of_joint} %) if {", and if then ".join(steps)}. So the joints seem '
-        f'to have other {" and ".join(differ)} than in the URDF, as in a DH convention: check '
-        'this, and convert the recording'
+        f'{better.total[2]:.3g} instead of {score.total[2]:.3g} % (of {joints[i]} '
+        f'{100.0 * better.shares[i]:.2g} instead of {100.0 * score.shares[i]:.2g} %) if '
+        f'{", and if then ".join(steps)}. So the joints seem to have other '
+        f'{" and ".join(differ)} than in the URDF, as in a DH convention: check this, and convert '
+        'the recording'
     )
 
 

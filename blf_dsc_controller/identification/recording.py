@@ -68,25 +68,20 @@ def resampled(
     groups = [q, torque] if motors is None else [q, torque, motors]
     order = _order(stamp, groups)
     if not np.array_equal(order, np.arange(stamp.size)):
-        stamp, q, torque = stamp[order], q[order], torque[order]
-        motors = None if motors is None else motors[order]
-    grid = _grid_of(stamp)
+        stamp = stamp[order]
+        groups = [each[order] for each in groups]
+    q, torque, *others = groups
+    time, even, period, gap = _grid_of(stamp)
     turns = _turns(q, turning)
     if turns.any():
         q = q + TURN * turns
         names = ', '.join(np.array(joints)[turns.any(axis=0)])
         source = f'{source} (positions of {names} are wrapped: full turns added)'
-    recording = Recording(
-        joints=joints,
-        period=grid.period,
-        q=grid.evenly(q),
-        torque=grid.evenly(torque),
-        gap=grid.gap,
-        source=source,
-    )
-    if motors is None:
-        return recording
-    return recording._replace(twist=grid.evenly(_twist(q, motors, turning)))
+    twist = None
+    if others:
+        twist = interpolated(even, time, _twist(q, others[0], turning))
+    q, torque = (interpolated(even, time, each) for each in (q, torque))
+    return Recording(joints, period, q, torque, gap, source, twist=twist)
 
 
 def _order(stamp: Stamps, groups: Sequence[Floats]) -> Indices:
@@ -109,21 +104,10 @@ def _turns(q: Floats, turning: Flags) -> Floats:
     return np.cumsum(turns, axis=0, out=turns)
 
 
-class _Grid(NamedTuple):
-    """Even times, at which states at uneven ones are interpolated."""
+def _grid_of(stamp: Stamps) -> tuple[Floats, Floats, float, Flags]:
+    """Return the times [s] of states at these stamps, which increase, and even ones.
 
-    time: Floats  # (N,) of the states, s
-    even: Floats  # (M,) s
-    period: float  # s
-    gap: Flags  # (M,) whether nothing was recorded here
-
-    def evenly(self, values: Floats) -> Floats:
-        """Return values (N, n) of the states at the even times."""
-        return interpolated(self.even, self.time, values)
-
-
-def _grid_of(stamp: Stamps) -> _Grid:
-    """Return the even times for states at these stamps, which increase.
+    Also the period of the latter [s], and whether nothing was recorded at each.
 
     Raises:
         BlfDscError: there are too few, or they cannot be of one clock.
@@ -149,7 +133,7 @@ def _grid_of(stamp: Stamps) -> _Grid:
         )
     even = np.arange(0.0, time[-1], period)
     gap = (intervals > GAP * period)[np.searchsorted(time, even, side='right') - 1]
-    return _Grid(time, even, period, gap)
+    return time, even, period, gap
 
 
 def _twist(links: Floats, motors: Floats, turning: Flags) -> Floats:

@@ -129,11 +129,12 @@ def listed_ripples(ripples: Sequence[Ripples]) -> tuple[Listed, ...]:
         for each in own.found
     ]
     for each in sorted(candidates, key=lambda one: -one.worth):
-        same = next((group for group in groups if _is_same(group[0], each)), None)
-        if same is None:
-            groups.append([each])
+        for group in groups:
+            if _is_same(group[0], each):
+                group.append(each)
+                break
         else:
-            same.append(each)
+            groups.append([each])
     groups.sort(key=lambda group: -sum(each.worth for each in group))
     return tuple(map(_together, groups[:_LISTED]))
 

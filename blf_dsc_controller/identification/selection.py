@@ -80,8 +80,8 @@ def _worthwhile(found: Regression, prior: Prior) -> list[Entry]:
     """
     kept: list[Entry] = []
     optional = prior.optional
-    cones = {cone.at for cone in prior.cones}
-    positive = [k for entry in optional for k in entry if k in cones]
+    _, terms = prior.cones
+    positive = [k for entry in optional for k in entry if k in terms.entries]
     used = np.ones(prior.mean.size)
     for entry in optional:
         used[list(entry)] = 0.0
@@ -117,7 +117,7 @@ def repeats(rows: Rows, fit: Indices) -> bool:
 
 
 def prior_widths(
-    found: Regression, prior: Prior, tried: Sequence[float] = _WIDTHS
+    found: Regression, prior: Prior, tried: Sequence[float]
 ) -> dict[str, float]:
     """Return the factor of each group's width, raised as long as that predicts better.
 

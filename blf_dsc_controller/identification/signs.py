@@ -3,23 +3,23 @@
 
 A drive may count its effort in the opposite sense.  A URDF alone cannot tell: if a link
 is heavier than it says, gravity may point the other way.  So all combinations of signs
-are compared by the fit of the whole arm.  Without bounds its cost is a quadratic
-function of the signs, and a lower bound of the cost with physical bodies and friction
-that brakes.  The latter is computed for the most likely combinations only.
+are compared by the fit of the whole arm.  Its cost for any bodies and friction is a lower
+bound of that with physical bodies and friction that brakes, which takes longer and is
+computed for the most likely combinations only.
 
 Clear friction overrules everything: it cannot drive.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.identification.joint_alone import Alone
-from blf_dsc_controller.identification.physical import left_of, solve
+from blf_dsc_controller.identification.physical import left_of, most_likely, solve
 from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.run import Floats
 
@@ -37,16 +37,16 @@ def likely_signs(alone: Alone, prior: Prior) -> Signs:
     Of signs that are as good, those of most joints are alike, and as recorded.
     """
     fit = _Fit(alone, prior)
-    combinations = np.array(list(_combinations(alone)))
-    bounds = fit.bounds(combinations)
-    found: list[tuple[float, Signs]] = []
-    for k in np.argsort(bounds)[:_MOST]:
-        least = min((cost for cost, _ in found), default=np.inf)
+    combinations = list(_combinations(alone))
+    bounds = np.array([fit.cost(signs, most_likely) for signs in combinations])
+    costs: dict[int, float] = {}
+    least = np.inf
+    for k in np.argsort(bounds)[:_MOST].tolist():
         if bounds[k] > _AS_GOOD * least:
             break
-        found.append((fit.cost(combinations[k]), combinations[k]))
-    least = min(cost for cost, _ in found)
-    as_good = [signs for cost, signs in found if cost <= _AS_GOOD * least]
+        costs[k] = fit.cost(combinations[k], fit.physical)
+        least = min(costs.values())
+    as_good = [combinations[k] for k, cost in costs.items() if cost <= _AS_GOOD * least]
     return min(as_good, key=_oddity)
 
 
@@ -81,27 +81,21 @@ class _Fit:
         T[:-2, :-1] = prior.T[:-2]
         T[-2:, -1] = -alone.delay, 1.0
         deviation = alone.deviation[:, None, None]
-        self._products = T.T @ (alone.products / deviation**2) @ T  # (n, k + 2, k + 2)
+        products = T.T @ (alone.products / deviation**2) @ T  # (n, k + 2, k + 2)
+        self._alike = products.sum(axis=0)
+        self._with_torque = products[:, -1]  # (n, k + 2), of which each has a sign
         self._prior = prior
 
-    def bounds(self, signs: Signs) -> Floats:
-        """Return lower bounds (c,) of the cost with signs (c, n)."""
-        products = self._products
-        alike = products.sum(axis=0)
-        L = np.linalg.cholesky(alike[:-2, :-2] + np.eye(len(alike) - 2))
-        targets = np.column_stack((alike[:-2, -2], products[:, :-2, -1].T))
-        y = np.linalg.solve(L, targets)
-        explained = np.sum((y[:, 1:] @ signs.T + y[:, :1]) ** 2, axis=0)
-        crossed = signs @ products[:, -2, -1]
-        return np.asarray(alike[-2, -2] + alike[-1, -1] + 2.0 * crossed - explained)
-
-    def cost(self, signs: Signs) -> float:
-        """Return the squared residuals and deviations of the best physical arm."""
-        own = np.tile(
-            np.eye(len(self._products[0]), len(self._products[0]) - 1),
-            (signs.size, 1, 1),
-        )
-        own[:, -1, -1] = signs
-        products = (np.swapaxes(own, 1, 2) @ self._products @ own).sum(axis=0)
-        z = solve(products, self._prior.cones, self._prior.start)
+    def cost(self, signs: Signs, solution: Callable[[Floats], Floats]) -> float:
+        """Return the squared residuals and deviations of the solution for products."""
+        crossed = signs @ self._with_torque
+        products = self._alike[:-1, :-1].copy()
+        products[-1] += crossed[:-1]
+        products[:, -1] += crossed[:-1]
+        products[-1, -1] += self._alike[-1, -1]
+        z = solution(products)
         return left_of(products, z) + float(z @ z)
+
+    def physical(self, products: Floats) -> Floats:
+        """Return the most likely z of a physical arm."""
+        return solve(products, self._prior.cones, self._prior.start)

@@ -135,10 +135,8 @@ class Rows(NamedTuple):
         edges = np.searchsorted(self.starts[windows], of_samples).tolist()
         return (slice(*pair) for pair in pairwise(edges) if pair[0] < pair[1])
 
-    def matrix(self, windows: Indices | None = None) -> Floats:
-        """Return X (k, n, m) of some windows, which increase; by default of all."""
-        if windows is None:
-            windows = np.arange(self.time.size)
+    def matrix(self, windows: Indices) -> Floats:
+        """Return X (k, n, m) of some windows, which increase."""
         n = self.speed.size
         p = self.p
         X = np.zeros((windows.size, n, self.unknowns))

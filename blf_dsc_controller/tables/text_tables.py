@@ -24,8 +24,8 @@ from typing import NamedTuple, TextIO
 import numpy as np
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.columns import is_time
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.tables.columns import is_time
 
 _DELIMITERS = (';', '\t', ',')
 _COMMENTS = ('#', '%')

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.units import factor_of, is_of_drive, split_unit
+from blf_dsc_controller.tables.units import factor_of, is_of_drive, split_unit
 
 KINDS = ('time', 'q', 'tau', 'theta')
 """Columns, by the names of `--map`; positions theta of the motors are not needed."""

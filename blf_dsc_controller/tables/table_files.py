@@ -22,8 +22,8 @@ import numpy as np
 
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
-from blf_dsc_controller.identification.text_tables import text_table
 from blf_dsc_controller.run import Floats
+from blf_dsc_controller.tables.text_tables import text_table
 
 _MOST = 1 << 28  # bytes that an array, or a mat file, may have, unpacked
 _BYTES = 8  # of a number
