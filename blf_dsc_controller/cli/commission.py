@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 
 from blf_dsc_controller.cli.commission_ripple import (
@@ -20,11 +19,11 @@ from blf_dsc_controller.cli.commission_robot import (
     print_proof,
     proven,
     robot,
+    topics_of,
 )
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
-from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.commissioning import (
     files,
     page,
@@ -37,7 +36,7 @@ from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.measurement import Measured, measured_in
 from blf_dsc_controller.commissioning.picture import draw
-from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
+from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.commissioning.slow_motion import slow_motion
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -52,6 +51,7 @@ from blf_dsc_controller.configuration.nodes import (
     locate,
     read,
 )
+from blf_dsc_controller.drive.drivers import ROS, config_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.numerics.digits import largest_error
 from blf_dsc_controller.progress import announce_reading, print_notice, steps
@@ -68,20 +68,12 @@ NO_MARGIN = 3
 def commission(options: Namespace) -> int:
     """Write the motions to run, or measure, choose and write the gains."""
     _check(options)
+    if options.ros:
+        options.robot = ROS
     path = locate(options.config)
     if ignored := ignored_in(path, (CONTROLLER, DRIVE)):
         print_notice(f'warning: {ignored}')
-    if not options.ros:
-        return _commission(options, path, load(path, CONTROLLER, ControllerConfig))
-    require_ros()
-    from blf_dsc_controller.cli.commission_ros import config_over_ros, ros_session
-
-    with ros_session(options):
-        return _commission(options, path, config_over_ros(path))
-
-
-def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int:
-    """Write the motions of a configuration, or measure, choose and write the gains."""
+    config = config_of(options.robot or '', path, topics_of(options))
     if options.ripple:
         slow_motion(config)  # an error comes before anything moves
     commissioning = Commissioning(
@@ -92,7 +84,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         margin=options.margin,
         lags=_lags(path),
     )
-    if _in_motors(path) and (options.robot or options.ros or not options.bags):
+    if _in_motors(path) and (options.robot or not options.bags):
         _warn_in_motors()
     if options.write:
         _write_motions(options, path, commissioning)
@@ -101,7 +93,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         work = _prove_on_robot
     else:
         make_room(options.out, _picture(options.out), force=options.force)
-        work = _on_robot if options.robot or options.ros else _by_runs
+        work = _on_robot if options.robot else _by_runs
     try:
         return work(options, path, commissioning)
     except EndedError as error:
@@ -128,7 +120,7 @@ def _by_runs(options: Namespace, path: Path, commissioning: Commissioning) -> in
 def _on_robot(options: Namespace, path: Path, commissioning: Commissioning) -> int:
     """Commission a robot, with the bags that are given, too."""
     runs = _given(options, commissioning.config)
-    with _arm(options, path, commissioning) as arm:
+    with robot(options, path, commissioning) as arm:
         measured = measured_on(options, arm, commissioning)
         arm.hold_after()
     runs += [(name, measured_in(bag)) for name, bag in measured]
@@ -198,7 +190,7 @@ def _warn_in_motors() -> None:
 
 def _is_simulated(options: Namespace) -> bool:
     """Whether the options measure the simulated arm."""
-    return not (options.bags or options.robot or options.ros)
+    return not (options.bags or options.robot)
 
 
 def _check(options: Namespace) -> None:
@@ -235,7 +227,8 @@ def _check(options: Namespace) -> None:
         raise BlfDscError(
             '--yes and --record are for a robot: give --robot or --ros, too'
         )
-    if not options.ros and (options.states or options.commands or options.namespace):
+    is_over_ros = options.ros or options.robot == ROS
+    if topics_of(options)[DRIVE] and not is_over_ros:
         raise BlfDscError(
             '--states, --commands and --namespace are for topics: give --ros, too'
         )
@@ -252,17 +245,6 @@ def _names(commissioning: Commissioning, runs: Runs) -> list[str]:
     return [name for name, run in runs if not commissioning.is_slow_motion(run)]
 
 
-def _arm(
-    options: Namespace, path: Path, commissioning: Commissioning
-) -> AbstractContextManager[PostureByPosture]:
-    """Return the robot that the options name, still to be entered."""
-    if options.robot:
-        return robot(options, path, commissioning)
-    from blf_dsc_controller.cli.commission_ros import robot_over_ros
-
-    return robot_over_ros(options, commissioning)
-
-
 def _prove_on_robot(
     options: Namespace, path: Path, commissioning: Commissioning
 ) -> int:
@@ -276,7 +258,7 @@ def _prove_on_robot(
     if options.ripple:
         make_room(options.out, force=options.force)
         before.append(ripple_page.description(slow_motion(config)))
-    with _arm(options, path, commissioning) as arm:
+    with robot(options, path, commissioning) as arm:
         ask(options, before)
         print_proof(config, *proven(arm, planned, config))
         code = after_proof(options, arm, config, path) if options.ripple else 0

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture.
-
-`--ros` has the same limits and question.
-"""
+"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture."""
 
 from __future__ import annotations
 
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -22,7 +19,6 @@ from blf_dsc_controller.commissioning.commissioning import (
     REPEATS,
     Commissioning,
 )
-from blf_dsc_controller.commissioning.driven import Driven
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
@@ -36,7 +32,7 @@ from blf_dsc_controller.commissioning.proof import (
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import PLANT
+from blf_dsc_controller.configuration.nodes import DRIVE, PLANT
 from blf_dsc_controller.configuration.plant import pick_ups
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
@@ -60,7 +56,11 @@ def robot(
     """
     folder = prepared_folder(options)
     config = commissioning.config
-    unloaded = {PLANT: pick_ups([], [])}  # a simulated arm, which nobody disturbs
+    # of a simulated arm, which nobody disturbs
+    unloaded: dict[str, Mapping[str, object]] = {
+        PLANT: pick_ups([], []),
+        **topics_of(options),
+    }
     driver = driver_of(options.robot, path, config, unloaded)
     with announced_compilation(print_notice):
         ArmController(config).close()
@@ -68,10 +68,17 @@ def robot(
         print_notice(f'connecting to {options.robot}: some seconds')
         for remark in driver.connect():
             print_notice(remark)
-        driven = Driven(driver, commissioning, folder)
+        driven = PostureByPosture(driver, commissioning, folder)
         request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
         with signals_to(driven.request_end):
             yield driven
+
+
+def topics_of(options: Namespace) -> dict[str, dict[str, object]]:
+    """Return the topics that the options name, as parameters of the driver `ros`."""
+    names = ('states', 'commands', 'namespace')
+    given = {name: getattr(options, name) for name in names if getattr(options, name)}
+    return {DRIVE: given}
 
 
 def measured_on(

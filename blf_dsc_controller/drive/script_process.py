@@ -17,19 +17,17 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     DRIVE,
     ignored_in,
-    load,
     locate,
 )
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.beside import LinkLog
 from blf_dsc_controller.drive.driver import Driver
-from blf_dsc_controller.drive.drivers import driver_of
+from blf_dsc_controller.drive.drivers import config_of, driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.motor_feedback import closed_in_motors, robot_warnings
 from blf_dsc_controller.drive.script import Script
@@ -67,7 +65,8 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
     overrides = wanted['overrides']
     given = overrides.get(CONTROLLER, {})
     path = locate(wanted['config'])
-    config = load(path, CONTROLLER, ControllerConfig, _HOLD | given)
+    held = {**overrides, CONTROLLER: _HOLD | given}
+    config = config_of(wanted['robot'], path, held)
     driver = driver_of(wanted['robot'], path, config, overrides)
     in_motors = driver.config.feedback == 'motor'
     ignored = ignored_in(path, (CONTROLLER, DRIVE))
@@ -84,7 +83,7 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
         for remark in driver.connect():
             log.info(remark)
         request_realtime(config.realtime, log.warning)
-        _run(driver, controller, Script(link, controller), link)
+        _run(driver, controller, Script(link, controller, driver.inputs), link)
     if controller.output_problem:
         log.error(f'recorded only a part: {controller.output_problem}')
 
