@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -77,6 +78,22 @@ def test_stop_of_somebody_else_ends_its_motion(behind):
         client.call_async(Trigger.Request())
         with pytest.raises(blf.MotionFailedError, match='by ~/stop'):
             arm.wait()
+
+
+def test_second_publisher_ends_it_and_the_arm_is_held_until_it_recovers(behind):
+    plant = behind.nodes[-1].plant
+    held = {'blf_dsc_controller': {'safety.torque': 'hold_gravity'}}
+    with working(behind), blf.Drive('recommended', held, robot='ros') as arm:
+        other = behind.publisher(topics.COMMANDS)
+        wait_for(lambda: arm.ended)
+        assert 'the controller stopped: another node publishes torques on' in arm.ended
+        ended = plant.sample
+        wait_for(lambda: plant.sample > ended + 1000)  # who waits for a torque gets it
+        assert np.abs(plant.measure().reshape(3, -1)[1]).max() < 0.01  # rad/s
+        behind.tester.destroy_publisher(other)
+        time.sleep(2.0)  # the node looks every second
+        arm.recover()
+        arm.move_to(arm.state.q + STEP, speed=1.0)
 
 
 def test_nothing_starts_beside_another_commander(behind):

@@ -69,11 +69,11 @@ def _comment(path: Path) -> Iterator[str]:
 
 def _measured(arm: PostureByPosture, config: ControllerConfig) -> tuple[Ripples, ...]:
     """Return what the slow motion of a configuration shows."""
-    motion = arm.driver.aside(slow_motion, config)
+    motion = arm.aside(slow_motion, config)
     print(ripple_page.description(motion), flush=True)
     bag = arm.slow(motion)
     print_notice('looking for torque ripple in it: some seconds')
-    return arm.driver.aside(ripples_by_bag, bag)
+    return arm.aside(ripples_by_bag, bag)
 
 
 def on_simulated(file: CommissionedFile, found: Commissioned, stop: str) -> int:

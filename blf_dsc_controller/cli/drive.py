@@ -78,15 +78,11 @@ def drive(options: Namespace) -> int:
             ending.callback(ros.close)
         ending.enter_context(controller)
         ending.callback(driver.close)
-        print_notice(f'connecting to {options.robot}: some seconds')
-        for remark in driver.connect():
-            print_notice(remark)
-        request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
+        connect(driver)
         loop = DriveLoop(
             driver,
             controller,
             duration=options.duration or math.inf,
-            settle_time=driver.config.settle_time,
             beside=ros,
             feedback=driver.config.feedback,
         )
@@ -104,6 +100,16 @@ def drive(options: Namespace) -> int:
             f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
         )
     return CODES[outcome.end] or int(bool(controller.output_problem))
+
+
+def connect(driver: Driver) -> None:
+    """Connect to the robot, and print its remarks."""
+    print_notice(f'connecting to {driver.address}: some seconds')
+    for remark in driver.connect():
+        print_notice(remark)
+    request_realtime(
+        driver.controller.realtime, lambda text: print_notice(f'warning: {text}')
+    )
 
 
 def _say_before(config: ControllerConfig, driver: Driver) -> None:

@@ -13,8 +13,9 @@ is around the posture in which the arm rests by then, so it begins without an er
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,11 +52,13 @@ from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import Topic
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.turns import short_way
 from blf_dsc_controller.supervision.guard import Guard
 
 Floats = NDArray[np.float64]
+Answer = TypeVar('Answer')
 
 SPEED = 0.3
 """Largest speed of a joint on the way to a posture [rad/s]."""
@@ -63,6 +66,7 @@ SPEED = 0.3
 _ACCELERATION = 0.5  # rad/s^2, likewise
 _SHORTEST = 1.0  # s, of a move
 _REST = 1.0  # s, at its end
+_HELD = 'the arm is held until Ctrl-C: engage its brakes first'
 _PAUSE = 0.2  # s, in which an arm at rest does not move
 _OTHERS = {
     EventType.TRAJECTORY: 'a trajectory was sent to the controller',
@@ -168,13 +172,13 @@ def _set_aside(bag: Path, why: str) -> None:
 class _Disturbed:
     """An output that ends a run whose motion is changed: it shows nothing."""
 
-    def __init__(self, stop: Callable[[str], None]) -> None:
-        """`stop` is told what it was."""
-        self._stop = stop
+    def __init__(self, driver: Driver) -> None:
+        """`driver` gets it as its problem."""
+        self._driver = driver
 
     def write(self, _stamp: int, topic: Topic, raw: bytes) -> None:
         if topic in (topics.JOURNAL, topics.TARGETS):
-            self._stop(_OTHERS.get(decode(raw).type, ''))
+            self._driver.problem = _OTHERS.get(decode(raw).type, self._driver.problem)
 
 
 class PostureByPosture:
@@ -199,7 +203,20 @@ class PostureByPosture:
 
     def hold_after(self) -> None:
         """Hold an arm after its last run that would fall otherwise, until an end is requested."""
-        self.driver.hold_until(lambda: self._requests > 0)
+        if self.driver.answers and self._config.robot.drive_compensates == 'none':
+            print_notice(_HELD)
+            self.driver.wait_until(lambda: self._requests > 0)
+
+    def aside(self, compute: Callable[..., Answer], *given: object) -> Answer:
+        """Return the answer of a function that may take longer than a sample, between two runs."""
+        if self.driver.worker is None:
+            return compute(*given)
+        return self._awaited(self.driver.worker.submit(compute, *given))
+
+    def _awaited(self, computed: Future[Answer]) -> Answer:
+        """Return an answer; the arm is held until it is there."""
+        self.driver.wait_until(computed.done)
+        return computed.result()
 
     def request_end(self) -> None:
         """Bring the arm to rest and end, as for a signal; a second request ends at once."""
@@ -246,7 +263,7 @@ class PostureByPosture:
             planned, bag = self._measure(name)
             while k == 1:
                 with named(name):
-                    better = self.driver.aside(
+                    better = self.aside(
                         better_known_by_bag, self._commissioning, planned, bag
                     )
                 if better is None:
@@ -262,7 +279,7 @@ class PostureByPosture:
         planned, bag = self._run_motion(name)
         for _ in range(REPEATS):
             with named(name):
-                again = self.driver.aside(
+                again = self.aside(
                     plan_repeat_by_bag,
                     self._commissioning,
                     planned,
@@ -276,14 +293,14 @@ class PostureByPosture:
             self._commissioning.go_on_with(again)
             planned, bag = self._run_motion(name)
         with named(name):
-            self.driver.aside(check, bag)
+            self.aside(check, bag)
         return planned, bag
 
     def _run_motion(self, name: str) -> tuple[Planned, Path]:
         """Shake the arm where it rests, softer if it oscillates; return the motion and its bag."""
         while True:
             with named(name):
-                planned = self.driver.aside(self._commissioning.motion, self.position())
+                planned = self.aside(self._commissioning.motion, self.position())
             bag = self._run_calmly(planned.config, planned.duration, name)
             if bag is not None:
                 return planned, bag
@@ -293,7 +310,7 @@ class PostureByPosture:
         bag = None
         while bag is None:
             held = self._commissioning.held_with
-            way = self.driver.aside(move, held, self.position(), posture)
+            way = self.aside(move, held, self.position(), posture)
             bag = self._run_calmly(way.config, way.duration, name)
 
     def _run_calmly(
@@ -327,13 +344,11 @@ class PostureByPosture:
             there = start_of(step.config, here)
             is_last = step is steps[-1]
             rest = HOLD if is_last else _REST
-            way = self.driver.aside(move, step.config, here, there, rest)
+            way = self.aside(move, step.config, here, there, rest)
             still = self._run(way.config, way.duration, f'way with {step.name}')
             bag = self._run(step.config, step.duration, step.name)
-            cycles = (
-                self.driver.aside(cycles_in, still, bag, step.config) if is_last else []
-            )
-            yield step, self.driver.aside(errors_of, bag, step.config), cycles
+            cycles = self.aside(cycles_in, still, bag, step.config) if is_last else []
+            yield step, self.aside(errors_of, bag, step.config), cycles
             held = f'{step.share:.0%} of them were calm'
 
     def slow(self, motion: SlowMotion) -> Path:
@@ -342,7 +357,7 @@ class PostureByPosture:
         Raises EndedError or BlfDscError as `runs`.
         """
         self._left = f'The gains are proven; bags are in {self._folder}'
-        way = self.driver.aside(move, motion.config, self.position(), motion.posture)
+        way = self.aside(move, motion.config, self.position(), motion.posture)
         self._run(way.config, way.duration, 'way to slow motion')
         return self._run(motion.config, motion.duration, 'slow motion')
 
@@ -359,18 +374,20 @@ class PostureByPosture:
 
         Raises EndedError or BlfDscError if it ended before its time.
         """
-        with self.driver.meanwhile(
-            lambda: ArmController(config, record=bag, stamps='wall')
-        ) as controller:
+        with (
+            ThreadPoolExecutor(1) as thread,
+            self._awaited(
+                thread.submit(ArmController, config, record=bag, stamps='wall')
+            ) as controller,
+        ):
             loop = self._loop = DriveLoop(
                 self.driver,
                 controller,
                 duration=duration,
-                settle_time=self.driver.config.settle_time,
                 feedback='host',  # what moves the arm is the torque alone, as recorded
             )
             if self.driver.answers:
-                controller.add_output(_Disturbed(loop.stop))
+                controller.add_output(_Disturbed(self.driver))
             if self._requests:
                 raise self._ended(name, End.REQUESTED, '', None)
             with named(name):

@@ -11,7 +11,8 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, ParamSpec, TypeVar
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,8 +29,7 @@ if TYPE_CHECKING:
     from blf_dsc_controller.supervision.load_declaration import LoadDeclaration
 
 Vector = NDArray[np.float64]
-Given = ParamSpec('Given')
-Answer = TypeVar('Answer')
+_POLL = 0.01  # s
 
 
 class DriverError(BlfDscError):
@@ -85,12 +85,16 @@ class Driver(ABC):
         latency: time [s] from a state until the robot acts on the answer.
         answers: whether it answers states by the controller itself, as the node over ROS
             does; then `read` returns those that are answered, or None for a moment without.
+        worker: computes what takes long while the robot rests; None: there is time.
+        problem: why the arm is to come to rest, and the run to end; empty while all is well.
     """
 
     facts: ClassVar[Facts]
     has_feedback: ClassVar[bool] = False
     latency: float = 0.0
     answers: ClassVar[bool] = False
+    worker: Executor | None = None
+    problem: str = ''
 
     @classmethod
     def facts_for(cls, controller: ControllerConfig) -> Facts:
@@ -117,8 +121,13 @@ class Driver(ABC):
     def positions(self) -> ArrayLike:
         """Return the positions (n,) [rad] of the robot at rest, before `start`."""
 
-    def answer_by(self, controller: ArmController) -> None:  # noqa: B027 - for `answers`
-        """Answer states by this controller from the next `start` on."""
+    def answer_by(  # noqa: B027 - for `answers`
+        self, controller: ArmController, took: Callable[[float], None]
+    ) -> None:
+        """Answer states by this controller from the next `start` on.
+
+        `took` is told the time [s] from each state to its torque.
+        """
 
     @abstractmethod
     def start(self) -> None:
@@ -134,11 +143,6 @@ class Driver(ABC):
     @abstractmethod
     def write(self, torque: Vector | None) -> None:
         """Command torques (n,) [N m]; None: whatever lets the robot go on as it is."""
-
-    @property
-    def problem(self) -> str:
-        """Why the arm is to come to rest, and the run to end; empty while all is well."""
-        return ''
 
     @property
     def inputs(self) -> MotionInput | None:
@@ -188,23 +192,13 @@ class Driver(ABC):
 
     def wait(self, seconds: float) -> None:
         """Let time pass while the robot rests."""
-        time.sleep(seconds)
+        end = time.monotonic() + seconds
+        self.wait_until(lambda: time.monotonic() > end)
 
-    def aside(
-        self,
-        compute: Callable[Given, Answer],
-        *given: Given.args,
-        **named: Given.kwargs,
-    ) -> Answer:
-        """Return the answer of a function that may take long, while the robot rests."""
-        return compute(*given, **named)
-
-    def meanwhile(self, make: Callable[[], Answer]) -> Answer:
-        """Return what `make` returns after a moment, while the robot rests."""
-        return make()
-
-    def hold_until(self, is_over: Callable[[], bool]) -> None:  # noqa: B027 - most hold themselves
-        """Hold an arm after its last run that would fall otherwise."""
+    def wait_until(self, is_over: Callable[[], bool]) -> None:
+        """Likewise, until something is so."""
+        while not is_over():
+            time.sleep(_POLL)
 
     def close(self) -> None:  # noqa: B027 - most have nothing to leave
         """Leave the robot, after the last `finish` or an error."""

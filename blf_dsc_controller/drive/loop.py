@@ -76,13 +76,12 @@ class DriveLoop:
         controller: ArmController,
         *,
         duration: float = math.inf,
-        settle_time: float = 3.0,
         beside: Beside | None = None,
         feedback: Literal['host', 'motor'] = 'host',
     ) -> None:
         """Run for `duration` [s] of the robot's time, with what is beside the loop.
 
-        The end may take `settle_time` [s] more.  The driver is connected; `feedback` is
+        The end may take `drive.settle_time` more.  The driver is connected; `feedback` is
         `drive.feedback`.
 
         Raises:
@@ -95,7 +94,7 @@ class DriveLoop:
         self._driver = driver
         self._controller = controller
         self._duration = duration
-        self._settle_time = settle_time
+        self._settle_time = driver.config.settle_time
         self._declaration = driver.declaration or DriverDeclaration(driver)
         self._load_in_motion = driver.facts_for(controller.config).load_in_motion
         self._feedback: MotorFeedback | None = None
@@ -105,7 +104,6 @@ class DriveLoop:
         self._requests = 0
         self._states = 0
         self._stamp = math.nan  # s, of the last state
-        self._problem = ''
         self._received = 0.0  # s, when `read` returned last
         self._begin = math.nan  # s, stamp of the first state
         self._end: End | None = None
@@ -122,10 +120,6 @@ class DriveLoop:
         """Bring the arm to rest and end, as for a signal; a second request ends at once."""
         self._requests += 1
 
-    def stop(self, problem: str) -> None:
-        """Bring the arm to rest and end, as after a stop of the controller."""
-        self._problem = self._problem or problem
-
     def run(self) -> Outcome:
         """Control the robot until the end.
 
@@ -139,7 +133,7 @@ class DriveLoop:
             # a node is undisturbed from its start on: it holds the arm between two runs, too
             with nullcontext() if self._driver.answers else undisturbed_loop():
                 self._controller.prepare(self._driver.positions())
-                self._driver.answer_by(self._controller)
+                self._driver.answer_by(self._controller, self.latency.add)
                 self._driver.start()
                 self._control()
         except ReflexError as error:
@@ -225,9 +219,9 @@ class DriveLoop:
         elif self._requests:
             controller.stop()
             self._begin_end(End.REQUESTED)
-        elif problem := self._problem or self._driver.problem:
+        elif self._driver.problem:
             controller.stop()
-            self._begin_end(End.STOPPED, problem)
+            self._begin_end(End.STOPPED, self._driver.problem)
         elif self._stamp - self._begin >= self._duration:
             controller.stop()
             self._begin_end(End.DURATION)

@@ -13,13 +13,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import (
     Executor,
-    Future,
     ProcessPoolExecutor,
-    ThreadPoolExecutor,
 )
 from contextlib import ExitStack
 from functools import partial
-from math import inf
 from multiprocessing import get_context
 from pathlib import Path
 from typing import ClassVar
@@ -36,12 +33,9 @@ from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.control.realtime import undisturbed_loop
 from blf_dsc_controller.drive.driver import (
-    Answer,
     ConnectionLostError,
     Driver,
-    DriverError,
     Facts,
-    Given,
     RobotState,
     Vector,
 )
@@ -54,8 +48,8 @@ from blf_dsc_controller.supervision.load_declaration import LoadDeclaration
 # s without joint states, or anybody who takes torques: longer than the watchdog of the
 # law waits, which is for stamps of the wall clock only
 _PATIENCE = 10.0
+_FRESH = 0.02  # s, in which a newer state comes
 _LOOK = 1.0  # s between looks whether somebody takes the torques
-_HELD = 'the arm is held until Ctrl-C: engage its brakes first'
 _NAME = 'blf_dsc_drive'  # of the node that asks for a URDF
 _URDF = 'robot.urdf'
 
@@ -64,32 +58,19 @@ class RosDriver(Driver):
     """A robot behind the topics of joint states and torques."""
 
     answers: ClassVar[bool] = True
-
-    @classmethod
-    def facts_for(cls, controller: ControllerConfig) -> Facts:
-        """Return what the configuration says: the states themselves are looked at."""
-        n = len(controller.joints)
-        robot = controller.robot
-        return Facts(
-            joints=n,
-            period=controller.sample_time,
-            drive_compensates=robot.drive_compensates,
-            effort=robot.effort,
-            torque_limit=(inf,) * n,
-            torque_rate=(inf,) * n,
-        )
+    facts: ClassVar[Facts] = Facts(0, 0.0, '', '', (), ())  # they are in the states
 
     @staticmethod
     def received(
         path: Path, given: Mapping[str, object], config: DriveConfig
     ) -> dict[str, object]:
         """Return the URDF of a file if it comes from a topic; `given` takes precedence."""
-        names = [
-            section.entries[_URDF].value
-            for section in read(path)
-            if _URDF in section.entries
-        ]
-        name = str(given.get(_URDF) or (names[-1] if names else ''))
+        name = ''
+        for section in read(path):
+            name = (
+                str(section.entries[_URDF].value) if _URDF in section.entries else name
+            )
+        name = str(given.get(_URDF, name))
         if not name.startswith(TOPIC):
             return {}
         _begin_ros(config)
@@ -107,7 +88,6 @@ class RosDriver(Driver):
         super().__init__(address, controller, config)
         self._ending = ExitStack()
         self._is_begun = False
-        self._worker: Executor | None = None
         self._others = 0  # publishers of torques, beside the node, since the start
         self._looked = 0.0  # s, when there was the last look at who takes the torques
         self._began = 0.0  # s
@@ -125,27 +105,29 @@ class RosDriver(Driver):
         self._is_begun = True
         _begin_ros(self.config)
         self._ending.callback(rclpy.try_shutdown)
+        worker = self._ending.enter_context(
+            ProcessPoolExecutor(
+                1, get_context('spawn'), signal.signal, (signal.SIGINT, signal.SIG_IGN)
+            )
+        )
         executor = self._ending.enter_context(EventsExecutor())
         node = DrivenNode(self.controller)
         self._ending.callback(node.destroy_node)
         self._ending.callback(node.close)
         executor.add_node(node)
-        self.attach(node, partial(process.spin_once, executor, node))
+        self.attach(node, partial(process.spin_once, executor, node), worker)
         self._ending.enter_context(undisturbed_loop())
 
     def attach(
         self,
         node: DrivenNode,
         spin: Callable[[], None],
-        worker: Executor | None = None,
+        worker: Executor,
     ) -> None:
-        """Use a node, which `spin` lets work for a moment.
-
-        `worker` computes beside the loop; without one, another process does.
-        """
+        """Use a node, which `spin` lets work for a moment, and a worker beside it."""
         self._node = node
         self._spin = spin
-        self._worker = worker
+        self.worker = worker
 
     @property
     def inputs(self) -> MotionInput | None:
@@ -157,32 +139,25 @@ class RosDriver(Driver):
         """How the node declares loads to the driver's service, if there is one."""
         return self._node.declaration
 
-    @property
-    def problem(self) -> str:
-        """That there are more other publishers of torques than before the start; or empty.
-
-        One that was killed stays visible for some time.
-        """
-        node = self._node
-        self._others = min(self._others, node.others)
-        if node.others == self._others:
-            return ''
-        return f'another node publishes torques on {node.commands}, too'
-
     def positions(self) -> Vector:
         """Return the positions (n,) [rad] of the last joint state."""
+        self.wait(_FRESH)
         self._await_arm()
         position = self._node.position()
         assert position is not None  # noqa: S101 - for mypy
         return position
 
-    def answer_by(self, controller: ArmController) -> None:
+    def answer_by(
+        self, controller: ArmController, took: Callable[[float], None]
+    ) -> None:
         """Answer states by this controller from the next `start` on."""
         self._controller = controller
+        self._node.took = took
 
     def start(self) -> None:
         """Let the controller take command with the next state that it may start from."""
         node = self._node
+        self.problem = ''
         if not node.guard or not node.guard.commanding:
             self._others = node.others
         self._began = time.monotonic()
@@ -193,9 +168,10 @@ class RosDriver(Driver):
         """Let the node work for a moment; return the state that it has answered, if any."""
         self._spin()
         guard = self._controller.guard
-        if guard.starting.error is not None:
+        if guard.starting.error is not None and not guard.commanding:
             raise guard.starting.error
         self._check_for_loss()
+        self._look_for_others()
         stamp = guard.journal.stamp
         if stamp == self._last or not guard.commanding:
             return None
@@ -214,46 +190,8 @@ class RosDriver(Driver):
     def recover(self) -> None:
         """Do nothing: no robot behind ROS says that it has stopped by itself."""
 
-    def wait(self, seconds: float) -> None:
+    def wait_until(self, is_over: Callable[[], bool]) -> None:
         """Let time pass, in which the node holds the arm."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._spin()
-
-    def aside(
-        self,
-        compute: Callable[Given, Answer],
-        *given: Given.args,
-        **named: Given.kwargs,
-    ) -> Answer:
-        """Return the answer of a function that another process computes."""
-        if self._worker is None:
-            self._worker = self._ending.enter_context(
-                ProcessPoolExecutor(
-                    1,
-                    get_context('spawn'),
-                    signal.signal,
-                    (signal.SIGINT, signal.SIG_IGN),
-                )
-            )
-        return self._awaited(self._worker.submit(compute, *given, **named))
-
-    def meanwhile(self, make: Callable[[], Answer]) -> Answer:
-        """Return what a thread makes."""
-        with ThreadPoolExecutor(1) as thread:
-            return self._awaited(thread.submit(make))
-
-    def _awaited(self, computed: Future[Answer]) -> Answer:
-        """Return an answer; the node holds the arm until it is there."""
-        while not computed.done():
-            self._spin()
-        return computed.result()
-
-    def hold_until(self, is_over: Callable[[], bool]) -> None:
-        """Hold an arm whose drives do not."""
-        if self.controller.robot.drive_compensates != 'none':
-            return
-        self._node.get_logger().warning(_HELD)
         while not is_over():
             self._spin()
 
@@ -261,39 +199,48 @@ class RosDriver(Driver):
         """Leave the torque that the driver may hold, and end the node."""
         self._ending.close()
 
+    def _look_for_others(self) -> None:
+        """Note a problem if there are more other publishers of torques than before the start.
+
+        One that was killed stays visible for some time.
+        """
+        node = self._node
+        self._others = min(self._others, node.others)
+        if node.others > self._others:
+            self.problem = f'another node publishes torques on {node.commands}, too'
+
     def _await_arm(self) -> None:
         """Wait until there are joint states, and somebody takes the torques.
 
-        Raises DriverError if there are none, or nobody does, for ten seconds.
+        Raises ConnectionLostError if there are none, or nobody does, for ten seconds.
         """
-        node = self._node
         end = time.monotonic() + _PATIENCE
-        while node.position() is None:
+        while self._node.position() is None:
             self._spin()
-            if time.monotonic() < end:
-                continue
-            if not node.is_heard:
-                raise DriverError(
-                    f'nobody takes torques on {node.commands}: start the effort controller, or '
-                    'name its topic with --commands, or as drive.commands'
-                )
-            raise DriverError(
-                f'no joint states on {node.states}: start the driver, or name its topic with '
-                '--states, or as drive.states'
-            )
+            if time.monotonic() > end:
+                self._check_for_loss()
+                raise self._no_states(_PATIENCE)
+
+    def _no_states(self, seconds: float) -> ConnectionLostError:
+        """Return the error of this time [s] without joint states of the arm."""
+        return ConnectionLostError(
+            f'no joint states on {self._node.states} for {seconds:.2g} s: start the driver, or '
+            'name its topic with --states, or as drive.states'
+        )
 
     def _check_for_loss(self) -> None:
         """Raise ConnectionLostError without joint states, or anybody who takes torques."""
         node, now = self._node, time.monotonic()
         silent = now - max(node.heard, self._began)
-        if silent > _PATIENCE:
-            raise ConnectionLostError(
-                f'no joint states on {node.states} for {silent:.2g} s'
-            )
         if now - self._looked > _LOOK:
             self._looked = now
             if not node.is_heard:
-                raise ConnectionLostError(f'nobody takes torques on {node.commands}')
+                raise ConnectionLostError(
+                    f'nobody takes torques on {node.commands}: start the effort controller, or '
+                    'name its topic with --commands, or as drive.commands'
+                )
+        if silent > _PATIENCE:
+            raise self._no_states(silent)
 
 
 def _begin_ros(config: DriveConfig) -> None:

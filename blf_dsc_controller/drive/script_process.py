@@ -96,7 +96,6 @@ def _run(driver: Driver, controller: ArmController, script: Script, link: Link) 
         loop = DriveLoop(
             driver,
             controller,
-            settle_time=driver.config.settle_time,
             beside=script,
             feedback=driver.config.feedback,
         )
@@ -113,7 +112,7 @@ def _run(driver: Driver, controller: ArmController, script: Script, link: Link) 
             f'{loop.worst:.0%} of its bound; from state to torque {1e6 * median:.0f} us in the '
             f'median, {1e6 * most:.0f} us at 99 %'
         )
-        if not waits or _awaited(link, script_link.RECOVER) is None:
+        if not waits or _awaited(link, script_link.RECOVER, driver) is None:
             return
         if outcome.end is End.LOST:
             for remark in driver.connect():
@@ -121,11 +120,17 @@ def _run(driver: Driver, controller: ArmController, script: Script, link: Link) 
         controller.start()
 
 
-def _awaited(link: Link, kind: int) -> Any:
-    """Wait for a message and return its content; None if the script closes or ends."""
+def _awaited(link: Link, kind: int, driver: Driver | None = None) -> Any:
+    """Wait for a message and return its content; None if the script closes or ends.
+
+    The robot of a `driver` rests meanwhile.
+    """
     while not link.broken:
         link.flush()
-        link.wait(_POLL)
+        if driver is None:
+            link.wait(_POLL)
+        else:
+            driver.wait(_POLL)
         for got, content in link.messages():
             if got == script_link.CLOSE:
                 return None

@@ -8,6 +8,7 @@ from this torque, so nothing steps, and an unknown load does not sag.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ class DrivenNode(ControllerNode):
     """The controller's node without a controller of its own: `begin` gives it each.
 
     Attributes:
+        took: is told how long each torque took after its state came [s].
         heard: when the last joint state came, on the steady clock [s]; before the first,
             when the node was made.
     """
@@ -38,10 +40,11 @@ class DrivenNode(ControllerNode):
     def __init__(self, config: ControllerConfig, **options: Any) -> None:
         """Configure the node; it commands nothing before a controller begins."""
         self._acting: np.ndarray | None = None  # N m, the last torque
+        self.took: Callable[[float], None] = lambda _: None
         self.heard = time.monotonic()
         overrides = [
             Parameter(name, value=list(value) if isinstance(value, tuple) else value)
-            for name, value in flatten(config).items()
+            for name, value in {**flatten(config), 'autostart': True}.items()
             if value != ()
         ]
         super().__init__(parameter_overrides=overrides, **options)
@@ -53,12 +56,6 @@ class DrivenNode(ControllerNode):
         Raises BlfDscError if it cannot.
         """
         self._try_each('configure')
-
-    def start(self) -> None:
-        """Start timers and services, and configure the node."""
-        super().start()
-        if not self.config.autostart:
-            self.autostart()
 
     @property
     def commands(self) -> str:
@@ -93,6 +90,7 @@ class DrivenNode(ControllerNode):
         acting, self._acting = self._acting, None
         self._loop, self.config, self.guard = controller.loop, controller.config, guard
         self.log.begin()
+        self.end(controller)  # of a run that was lost
         self.outputs.add(controller.outputs)
         if acting is None:
             self._try_each('activate')
@@ -112,6 +110,7 @@ class DrivenNode(ControllerNode):
         super()._command(torque)
         if torque is not None:
             self._acting = np.array(torque)
+            self.took(time.monotonic() - self.heard)
 
     def _on_joint_state(self, raw: bytes) -> None:
         self.heard = time.monotonic()
