@@ -11,22 +11,24 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
+from command import wait_for
 from elastic_two_link import ARM, NEAR, shorten_motions, shorten_moves
 from rclpy.parameter import Parameter
 from ros_rig import PATIENCE
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import BlfDscError
-from blf_dsc_controller.cli import commission_ros
-from blf_dsc_controller.cli.commission_ros import made
+from blf_dsc_controller.cli import commission
 from blf_dsc_controller.cli.main import main
-from blf_dsc_controller.commissioning import over_ros, postures, proof
-from blf_dsc_controller.commissioning.over_ros import OverRos
-from blf_dsc_controller.commissioning.postures import EndedError
+from blf_dsc_controller.commissioning import postures, proof
+from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
+from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.drive import ros as drive_ros
 from blf_dsc_controller.drive.loop import End
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
+from blf_dsc_controller.nodes.driven_node import DrivenNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 
@@ -45,16 +47,14 @@ class Rig:
         self.commissioning = blf.Commissioning(loop.controller)
         values = {k: v for k, v in flatten(loop.plant).items() if v != ()}
         self.arm = ros.add(PlantNode, {**values, 'mode': 'lockstep'}, **options)
-        self.node = ros.keep(made(loop.controller, context=ros.context, cli_args=[]))
+        self.node = ros.keep(
+            DrivenNode(loop.controller, context=ros.context, cli_args=[])
+        )
         self.due = lambda: False
         self.then = self.always = lambda: None
-        self.robot = OverRos(
-            self.node,
-            self.spin,
-            self.commissioning,
-            self.bags,
-            ThreadPoolExecutor(1),
-        )
+        driver = drive_ros.RosDriver('ros', loop.controller, DriveConfig())
+        driver.attach(self.node, self.spin, ThreadPoolExecutor(1))
+        self.robot = PostureByPosture(driver, self.commissioning, self.bags)
 
     def spin(self):
         self.ros.executor.spin_once(timeout_sec=0.01)
@@ -85,7 +85,6 @@ class Rig:
         return (guard.journal.stamp - guard.reference.start_stamp) * 1e-9
 
     def measured(self, *postures):
-        self.robot.wait()
         return list(self.robot.runs(np.array(postures)))
 
     def speed(self):
@@ -95,7 +94,7 @@ class Rig:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """Wait for a slow arm as long as for anything in these tests."""
-    monkeypatch.setattr(over_ros, '_PATIENCE', PATIENCE)
+    monkeypatch.setattr(drive_ros, '_PATIENCE', PATIENCE)
 
 
 @pytest.fixture
@@ -135,9 +134,7 @@ def test_arm_is_held_after_the_proof_until_ctrl_c(ros, tmp_path, monkeypatch, ca
     monkeypatch.setattr(proof, '_LAST', 0.5)
     monkeypatch.setattr(postures, 'HOLD', 0.1)
     rig = Rig(ros, tmp_path, ARM + CHOSEN)
-    monkeypatch.setattr(
-        commission_ros, 'robot_over_ros', lambda *_: nullcontext(rig.robot)
-    )
+    monkeypatch.setattr(commission, 'robot', lambda *_: nullcontext(rig.robot))
     told, held = '', []
 
     def hold():
@@ -148,7 +145,7 @@ def test_arm_is_held_after_the_proof_until_ctrl_c(ros, tmp_path, monkeypatch, ca
             if held[-1] - held[0] > 0.1e9:
                 rig.robot.request_end()
 
-    rig.robot.wait()
+    rig.robot.position()
     rig.always = hold
     words = ['commission', '--ros', '--prove', '--yes', '--config', str(rig.file)]
     assert main([*words, '--record', str(rig.bags)]) == 0
@@ -203,8 +200,8 @@ def test_a_driver_that_is_gone_is_told(rig, takes, told, monkeypatch):
     def lose():
         rig.ros.kill(rig.arm)
         # of states, which are gone as well; and of the look at who takes the torques
-        monkeypatch.setattr(over_ros, '_PATIENCE', 1.0 if takes else 10.0)  # s
-        monkeypatch.setattr(over_ros, '_LOOK', 0.0)  # s
+        monkeypatch.setattr(drive_ros, '_PATIENCE', 1.0 if takes else 10.0)  # s
+        monkeypatch.setattr(drive_ros, '_LOOK', 0.0)  # s
 
     rig.during('move', lose)
     with pytest.raises(EndedError, match=told) as caught:
@@ -272,7 +269,23 @@ def test_watchdog_relies_on_each_run(rig):
 
 
 def test_parameters_cannot_be_changed_meanwhile(rig):
-    rig.measured()
+    rig.robot.position()
     (answer,) = rig.node.set_parameters([Parameter('feedback.stiffness', value=2.0)])
     assert not answer.successful
     assert 'an arm is being measured' in answer.reason
+
+
+def test_the_arm_is_held_while_the_next_run_is_prepared(rig, monkeypatch):
+    """Its states are answered meanwhile, however long that takes."""
+    made = postures.ArmController
+
+    def make(*given, **named):
+        before = rig.arm.plant.sample
+        if before:  # the arm waits for the first torque
+            wait_for(lambda: rig.arm.plant.sample > before + 10)
+        return made(*given, **named)
+
+    monkeypatch.setattr(postures, 'ArmController', make)
+    rig.during('motion', rig.robot.request_end)
+    with pytest.raises(EndedError, match='posture 1: ended on request'):
+        rig.measured(NEAR)

@@ -196,8 +196,8 @@ class LoadedDriver(PlantDriver):
         }
         loop = blf.load_loop('fr3_direct', RIGID)
         self.what, self.at = '', -1
-        self.config = blf.change(loop.plant, changes)
-        self.plant = plant_of(self.config)
+        self.plant_config = blf.change(loop.plant, changes)
+        self.plant = plant_of(self.plant_config)
         self.told = []
         self.efforts = []
         self.count = self.late = self.mass = 0
@@ -212,11 +212,11 @@ class LoadedDriver(PlantDriver):
         if self.told and self.told[-1].mass != self.mass:  # it is in force from now on
             load = self.told[-1]
             robot = replace(
-                self.config.robot,
+                self.plant_config.robot,
                 drive_payload=load.mass,
                 drive_payload_centre=load.centre,
             )
-            self.plant.change(plant_settings(replace(self.config, robot=robot)))
+            self.plant.change(plant_settings(replace(self.plant_config, robot=robot)))
             self.mass = load.mass
         self.torques.append(torque)
         self.plant.step(np.zeros(7) if torque is None else torque)

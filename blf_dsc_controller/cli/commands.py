@@ -136,7 +136,8 @@ _DRIVE = Command(
     options=(
         option(
             '--robot',
-            'address of the robot; simulated: the simulated arm of the file',
+            'address of the robot; simulated: the simulated arm of the file; ros: the robot '
+            'behind topics',
             required=True,
         ),
         option(
@@ -234,10 +235,10 @@ _COMMISSION = Command(
     name='commission',
     module='commission',
     about='Measure an arm from a URDF, and choose its gains by what was measured. A reference '
-    'shakes all joints a little, in a few postures; from torques and positions follow the '
+    'excites all joints a little, in a few postures; from torques and positions follow the '
     'responses of the joints, and the stiffest gains with a modulus margin. With --robot, the '
-    'driver of `blf_dsc drive` moves the robot to each posture and measures it; with --ros, the '
-    "controller's node does. With --write, write the motions for a loop of your own; then give "
+    'driver of `blf_dsc drive` moves the robot to each posture and measures it; --ros is '
+    '--robot ros. With --write, write the motions for a loop of your own; then give '
     'their bags. With none of these the arm is simulated. Exit code: 0 done, 3 no gains have the '
     'margin, 5 the controller or the robot stopped before, 130 interrupted, 1 an error.',
     example='--config ur5e --out commissioned.yaml\n'
@@ -262,7 +263,7 @@ _COMMISSION = Command(
         ),
         option(
             '--ros',
-            'measure the robot behind topics; with BAGs, these count, too',
+            'measure the robot behind topics, as with --robot ros',
             action='store_true',
         ),
         option(

@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 
 from blf_dsc_controller.cli.commission_ripple import (
@@ -17,14 +16,13 @@ from blf_dsc_controller.cli.commission_robot import (
     ask,
     measured_on,
     of_proof,
-    print_proof,
-    proven,
+    prove,
     robot,
+    topics_of,
 )
 from blf_dsc_controller.cli.commissioned_file import CommissionedFile
 from blf_dsc_controller.cli.drive import CODES
 from blf_dsc_controller.cli.main import make_room
-from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.commissioning import (
     files,
     page,
@@ -37,10 +35,9 @@ from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.measurement import Measured, measured_in
 from blf_dsc_controller.commissioning.picture import draw
-from blf_dsc_controller.commissioning.postures import EndedError, PostureByPosture
+from blf_dsc_controller.commissioning.postures import EndedError
 from blf_dsc_controller.commissioning.slow_motion import slow_motion
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -52,6 +49,7 @@ from blf_dsc_controller.configuration.nodes import (
     locate,
     read,
 )
+from blf_dsc_controller.drive.drivers import ROS, config_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.numerics.digits import largest_error
 from blf_dsc_controller.progress import announce_reading, print_notice, steps
@@ -60,6 +58,10 @@ Runs = list[tuple[str, Measured]]
 """Runs with their names."""
 
 _CHOOSING = 'choosing the gains by what was measured: some ten seconds'
+_IN_MOTORS = (
+    'warning: drive.feedback is motor, but a commissioning measures with torques over the bus, '
+    'and chooses gains that are stable there: in the motors higher ones are'
+)
 
 NO_MARGIN = 3
 """Exit code if no gains have the margin."""
@@ -68,32 +70,25 @@ NO_MARGIN = 3
 def commission(options: Namespace) -> int:
     """Write the motions to run, or measure, choose and write the gains."""
     _check(options)
+    if options.ros:
+        options.robot = ROS
     path = locate(options.config)
     if ignored := ignored_in(path, (CONTROLLER, DRIVE)):
         print_notice(f'warning: {ignored}')
-    if not options.ros:
-        return _commission(options, path, load(path, CONTROLLER, ControllerConfig))
-    require_ros()
-    from blf_dsc_controller.cli.commission_ros import config_over_ros, ros_session
-
-    with ros_session(options):
-        return _commission(options, path, config_over_ros(path))
-
-
-def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int:
-    """Write the motions of a configuration, or measure, choose and write the gains."""
+    config = config_of(options.robot or '', path, topics_of(options))
     if options.ripple:
         slow_motion(config)  # an error comes before anything moves
+    in_motors = load(path, DRIVE, DriveConfig).feedback == 'motor'
     commissioning = Commissioning(
         config,
         options.posture,
         torque=options.torque,
         travel=options.travel,
         margin=options.margin,
-        lags=_lags(path),
+        lags=() if in_motors else LAGS,  # such motors have none
     )
-    if _in_motors(path) and (options.robot or options.ros or not options.bags):
-        _warn_in_motors()
+    if in_motors and (options.robot or not options.bags):
+        print_notice(_IN_MOTORS)
     if options.write:
         _write_motions(options, path, commissioning)
         return 0
@@ -101,7 +96,7 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         work = _prove_on_robot
     else:
         make_room(options.out, _picture(options.out), force=options.force)
-        work = _on_robot if options.robot or options.ros else _by_runs
+        work = _measure
     try:
         return work(options, path, commissioning)
     except EndedError as error:
@@ -109,38 +104,35 @@ def _commission(options: Namespace, path: Path, config: ControllerConfig) -> int
         return CODES[error.end]
 
 
-def _by_runs(options: Namespace, path: Path, commissioning: Commissioning) -> int:
-    """Commission by bags, or else on the simulated arm."""
-    file = _file(options, path)
-    if options.bags:
-        runs = _given(options, commissioning.config)
-        found = _chosen(commissioning, runs)
-        return _written(file, found, _names(commissioning, runs))
-    runs, missing = _simulated(path, commissioning)
-    file = file._replace(missing=tuple(missing))
-    found = _chosen(commissioning, runs)
-    if code := _written(file, found, [name for name, _ in runs]):
+def _measure(options: Namespace, path: Path, commissioning: Commissioning) -> int:
+    """Commission by the bags that are given, and a robot, or else on the simulated arm."""
+    file = CommissionedFile(
+        path=options.out,
+        source=path,
+        name=options.config,
+        command=options.line,
+        is_simulated=not (options.bags or options.robot),
+        ripple_follows=options.ripple,
+    )
+    announce_reading(options.bags, 'read')
+    runs = [(str(bag), measured_in(bag, commissioning.config)) for bag in options.bags]
+    if options.robot:
+        with robot(options, path, commissioning) as arm:
+            measured = measured_on(options, arm, commissioning)
+            arm.hold_after()
+        runs += [(name, measured_in(bag)) for name, bag in measured]
+    elif file.is_simulated:
+        runs, missing = _simulated(path, commissioning)
+        file = file._replace(missing=tuple(missing))
+    print_notice(_CHOOSING)
+    names = [name for name, _ in runs]
+    found = commissioning.result([run for _, run in runs], names)
+    shaken = [name for name, run in runs if not commissioning.is_slow_motion(run)]
+    code = _written(file, found, shaken)
+    if code or not file.is_simulated:
         return code
     stop = _prove(file.path)
     return on_simulated(file, found, stop) if options.ripple else 0
-
-
-def _on_robot(options: Namespace, path: Path, commissioning: Commissioning) -> int:
-    """Commission a robot, with the bags that are given, too."""
-    runs = _given(options, commissioning.config)
-    with _arm(options, path, commissioning) as arm:
-        measured = measured_on(options, arm, commissioning)
-        arm.hold_after()
-    runs += [(name, measured_in(bag)) for name, bag in measured]
-    found = _chosen(commissioning, runs)
-    return _written(_file(options, path), found, _names(commissioning, runs))
-
-
-def _chosen(commissioning: Commissioning, runs: Runs) -> Commissioned:
-    """Return what runs show, and the gains that follow."""
-    print_notice(_CHOOSING)
-    names = [name for name, _ in runs]
-    return commissioning.result([run for _, run in runs], names)
 
 
 def _written(file: CommissionedFile, found: Commissioned, names: Sequence[str]) -> int:
@@ -161,44 +153,9 @@ def _written(file: CommissionedFile, found: Commissioned, names: Sequence[str]) 
     return 0
 
 
-def _file(options: Namespace, path: Path) -> CommissionedFile:
-    """Return the file to write for the parameter file at a path."""
-    return CommissionedFile(
-        path=options.out,
-        source=path,
-        name=options.config,
-        command=options.line,
-        is_simulated=_is_simulated(options),
-        ripple_follows=options.ripple,
-    )
-
-
 def _picture(out: Path) -> Path:
     """Return the path of the picture beside a parameter file."""
     return out.with_suffix('.png')
-
-
-def _in_motors(path: Path) -> bool:
-    """Whether motors close the feedback of a file."""
-    return load(path, DRIVE, DriveConfig).feedback == 'motor'
-
-
-def _lags(path: Path) -> Sequence[float]:
-    """Return the lags of the damping to try [s]: motors that close the feedback have none."""
-    return () if _in_motors(path) else LAGS
-
-
-def _warn_in_motors() -> None:
-    """Warn that a feedback which motors close is measured over the bus."""
-    print_notice(
-        'warning: drive.feedback is motor, but a commissioning measures with torques over the bus, '
-        'and chooses gains that the arm bears there: motors bear more'
-    )
-
-
-def _is_simulated(options: Namespace) -> bool:
-    """Whether the options measure the simulated arm."""
-    return not (options.bags or options.robot or options.ros)
 
 
 def _check(options: Namespace) -> None:
@@ -235,32 +192,11 @@ def _check(options: Namespace) -> None:
         raise BlfDscError(
             '--yes and --record are for a robot: give --robot or --ros, too'
         )
-    if not options.ros and (options.states or options.commands or options.namespace):
+    is_over_ros = options.ros or options.robot == ROS
+    if topics_of(options)[DRIVE] and not is_over_ros:
         raise BlfDscError(
             '--states, --commands and --namespace are for topics: give --ros, too'
         )
-
-
-def _given(options: Namespace, config: ControllerConfig) -> Runs:
-    """Return the runs of the bags that are given, which must be of the same joints."""
-    announce_reading(options.bags, 'read')
-    return [(str(bag), measured_in(bag, config)) for bag in options.bags]
-
-
-def _names(commissioning: Commissioning, runs: Runs) -> list[str]:
-    """Return the names of the runs in postures."""
-    return [name for name, run in runs if not commissioning.is_slow_motion(run)]
-
-
-def _arm(
-    options: Namespace, path: Path, commissioning: Commissioning
-) -> AbstractContextManager[PostureByPosture]:
-    """Return the robot that the options name, still to be entered."""
-    if options.robot:
-        return robot(options, path, commissioning)
-    from blf_dsc_controller.cli.commission_ros import robot_over_ros
-
-    return robot_over_ros(options, commissioning)
 
 
 def _prove_on_robot(
@@ -276,9 +212,9 @@ def _prove_on_robot(
     if options.ripple:
         make_room(options.out, force=options.force)
         before.append(ripple_page.description(slow_motion(config)))
-    with _arm(options, path, commissioning) as arm:
+    with robot(options, path, commissioning) as arm:
         ask(options, before)
-        print_proof(config, *proven(arm, planned, config))
+        prove(arm, planned, config)
         code = after_proof(options, arm, config, path) if options.ripple else 0
         arm.hold_after()
     return code

@@ -1,34 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture.
-
-`--ros` has the same limits and question.
-"""
+"""`blf_dsc commission --robot`: the limits, a question, and the robot in each posture."""
 
 from __future__ import annotations
 
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.cli.drive import signals_to
+from blf_dsc_controller.cli.drive import connect, signals_to
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.commissioning import page
 from blf_dsc_controller.commissioning.commissioning import (
     REPEATS,
     Commissioning,
 )
-from blf_dsc_controller.commissioning.driven import Driven
-from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
+from blf_dsc_controller.commissioning.limit_cycle import HOLD
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
 from blf_dsc_controller.commissioning.proof import (
     SHARES,
-    Errors,
     Step,
     name_of,
     seconds,
@@ -36,10 +31,9 @@ from blf_dsc_controller.commissioning.proof import (
 from blf_dsc_controller.commissioning.strength import MOST
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import PLANT
+from blf_dsc_controller.configuration.nodes import DRIVE, PLANT
 from blf_dsc_controller.configuration.plant import pick_ups
 from blf_dsc_controller.control.arm_controller import ArmController
-from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.drivers import driver_of
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.numerics.digits import largest_error
@@ -60,18 +54,26 @@ def robot(
     """
     folder = prepared_folder(options)
     config = commissioning.config
-    unloaded = {PLANT: pick_ups([], [])}  # a simulated arm, which nobody disturbs
+    # of a simulated arm, which nobody disturbs
+    unloaded: dict[str, Mapping[str, object]] = {
+        PLANT: pick_ups([], []),
+        **topics_of(options),
+    }
     driver = driver_of(options.robot, path, config, unloaded)
     with announced_compilation(print_notice):
         ArmController(config).close()
     with closing(driver):
-        print_notice(f'connecting to {options.robot}: some seconds')
-        for remark in driver.connect():
-            print_notice(remark)
-        driven = Driven(driver, commissioning, folder)
-        request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
+        connect(driver)
+        driven = PostureByPosture(driver, commissioning, folder)
         with signals_to(driven.request_end):
             yield driven
+
+
+def topics_of(options: Namespace) -> dict[str, dict[str, object]]:
+    """Return the topics that the options name, as parameters of the driver `ros`."""
+    names = ('states', 'commands', 'namespace')
+    given = {name: getattr(options, name) for name in names if getattr(options, name)}
+    return {DRIVE: given}
 
 
 def measured_on(
@@ -88,34 +90,32 @@ def measured_on(
     planned = commissioning.motions_from(arm.position())
     duration = arm.duration(planned)
     ask(options, _limits(options, commissioning, planned, duration))
-    return list(_followed(arm, planned))
+    measured = []
+    total = len(planned)
+    print(f'0 of {total} postures measured: Ctrl-C stops the arm', flush=True)
+    for bag in arm.runs(np.array([each.posture for each in planned])):
+        measured.append(bag)
+        print(f'{len(measured)} of {total} postures measured', flush=True)
+    return measured
 
 
-def proven(
+def prove(
     arm: PostureByPosture, planned: Sequence[Step], config: ControllerConfig
-) -> tuple[list[Errors], list[LimitCycle]]:
+) -> None:
     """Prove the gains of a configuration on a robot.
 
-    Return the errors of each step, and the limit cycles at rest and in the last step.
+    Print the errors of each step, those of the last one beside those to expect, and the limit
+    cycles at rest and in the last step.
 
     Raises as `measured_on`.
     """
-    found, shaking = [], []
     for step, errors, cycles in arm.proof(planned):
         worst = largest_error(errors.measured, config.units)
         print(f'{step.name}: calm, errors of {worst} at most', flush=True)
-        found.append(errors)
-        shaking += cycles
-    return found, shaking
-
-
-def print_proof(
-    config: ControllerConfig, errors: Sequence[Errors], cycles: Iterable[LimitCycle]
-) -> None:
-    """Print the errors of the last step beside those to expect, and the limit cycles."""
-    print(page.errors_table(config, errors[-1]))
-    for each in cycles:
-        print(page.of_limit_cycle(each))
+        if step is planned[-1]:
+            print(page.errors_table(config, errors))
+        for each in cycles:
+            print(page.of_limit_cycle(each))
 
 
 def prepared_folder(options: Namespace) -> Path:
@@ -150,18 +150,6 @@ def agreed() -> bool:
     finally:
         for number, handler in zip(_SIGNALS, before, strict=True):
             signal.signal(number, handler)
-
-
-def _followed(
-    robot: PostureByPosture, planned: list[Planned]
-) -> Iterator[tuple[str, Path]]:
-    """Yield the bags of the postures, and say how far it is."""
-    postures = np.array([each.posture for each in planned])
-    total = len(planned)
-    print(f'0 of {total} postures measured: Ctrl-C stops the arm', flush=True)
-    for k, bag in enumerate(robot.runs(postures), 1):
-        print(f'{k} of {total} postures measured', flush=True)
-        yield bag
 
 
 def of_proof(options: Namespace, config: ControllerConfig) -> Iterator[str]:

@@ -19,7 +19,6 @@ from blf_dsc_controller.cli import computer
 from blf_dsc_controller.cli.domains import check_network, shell_domain, strangers
 from blf_dsc_controller.cli.finding import Finding, Level, note, ok, problem
 from blf_dsc_controller.cli.gains_of_joints import gains_of_joints
-from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.compiled.kernel_cache import SHIPPED, is_quick, place
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
@@ -34,6 +33,7 @@ from blf_dsc_controller.drive.drivers import is_in_network
 from blf_dsc_controller.drive.motor_feedback import robot_warnings
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import install_command
+from blf_dsc_controller.nodes.ros_check import require_ros
 
 _NEEDED = ('numpy', 'scipy', 'numba', 'mcap', 'rosbags', 'matplotlib')
 _EXTRAS = {

@@ -15,7 +15,6 @@ from blf_dsc_controller.cli.result_folder import (
     expect_folder,
     keep,
 )
-from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
@@ -24,13 +23,12 @@ from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     DRIVE,
     ignored_in,
-    load,
     locate,
 )
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.driver import Driver
-from blf_dsc_controller.drive.drivers import driver_of
+from blf_dsc_controller.drive.drivers import ROS, config_of, driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End, Outcome
 from blf_dsc_controller.drive.motor_feedback import (
     as_in_motors,
@@ -39,6 +37,7 @@ from blf_dsc_controller.drive.motor_feedback import (
 )
 from blf_dsc_controller.drive.ros_topics import RosTopics
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.ros_check import require_ros
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import end_of_waypoints
 from blf_dsc_controller.warnings.expected_errors import expectation
@@ -57,7 +56,7 @@ def drive(options: Namespace) -> int:
     """Control a robot until the end, and print how it went."""
     _check(options)
     path = locate(options.config)
-    config = load(path, CONTROLLER, ControllerConfig)
+    config = config_of(options.robot, path, {})
     driver = driver_of(options.robot, path, config)
     if ignored := ignored_in(path, (CONTROLLER, DRIVE)):
         print_notice(f'warning: {ignored}')
@@ -79,15 +78,11 @@ def drive(options: Namespace) -> int:
             ending.callback(ros.close)
         ending.enter_context(controller)
         ending.callback(driver.close)
-        print_notice(f'connecting to {options.robot}: some seconds')
-        for remark in driver.connect():
-            print_notice(remark)
-        request_realtime(config.realtime, lambda text: print_notice(f'warning: {text}'))
+        connect(driver)
         loop = DriveLoop(
             driver,
             controller,
             duration=options.duration or math.inf,
-            settle_time=driver.config.settle_time,
             beside=ros,
             feedback=driver.config.feedback,
         )
@@ -105,6 +100,16 @@ def drive(options: Namespace) -> int:
             f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
         )
     return CODES[outcome.end] or int(bool(controller.output_problem))
+
+
+def connect(driver: Driver) -> None:
+    """Connect to the robot, and print its remarks."""
+    print_notice(f'connecting to {driver.address}: some seconds')
+    for remark in driver.connect():
+        print_notice(remark)
+    request_realtime(
+        driver.controller.realtime, lambda text: print_notice(f'warning: {text}')
+    )
 
 
 def _say_before(config: ControllerConfig, driver: Driver) -> None:
@@ -126,6 +131,8 @@ def _check(options: Namespace) -> None:
             f'--duration: got {options.duration:g} s, but a finite time of at least 0 is needed '
             '(0: until Ctrl-C)'
         )
+    if options.ros and options.robot == ROS:
+        raise BlfDscError('--robot ros has its topics already: leave out --ros')
     if options.ros:
         require_ros()
     elif options.namespace:

@@ -25,9 +25,9 @@ from blf_dsc_controller.cli.parser import (
     parse,
 )
 from blf_dsc_controller.cli.result_folder import discard_empty, discard_unbegun
-from blf_dsc_controller.cli.ros_check import require_ros
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.errors import BlfDscError
+from blf_dsc_controller.nodes.ros_check import require_ros
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

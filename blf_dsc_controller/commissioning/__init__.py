@@ -21,9 +21,7 @@ joints, and these the stiffest gains with a margin.
     commissioned    the three steps in a row
     commissioning   all of it for a loop of your own: `blf.Commissioning`
     simulated       the runs of a simulated arm
-    postures        the runs of a robot, from posture to posture
-    driven          likewise, over its driver
-    over_ros        likewise, over ROS, by the controller's node
+    postures        the runs of a robot over its driver, from posture to posture
     proof           the chosen gains in three steps along the arm's own reference
     slow_motion     the motion that shows the torque ripple of the drives
     ripple          what runs of it show

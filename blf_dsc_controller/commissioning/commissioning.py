@@ -280,15 +280,14 @@ class Commissioning:
         sliding: bool = False,
         share: float = 1.0,
     ) -> Planned:
-        (motion,) = plan(
+        return plan(
             self.measured_with,
-            np.asarray(posture, float)[None],
+            np.asarray(posture, float),
             torque=torque,
             travel=self._travel,
             sliding=sliding,
             share=share,
         )
-        return motion
 
     def result(
         self,

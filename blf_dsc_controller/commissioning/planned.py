@@ -85,14 +85,14 @@ def postures_of(
 
 def plan(
     config: ControllerConfig,
-    postures: Floats,
+    posture: Floats,
     *,
-    torque: float = TORQUE,
-    travel: float = TRAVEL,
-    sliding: bool = False,
-    share: float = 1.0,
-) -> list[Planned]:
-    """Return the motions around postures (k, n) [rad] by which an arm is measured.
+    torque: float,
+    travel: float,
+    sliding: bool,
+    share: float,
+) -> Planned:
+    """Return the motion around a posture (n,) [rad] by which an arm is measured.
 
     `sliding` adds swings that keep joints sliding which would stick without.  The arm has a
     `share` of the gains of the configuration.
@@ -111,14 +111,10 @@ def plan(
         )
     gains = softer(config, share)
     arm = with_gains(config, gains) if gains else config
-    planned = []
-    for posture in postures:
-        _check_posture(config, posture)
-        tones = excitation(arm, posture, torque, travel, sliding=sliding)
-        values = {**gains, **shaking_parameters(arm, tones, posture)}
-        made = change(arm, values)
-        planned.append(Planned(made, values, posture, tones, share, torque))
-    return planned
+    _check_posture(config, posture)
+    tones = excitation(arm, posture, torque, travel, sliding=sliding)
+    values = {**gains, **shaking_parameters(arm, tones, posture)}
+    return Planned(change(arm, values), values, posture, tones, share, torque)
 
 
 def softer(config: ControllerConfig, share: float) -> dict[str, Value]:

@@ -12,13 +12,13 @@ is around the posture in which the arm rests by then, so it begins without an er
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
 from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
@@ -43,16 +43,21 @@ from blf_dsc_controller.commissioning.run_parameters import undisturbed_paramete
 from blf_dsc_controller.commissioning.slow_motion import SlowMotion
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
+from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.slow_move import duration_of
-from blf_dsc_controller.drive.loop import End
+from blf_dsc_controller.drive.driver import Driver
+from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.ripple import Ripples
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.journal import EventType, decode
+from blf_dsc_controller.messages.topics import Topic
+from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.reference.approach import AT_REST
 from blf_dsc_controller.reference.turns import short_way
 from blf_dsc_controller.supervision.guard import Guard
 
 Floats = NDArray[np.float64]
-Given = ParamSpec('Given')
 Answer = TypeVar('Answer')
 
 SPEED = 0.3
@@ -61,7 +66,15 @@ SPEED = 0.3
 _ACCELERATION = 0.5  # rad/s^2, likewise
 _SHORTEST = 1.0  # s, of a move
 _REST = 1.0  # s, at its end
+_HELD = 'the arm is held until Ctrl-C: engage its brakes first'
 _PAUSE = 0.2  # s, in which an arm at rest does not move
+_OTHERS = {
+    EventType.TRAJECTORY: 'a trajectory was sent to the controller',
+    EventType.TARGET: 'a position was sent to the controller',
+    EventType.BRAKE: 'somebody called ~/stop',
+    EventType.RESET: 'somebody called ~/reset',
+    EventType.CONTACT: 'something touched the arm',
+}
 
 
 class EndedError(BlfDscError):
@@ -156,11 +169,31 @@ def _set_aside(bag: Path, why: str) -> None:
     bag.rename(there)
 
 
-class PostureByPosture(ABC):
-    """A robot at rest, which goes from posture to posture and is measured in each."""
+class _Disturbed:
+    """An output that ends a run whose motion is changed: it shows nothing."""
 
-    def __init__(self, commissioning: Commissioning, folder: Path) -> None:
-        """Measure for a configuration, and write bags into `folder`."""
+    def __init__(self, driver: Driver) -> None:
+        """`driver` gets it as its problem."""
+        self._driver = driver
+
+    def write(self, _stamp: int, topic: Topic, raw: bytes) -> None:
+        if topic in (topics.JOURNAL, topics.TARGETS):
+            self._driver.problem = _OTHERS.get(decode(raw).type, self._driver.problem)
+
+
+class PostureByPosture:
+    """A robot at rest, which goes from posture to posture and is measured in each.
+
+    Attributes:
+        driver: of the robot; holds the arm between two runs.
+    """
+
+    def __init__(
+        self, driver: Driver, commissioning: Commissioning, folder: Path
+    ) -> None:
+        """Use a connected driver, and write bags into `folder`."""
+        self.driver = driver
+        self._loop: DriveLoop | None = None
         self._commissioning = commissioning
         self._config = commissioning.config
         self._folder = folder
@@ -168,47 +201,37 @@ class PostureByPosture(ABC):
         self._requests = 0
         self._left = ''  # what a proof has found so far; empty: the arm is measured
 
-    @abstractmethod
-    def _positions(self) -> ArrayLike:
-        """Return the present positions (n,) [rad]."""
+    def hold_after(self) -> None:
+        """Hold an arm after its last run that would fall otherwise, until an end is requested."""
+        if self.driver.answers and self._config.robot.drive_compensates == 'none':
+            print_notice(_HELD)
+            self.driver.wait_until(lambda: self._requests > 0)
 
-    @abstractmethod
-    def _pause(self, seconds: float) -> None:
-        """Let time pass."""
-
-    @abstractmethod
-    def _control(
-        self, config: ControllerConfig, duration: float, bag: Path, name: str
-    ) -> None:
-        """Control the robot from rest to rest, for so long [s], and record it.
-
-        Raises EndedError or BlfDscError if it ended before its time.
-        """
-
-    def hold_after(self) -> None:  # noqa: B027 - most robots hold themselves
-        """Hold an arm after its last run that would fall otherwise."""
-
-    def aside(
-        self,
-        compute: Callable[Given, Answer],
-        *given: Given.args,
-        **named: Given.kwargs,
-    ) -> Answer:
+    def aside(self, compute: Callable[..., Answer], *given: object) -> Answer:
         """Return the answer of a function that may take longer than a sample, between two runs."""
-        return compute(*given, **named)
+        if self.driver.worker is None:
+            return compute(*given)
+        return self._awaited(self.driver.worker.submit(compute, *given))
+
+    def _awaited(self, computed: Future[Answer]) -> Answer:
+        """Return an answer; the arm is held until it is there."""
+        self.driver.wait_until(computed.done)
+        return computed.result()
 
     def request_end(self) -> None:
         """Bring the arm to rest and end, as for a signal; a second request ends at once."""
         self._requests += 1
+        if self._loop is not None:
+            self._loop.request_end()
 
     def position(self) -> Floats:
         """Return the positions (n,) [rad] of the arm.
 
         Raises BlfDscError if it moves.
         """
-        before = np.array(self._positions(), float)
-        self._pause(_PAUSE)
-        after = np.array(self._positions(), float)
+        before = np.array(self.driver.positions(), float)
+        self.driver.wait(_PAUSE)
+        after = np.array(self.driver.positions(), float)
         joint = int(np.abs(after - before).argmax())
         moved = float(after[joint] - before[joint])
         if abs(moved) > AT_REST * _PAUSE:
@@ -343,6 +366,37 @@ class PostureByPosture(ABC):
         bag = self._bag(name)
         self._control(config, duration, bag, name)
         return bag
+
+    def _control(
+        self, config: ControllerConfig, duration: float, bag: Path, name: str
+    ) -> None:
+        """Control the robot from rest to rest, for so long [s], and record it.
+
+        Raises EndedError or BlfDscError if it ended before its time.
+        """
+        with (
+            ThreadPoolExecutor(1) as thread,
+            self._awaited(
+                thread.submit(ArmController, config, record=bag, stamps='wall')
+            ) as controller,
+        ):
+            loop = self._loop = DriveLoop(
+                self.driver,
+                controller,
+                duration=duration,
+                feedback='host',  # what moves the arm is the torque alone, as recorded
+            )
+            if self.driver.answers:
+                controller.add_output(_Disturbed(self.driver))
+            if self._requests:
+                raise self._ended(name, End.REQUESTED, '', None)
+            with named(name):
+                outcome = loop.run()
+            self._loop = None
+        if outcome.end is not End.DURATION:
+            raise self._ended(name, outcome.end, outcome.text, controller.guard)
+        if controller.output_problem:
+            raise self._not_whole(name)
 
     def _bag(self, name: str) -> Path:
         return self._folder / name.replace(' ', '_').replace('%', '')

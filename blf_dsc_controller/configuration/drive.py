@@ -91,6 +91,11 @@ class DriveConfig:
         'damiao: at the end, the motors hold the arm where it is, or are disabled: an arm '
         'without brakes falls',
     )
+    namespace: str = _fixed('', 'ros: namespace of the node and of these topics')
+    states: str = _fixed('', 'ros: topic of the joint states; empty: joint_states')
+    commands: str = _fixed(
+        '', 'ros: topic of the torques; empty: blf_dsc_controller/commands'
+    )
     settle_time: float = positive(
         3.0,
         'longest time to wait for the arm to come to rest at the end',

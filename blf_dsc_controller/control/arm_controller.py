@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.configuration.rules import When
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.loop_outputs import LoopOutputs
-from blf_dsc_controller.control.outputs import Output
+from blf_dsc_controller.control.outputs import Output, Outputs
 from blf_dsc_controller.errors import BlfDscError, LoopEndedError, check_type
 from blf_dsc_controller.law.weighing import DEVIATION, MASS, mass_interval
 from blf_dsc_controller.messages.named_values import disturbance_names
@@ -497,6 +497,16 @@ class ArmController:
     def guard(self) -> Guard:
         """The law between its checks, for shells such as `blf_dsc drive`."""
         return self._loop.guard
+
+    @property
+    def loop(self) -> GuardedLoop:
+        """The law with its telemetry, for a node that answers joint states by it."""
+        return self._loop
+
+    @property
+    def outputs(self) -> Outputs:
+        """Where the messages of its loop go, such as a bag."""
+        return self._outputs
 
     @property
     def estimate_names(self) -> tuple[str, ...]:

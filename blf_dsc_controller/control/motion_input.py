@@ -85,6 +85,7 @@ class MotionInput:
         reason: why the last one was rejected.
         source: what has set the present reference.
         job: the motion that is being planned, if any.
+        log: takes warnings of what is not followed.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class MotionInput:
         self.source = ''
         self.job: _Job | None = None
         self._next: _Request | None = None
-        self._log = log
+        self.log = log
         self._largest = MOST_POINTS * _POINT_SIZE * (joints + 2)
         self._guard = guard
         self._is_live = is_live
@@ -273,7 +274,7 @@ class MotionInput:
         """Say once that motions are shifted by whole turns."""
         if turned and not self._has_logged_turns:
             self._has_logged_turns = True
-            self._log.info(f'a motion {turned}; others are shifted likewise')
+            self.log.info(f'a motion {turned}; others are shifted likewise')
 
     def _read_positions(self, raw: bytes) -> np.ndarray:
         size = self._decoder.decode(raw)
@@ -299,7 +300,7 @@ class MotionInput:
         self._last_message = guard.reference.time
         left = self.stop(guard, '~/stop') - guard.reference.time
         text = f'braking for {left:.3g} s; {ignored}'
-        self._log.info(text)
+        self.log.info(text)
         return text
 
     def _ignore_after_stop(self, guard: Guard) -> bool:
@@ -312,7 +313,7 @@ class MotionInput:
         if not guard.supervisor.running:
             return False
         if self._is_stopped and 0.0 <= pause < _PAUSE:
-            self._log.warning(
+            self.log.warning(
                 f'ignored after ~/stop, until messages pause for {_PAUSE:g} s',
                 throttle_duration_sec=_RARELY,
             )
@@ -327,7 +328,7 @@ class MotionInput:
             self._reject(_reason(error))
             return
         self.accepted += 1
-        self._log.info('stopping: a trajectory without points arrived')
+        self.log.info('stopping: a trajectory without points arrived')
 
     # Plans.
 
@@ -402,7 +403,7 @@ class MotionInput:
             count = len(plan.command.points)
             points = '1 point' if count == 1 else f'{count} points'
             note = f' {plan.motion.note}' if plan.motion.note else ''
-            self._log.info(f'following a trajectory of {points}{note}')
+            self.log.info(f'following a trajectory of {points}{note}')
             self._log_turns(plan.motion.turned)
 
     def _report_target(self, plan: Plan | None, reason: str) -> None:
@@ -413,9 +414,9 @@ class MotionInput:
     def _reject(self, reason: str) -> None:
         self.rejected += 1
         if reason == self.reason:  # a stream may repeat it at its rate
-            self._log.warning(reason, throttle_duration_sec=_RARELY)
+            self.log.warning(reason, throttle_duration_sec=_RARELY)
         else:
-            self._log.warning(reason)
+            self.log.warning(reason)
         self.reason = reason
 
 

@@ -18,15 +18,24 @@ from blf_dsc_controller.supervision.guard import Guard
 class Beside(ABC):
     """What a loop without ROS exchanges with a process beside it."""
 
-    def __init__(self, link: Link, controller: ArmController) -> None:
-        """Take motions that come over a link, to which the log goes."""
+    def __init__(
+        self,
+        link: Link,
+        controller: ArmController,
+        inputs: MotionInput | None = None,
+    ) -> None:
+        """Take motions that come over a link, to which the log goes.
+
+        `inputs` are those that the driver has itself: who stops them, stops these.
+        """
         self._link = link
         self._guard = controller.guard
         self.log = LinkLog(link)
         self._untrusted = ''  # what was said of the torque sensors
-        self._inputs = MotionInput(
+        self._inputs = inputs or MotionInput(
             len(controller.joints), lambda: self._guard, _is_live, self.log
         )
+        self._inputs.log = self.log
 
     def follow(self) -> None:
         """Send what waits and take what has arrived; after each state's torque."""

@@ -8,9 +8,11 @@ configurations.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +23,13 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.motors.frame import Frame, Ranges
 
+if TYPE_CHECKING:
+    from blf_dsc_controller.control.arm_controller import ArmController
+    from blf_dsc_controller.control.motion_input import MotionInput
+    from blf_dsc_controller.supervision.load_declaration import LoadDeclaration
+
 Vector = NDArray[np.float64]
+_POLL = 0.01  # s
 
 
 class DriverError(BlfDscError):
@@ -75,11 +83,18 @@ class Driver(ABC):
         has_feedback: whether its motors close a PD of their own; then there is
             `write_frame`.
         latency: time [s] from a state until the robot acts on the answer.
+        answers: whether it answers states by the controller itself, as the node over ROS
+            does; then `read` returns those that are answered, or None for a moment without.
+        worker: computes what takes long while the robot rests; None: there is time.
+        problem: why the arm is to come to rest, and the run to end; empty while all is well.
     """
 
     facts: ClassVar[Facts]
     has_feedback: ClassVar[bool] = False
     latency: float = 0.0
+    answers: ClassVar[bool] = False
+    worker: Executor | None = None
+    problem: str = ''
 
     @classmethod
     def facts_for(cls, controller: ControllerConfig) -> Facts:
@@ -106,6 +121,14 @@ class Driver(ABC):
     def positions(self) -> ArrayLike:
         """Return the positions (n,) [rad] of the robot at rest, before `start`."""
 
+    def answer_by(  # noqa: B027 - for `answers`
+        self, controller: ArmController, took: Callable[[float], None]
+    ) -> None:
+        """Answer states by this controller from the next `start` on.
+
+        `took` is told the time [s] from each state to its torque.
+        """
+
     @abstractmethod
     def start(self) -> None:
         """Begin to command torques.
@@ -114,12 +137,22 @@ class Driver(ABC):
         """
 
     @abstractmethod
-    def read(self) -> RobotState:
+    def read(self) -> RobotState | None:
         """Wait for the next state."""
 
     @abstractmethod
     def write(self, torque: Vector | None) -> None:
         """Command torques (n,) [N m]; None: whatever lets the robot go on as it is."""
+
+    @property
+    def inputs(self) -> MotionInput | None:
+        """Where other programs send motions to the controller, if it is the driver that listens."""
+        return None
+
+    @property
+    def declaration(self) -> LoadDeclaration | None:
+        """What declares loads to the robot, if it is not `tell_load`."""
+        return None
 
     @property
     def ranges(self) -> Ranges:
@@ -156,6 +189,16 @@ class Driver(ABC):
     @abstractmethod
     def finish(self) -> None:
         """End the motion; the robot holds itself by its own means."""
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass while the robot rests."""
+        end = time.monotonic() + seconds
+        self.wait_until(lambda: time.monotonic() > end)
+
+    def wait_until(self, is_over: Callable[[], bool]) -> None:
+        """Likewise, until something is so."""
+        while not is_over():
+            time.sleep(_POLL)
 
     def close(self) -> None:  # noqa: B027 - most have nothing to leave
         """Leave the robot, after the last `finish` or an error."""

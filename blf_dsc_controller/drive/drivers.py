@@ -7,18 +7,25 @@ import importlib.util
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
-from blf_dsc_controller.configuration.nodes import DRIVE, PLANT, load
+from blf_dsc_controller.configuration.nodes import CONTROLLER, DRIVE, PLANT, load
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import suggestion
 from blf_dsc_controller.drive.driver import Driver, check_feedback, disagreements
 from blf_dsc_controller.drive.simulated import SIMULATED, simulated
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.extras import import_extra
+from blf_dsc_controller.nodes.ros_check import require_ros
+
+if TYPE_CHECKING:
+    from blf_dsc_controller.drive.ros import RosDriver
 
 FRANKA, DAMIAO = 'franka', 'damiao'  # drivers of this package
+ROS = 'ros'
+"""The address of a robot behind ROS: its driver publishes joint states and takes torques."""
 _BUS = re.compile(r'[a-z]*can\d+$|[a-z_]+:(?!\d+$)')  # can0, vcan1, slcan:/dev/ttyACM0
 _HOST = re.compile(r'\d+(\.\d+){3}$')
 _SHORTEST = 3  # letters of an address that may mean `simulated`
@@ -34,7 +41,7 @@ def driver_of(
     """Return the driver that a file names, for the robot at an address.
 
     `overrides`, by node and dotted name, take precedence over the file.  The address
-    `simulated` is that of its simulated arm.
+    `simulated` is that of its simulated arm, `ros` that of a robot behind ROS.
 
     Raises BlfDscError if there is no such driver, or the file contradicts the robot.
     """
@@ -43,6 +50,8 @@ def driver_of(
     if address == SIMULATED:
         plant = load(path, PLANT, PlantConfig, given.get(PLANT))
         made: type[Driver] = simulated(plant, settings.feedback)
+    elif address == ROS:
+        return _ros()(address, config, settings)
     else:
         if is_nearly_simulated(address):
             raise BlfDscError(
@@ -59,6 +68,25 @@ def driver_of(
         )
         raise ConfigurationError(problems, f'{path}{of_driver}')
     return made(address, config, settings)
+
+
+def config_of(
+    address: str, path: Path, overrides: Mapping[str, Mapping[str, object]]
+) -> ControllerConfig:
+    """Return the configuration of a file; behind ROS, the URDF may come from a topic."""
+    given = dict(overrides.get(CONTROLLER, {}))
+    if address == ROS:
+        settings = load(path, DRIVE, DriveConfig, overrides.get(DRIVE))
+        given |= _ros().received(path, given, settings)
+    return load(path, CONTROLLER, ControllerConfig, given)
+
+
+def _ros() -> type[RosDriver]:
+    """Return the driver `ros`; raises BlfDscError without ROS."""
+    require_ros()
+    from blf_dsc_controller.drive.ros import RosDriver
+
+    return RosDriver
 
 
 def _check_kind(address: str, path: Path, settings: DriveConfig) -> None:
@@ -79,7 +107,7 @@ def _check_kind(address: str, path: Path, settings: DriveConfig) -> None:
 
 def is_in_network(address: str) -> bool:
     """Whether an address is that of a computer, not of a CAN bus or the simulated arm."""
-    return address != SIMULATED and _BUS.match(address) is None
+    return address not in (SIMULATED, ROS) and _BUS.match(address) is None
 
 
 def is_nearly_simulated(address: str) -> bool:

@@ -12,6 +12,7 @@ resumed.
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from enum import Enum
 from time import perf_counter
 from typing import Literal, NamedTuple
@@ -32,7 +33,7 @@ from blf_dsc_controller.drive.driver import (
 from blf_dsc_controller.drive.driver_declaration import DriverDeclaration
 from blf_dsc_controller.drive.latency import Latency
 from blf_dsc_controller.drive.motor_feedback import MotorFeedback
-from blf_dsc_controller.supervision.supervisor import Phase
+from blf_dsc_controller.supervision.supervisor import Phase, Reason
 
 Vector = NDArray[np.float64]
 
@@ -75,13 +76,12 @@ class DriveLoop:
         controller: ArmController,
         *,
         duration: float = math.inf,
-        settle_time: float = 3.0,
         beside: Beside | None = None,
         feedback: Literal['host', 'motor'] = 'host',
     ) -> None:
         """Run for `duration` [s] of the robot's time, with what is beside the loop.
 
-        The end may take `settle_time` [s] more.  The driver is connected; `feedback` is
+        The end may take `drive.settle_time` more.  The driver is connected; `feedback` is
         `drive.feedback`.
 
         Raises:
@@ -94,8 +94,8 @@ class DriveLoop:
         self._driver = driver
         self._controller = controller
         self._duration = duration
-        self._settle_time = settle_time
-        self._declaration = DriverDeclaration(driver)
+        self._settle_time = driver.config.settle_time
+        self._declaration = driver.declaration or DriverDeclaration(driver)
         self._load_in_motion = driver.facts_for(controller.config).load_in_motion
         self._feedback: MotorFeedback | None = None
         if feedback == 'motor':
@@ -103,6 +103,7 @@ class DriveLoop:
         self._beside = beside
         self._requests = 0
         self._states = 0
+        self._stamp = math.nan  # s, of the last state
         self._received = 0.0  # s, when `read` returned last
         self._begin = math.nan  # s, stamp of the first state
         self._end: End | None = None
@@ -129,8 +130,10 @@ class DriveLoop:
             Exception: an error of the controller, after the arm was brought to rest.
         """
         try:
-            with undisturbed_loop():
+            # a node is undisturbed from its start on: it holds the arm between two runs, too
+            with nullcontext() if self._driver.answers else undisturbed_loop():
                 self._controller.prepare(self._driver.positions())
+                self._driver.answer_by(self._controller, self.latency.add)
                 self._driver.start()
                 self._control()
         except ReflexError as error:
@@ -139,7 +142,8 @@ class DriveLoop:
         except ConnectionLostError as error:
             self._withdraw(End.LOST, str(error))
         finally:
-            self._declaration.close()
+            if isinstance(self._declaration, DriverDeclaration):
+                self._declaration.close()
         if self._error is not None:
             raise self._error
         return Outcome(self._end or End.REQUESTED, self._text, self._states)
@@ -157,15 +161,16 @@ class DriveLoop:
             raise
         self._driver.finish()
 
-    def _step(self, state: RobotState) -> None:
-        """Answer a state.
+    def _step(self, state: RobotState | None) -> None:
+        """Answer a state, if there is one.
 
         The first error leads to the safe torque, a second one ends the run.
         """
-        self._states += 1
         try:
-            self._declaration.follow(self._controller, in_motion=self._load_in_motion)
-            self._controller.update(*state, send=self._send)
+            if state is not None:
+                self._states += 1
+                self._stamp = state.stamp
+                self._answer(state)
             if self._beside is not None:
                 self._beside.follow()
         except DriverError:
@@ -176,9 +181,16 @@ class DriveLoop:
             self._error = error
             text = f'{type(error).__name__}: {error}'
             self._send(self._controller.fail(text))
-            self._begin_end(End.STOPPED, text, state.stamp)
+            self._begin_end(End.STOPPED, text)
             return
-        self._watch(state.stamp)
+        self._watch()
+
+    def _answer(self, state: RobotState) -> None:
+        """Let the controller answer a state, unless the driver has done so."""
+        if self._driver.declaration is None:
+            self._declaration.follow(self._controller, in_motion=self._load_in_motion)
+        if not self._driver.answers:
+            self._controller.update(*state, send=self._send)
 
     def _send(self, torque: Vector | None) -> None:
         if torque is None or self._feedback is None:
@@ -187,46 +199,53 @@ class DriveLoop:
             self._driver.write_frame(self._feedback.frame(torque))
         self.latency.add(perf_counter() - self._received)
 
-    def _watch(self, stamp: float) -> None:
+    def _watch(self) -> None:
         """Begin the end if it is time, or if the controller has stopped."""
         if math.isnan(self._begin):
-            self._begin = stamp
+            self._begin = self._stamp
         if self._end is not None:
             return
         controller = self._controller
-        self.worst = max(
-            self.worst, float((abs(controller.error) / controller.bound).max())
-        )
-        at_tool = controller.tool.error
-        self.worst_at_tool = float(np.fmax(self.worst_at_tool, at_tool))
+        if controller.guard.has_sample:
+            ratio = abs(controller.error) / controller.bound
+            self.worst = max(self.worst, float(ratio.max()))
+            at_tool = controller.tool.error
+            self.worst_at_tool = float(np.fmax(self.worst_at_tool, at_tool))
         if controller.phase is Phase.SAFE_STOP:
-            self._begin_end(End.STOPPED, controller.reason, stamp)
+            is_lost = controller.guard.supervisor.reason is Reason.STATE_TIMEOUT
+            self._begin_end(End.LOST if is_lost else End.STOPPED, controller.reason)
+        elif controller.phase is Phase.INACTIVE:
+            self._begin_end(End.REQUESTED, 'somebody deactivated the node')
         elif self._requests:
             controller.stop()
-            self._begin_end(End.REQUESTED, '', stamp)
-        elif stamp - self._begin >= self._duration:
+            self._begin_end(End.REQUESTED)
+        elif self._driver.problem:
             controller.stop()
-            self._begin_end(End.DURATION, '', stamp)
+            self._begin_end(End.STOPPED, self._driver.problem)
+        elif self._stamp - self._begin >= self._duration:
+            controller.stop()
+            self._begin_end(End.DURATION)
 
-    def _begin_end(self, end: End, text: str, stamp: float) -> None:
+    def _begin_end(self, end: End, text: str = '') -> None:
         if self._end is None:
             self._end = end
             self._text = text
-            self._end_at = stamp
+            self._end_at = self._stamp
 
-    def _is_over(self, state: RobotState) -> bool:
+    def _is_over(self, state: RobotState | None) -> bool:
         """Whether the arm rests under the safe torque, or its time is over."""
         if self._requests > 1:
             return True
         if self._end is None:
             return False
-        is_late = state.stamp - self._end_at > self._settle_time
+        stamp = self._stamp if state is None else state.stamp
+        is_late = stamp - self._end_at > self._settle_time
         return is_late or self._controller.is_settled
 
     def _withdraw(self, end: End, text: str) -> None:
         """Note that the robot takes no more torques."""
         self._end = None
-        self._begin_end(end, text, math.nan)
+        self._begin_end(end, text)
         self._controller.withdraw(text)
 
     def _recover(self) -> None:

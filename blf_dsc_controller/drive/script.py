@@ -17,6 +17,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.goal_messages import End, Goal, Message, encode
 from blf_dsc_controller.control.goals import Goals
+from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.drive.loop import DriveLoop
@@ -41,9 +42,14 @@ _BEYOND = 2.0  # times what a joint reaches, and at least turns: no target
 class Script(Beside):
     """What a script wants of the loop, and is told of it."""
 
-    def __init__(self, link: Link, controller: ArmController) -> None:
+    def __init__(
+        self,
+        link: Link,
+        controller: ArmController,
+        inputs: MotionInput | None = None,
+    ) -> None:
         """Take the commands that come over a link of the parent process."""
-        super().__init__(link, controller)
+        super().__init__(link, controller, inputs)
         self._controller = controller
         self._goals = Goals(self._inputs, controller.joints, self._tell_goal, self.log)
         self._parent = os.getppid()

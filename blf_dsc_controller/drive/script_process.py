@@ -17,19 +17,17 @@ from pathlib import Path
 from typing import Any
 
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
     DRIVE,
     ignored_in,
-    load,
     locate,
 )
 from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.control.realtime import request_realtime
 from blf_dsc_controller.drive.beside import LinkLog
 from blf_dsc_controller.drive.driver import Driver
-from blf_dsc_controller.drive.drivers import driver_of
+from blf_dsc_controller.drive.drivers import config_of, driver_of
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.drive.motor_feedback import closed_in_motors, robot_warnings
 from blf_dsc_controller.drive.script import Script
@@ -67,7 +65,8 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
     overrides = wanted['overrides']
     given = overrides.get(CONTROLLER, {})
     path = locate(wanted['config'])
-    config = load(path, CONTROLLER, ControllerConfig, _HOLD | given)
+    held = {**overrides, CONTROLLER: _HOLD | given}
+    config = config_of(wanted['robot'], path, held)
     driver = driver_of(wanted['robot'], path, config, overrides)
     in_motors = driver.config.feedback == 'motor'
     ignored = ignored_in(path, (CONTROLLER, DRIVE))
@@ -84,7 +83,7 @@ def _control(link: Link, log: LinkLog, wanted: Mapping[str, Any]) -> None:
         for remark in driver.connect():
             log.info(remark)
         request_realtime(config.realtime, log.warning)
-        _run(driver, controller, Script(link, controller), link)
+        _run(driver, controller, Script(link, controller, driver.inputs), link)
     if controller.output_problem:
         log.error(f'recorded only a part: {controller.output_problem}')
 
@@ -97,7 +96,6 @@ def _run(driver: Driver, controller: ArmController, script: Script, link: Link) 
         loop = DriveLoop(
             driver,
             controller,
-            settle_time=driver.config.settle_time,
             beside=script,
             feedback=driver.config.feedback,
         )
@@ -114,7 +112,7 @@ def _run(driver: Driver, controller: ArmController, script: Script, link: Link) 
             f'{loop.worst:.0%} of its bound; from state to torque {1e6 * median:.0f} us in the '
             f'median, {1e6 * most:.0f} us at 99 %'
         )
-        if not waits or _awaited(link, script_link.RECOVER) is None:
+        if not waits or _awaited(link, script_link.RECOVER, driver) is None:
             return
         if outcome.end is End.LOST:
             for remark in driver.connect():
@@ -122,11 +120,17 @@ def _run(driver: Driver, controller: ArmController, script: Script, link: Link) 
         controller.start()
 
 
-def _awaited(link: Link, kind: int) -> Any:
-    """Wait for a message and return its content; None if the script closes or ends."""
+def _awaited(link: Link, kind: int, driver: Driver | None = None) -> Any:
+    """Wait for a message and return its content; None if the script closes or ends.
+
+    The robot of a `driver` rests meanwhile.
+    """
     while not link.broken:
         link.flush()
-        link.wait(_POLL)
+        if driver is None:
+            link.wait(_POLL)
+        else:
+            driver.wait(_POLL)
         for got, content in link.messages():
             if got == script_link.CLOSE:
                 return None

@@ -65,7 +65,7 @@ _LEFT_OUT = (
     'friction that differs with the direction',
     'friction that grows with the torque',
     'joints whose torque is measured with another gain',
-    'joints that give way behind their encoders',
+    'joints that are elastic behind their encoders',
 )  # of KINDS
 _REMEDIES = {
     'gain': (

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node for runs in a row, each with its own parameters and bag.
+"""The controller's node for controllers in a row, each with its own parameters and bag.
 
-Between two runs the arm is under the safe torque of the one before.  The next one goes on
+Between two of them the arm is under the safe torque of the one before.  The next one goes on
 from this torque, so nothing steps, and an unknown load does not sag.
 """
 
@@ -12,31 +12,43 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from rclpy.parameter import Parameter
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.control.outputs import Output
+from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.control.arm_controller import ArmController
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.supervision.guard import Guard
 
-_MEASURED = 'an arm is being measured: no parameter can be changed before the end'
+_MEASURED = (
+    'an arm is being measured, or is commanded by a program: no parameter can be changed before '
+    'the end'
+)
 
 
-class RunByRunNode(ControllerNode):
-    """The controller's node without a reference of its own: `begin` starts each run.
+class DrivenNode(ControllerNode):
+    """The controller's node without a controller of its own: `begin` gives it each.
 
     Attributes:
+        took: is told how long each torque took after its state came [s].
         heard: when the last joint state came, on the steady clock [s]; before the first,
             when the node was made.
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, config: ControllerConfig, **options: Any) -> None:
+        """Configure the node; it commands nothing before a controller begins."""
         self._acting: np.ndarray | None = None  # N m, the last torque
+        self.took: Callable[[float], None] = lambda _: None
         self.heard = time.monotonic()
-        super().__init__(**options)
-        self.log.warns_of_gains = False  # they are about to be measured
+        overrides = [
+            Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+            for name, value in {**flatten(config), 'autostart': True}.items()
+            if value != ()
+        ]
+        super().__init__(parameter_overrides=overrides, **options)
+        self.log.warns_of_gains = False  # who has the controller has said so
 
     def autostart(self) -> None:
         """Configure the node only: it commands nothing before the first run.
@@ -44,12 +56,6 @@ class RunByRunNode(ControllerNode):
         Raises BlfDscError if it cannot.
         """
         self._try_each('configure')
-
-    def start(self) -> None:
-        """Start timers and services, and configure the node."""
-        super().start()
-        if not self.config.autostart:
-            self.autostart()
 
     @property
     def commands(self) -> str:
@@ -73,41 +79,38 @@ class RunByRunNode(ControllerNode):
             return None
         return np.array(guard.readings.last.q)
 
-    def warn(self, text: str) -> None:
-        """Log a warning."""
-        self.get_logger().warning(text)
-
-    def begin(self, config: ControllerConfig, outputs: tuple[Output, ...]) -> Guard:
-        """Begin a run with the next joint state; its messages also go to the outputs.
-
-        Return its guard.
+    def begin(self, controller: ArmController) -> None:
+        """Answer states by a controller, which is to take command, from the next one on.
 
         Raises BlfDscError if the node cannot begin, or was silent since the last run.
         """
-        if self.guard is not None and self.guard.silenced:
-            raise BlfDscError(self.guard.supervisor.text)
+        before, guard = self.guard, controller.guard
+        if before is not None and before.silenced:
+            raise BlfDscError(before.supervisor.text)
         acting, self._acting = self._acting, None
-        self._loop = GuardedLoop(config, self._steady, self._wall)
-        self.config, self.guard = config, self._loop.guard
+        self._loop, self.config, self.guard = controller.loop, controller.config, guard
         self.log.begin()
-        for output in outputs:
-            self.outputs.add(output)
+        self.end(controller)  # of a run that was lost
+        self.outputs.add(controller.outputs)
         if acting is None:
             self._try_each('activate')
-        else:
-            self.guard.starting.activate()
-            self.guard.starting.take_over_from(acting)
+        elif guard is not before:
+            guard.starting.take_over_from(acting)
         self._report()
-        return self.guard
 
-    def end(self, output: Output, close: Callable[[], None] = lambda: None) -> None:
-        """Give an output no more messages, and close it: `outputs.problem`."""
-        self.outputs.end(output, close)
+    def end(self, controller: ArmController) -> None:
+        """Give the outputs of a controller no more messages; it still holds the arm."""
+        self.outputs.end(controller.outputs, lambda: None)
+
+    def command(self, torque: np.ndarray | None) -> None:
+        """Send torques (n,) [N m] that no joint state has asked for; None: none."""
+        self._command(torque)
 
     def _command(self, torque: np.ndarray | None) -> None:
         super()._command(torque)
         if torque is not None:
             self._acting = np.array(torque)
+            self.took(time.monotonic() - self.heard)
 
     def _on_joint_state(self, raw: bytes) -> None:
         self.heard = time.monotonic()
