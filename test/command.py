@@ -20,7 +20,6 @@ PATIENT = """blf_dsc_controller:
       watchdog: 'off'
       error_ratio: 0.0
       saturation_time: 1000.0
-      overrun_fraction: 1.0
 """
 OLDER = {
     'GLIBC_TUNABLES': 'glibc.cpu.hwcaps=-FMA,-AVX2,-FMA4,-AVX2_Usable,-FMA_Usable',

@@ -55,7 +55,7 @@ from blf_dsc_controller.tool.tip_wrench import TipWrench
 
 CONTROLLER = '/blf_dsc_controller'
 LOAD = {'events.begin': [0.0], 'events.duration': [1e6], 'events.payload': [2.0]}
-PATIENT = {'safety.state_timeout': 10.0, 'safety.overrun_fraction': 1.0}
+PATIENT = {'safety.state_timeout': 10.0}
 # ends with the process that started it
 BUSY = (
     'import os; os.nice(10); parent = os.getppid()\nwhile os.getppid() == parent: pass'

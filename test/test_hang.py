@@ -13,7 +13,7 @@ from watched_arm import PERIOD, TIMEOUT, WatchedArm
 
 import blf_dsc_controller as blf
 
-PATIENT = {'safety.state_timeout': 10.0, 'safety.overrun_fraction': 1.0}
+PATIENT = {'safety.state_timeout': 10.0}
 SLACK = 0.2
 """rad/s: what a load of 2 kg that nobody knows adds while it is observed.
 

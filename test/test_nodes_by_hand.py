@@ -274,7 +274,7 @@ def start_live(ros, node, arm):
 
 def test_reset_measures_the_rate_again_and_a_later_refusal_ends_nothing(ros):
     """A driver that was restarted at another rate: the node stays, to be reset once more."""
-    given = {'safety.state_timeout': 600.0, 'safety.overrun_fraction': 1.0}
+    given = {'safety.state_timeout': 600.0}
     node = ros.add(ControllerNode, given)
     arm = Arm(ros)
     stamp = start_live(ros, node, arm)

@@ -432,7 +432,7 @@ def test_arm_tracks_on_while_states_are_lost_repeated_or_late(spoil):
 
 
 def test_stop_names_both_rates_where_the_states_come_at_another():
-    arm = arm_of({'safety.overrun_fraction': 1.0})
+    arm = arm_of()
     arm.run(0.03, spoil=every(0.003))
     arm.run(0.06, spoil=every(0.003), reach=pushed(40.0, 0.0))
     assert arm.reason == 'error past the bound'

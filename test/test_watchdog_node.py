@@ -48,10 +48,7 @@ def controller(ros):
 
     def start(**parameters):
         """Start it with patience for a slow arm."""
-        patient = {
-            'safety.state_timeout': 10.0,
-            'safety.overrun_fraction': 1.0,
-        } | parameters
+        patient = {'safety.state_timeout': 10.0} | parameters
         words = [
             word
             for name, value in patient.items()

@@ -47,7 +47,10 @@ class Safety:
     """Limits past which the controller stops, and the torque of the stop."""
 
     state_timeout: float = positive(
-        0.04, 'largest delay of a state, by steady clock or stamp', 's'
+        0.04,
+        'largest delay of a state, by steady clock or stamp; in a second, states may be missing '
+        'for this time, or for 0.4 s if that is longer',
+        's',
     )
     watchdog: Literal['auto', 'on', 'off'] = parameter(
         'auto',
@@ -82,9 +85,6 @@ class Safety:
         0.5,
         'longest time with a torque at its limit, less a quarter of the time below it',
         's',
-    )
-    overrun_fraction: float = positive(
-        0.4, 'largest fraction of missed states, averaged over a second', at_most=1.0
     )
     first_torque: Literal['check', 'send'] = parameter(
         'check',

@@ -25,7 +25,8 @@ _IGNORED_REPEATS = 3
 _CLOCK_MOTION = 0.02  # rad/s: a slower motion shows no time
 _CLOCK_RATIO = 0.5  # of the time by the stamps
 _CLOCK_SPEED_RATIO = 0.5  # of the speed: an arm whose clock was set keeps its own
-_MISSED_TIME = 1.0  # s, over which missed states are
+_MISSED_TIME = 1.0  # s, over which missed states are averaged
+_MISSING = 0.4  # s of it, for which states may be missing
 
 SKIP = Fault(Reason.NONE, '')
 """Returned for a state to ignore."""
@@ -149,11 +150,14 @@ class StateCheck:
         self.missed_fraction *= keep
         if missed:
             self.missed_fraction = 1.0 - (1.0 - self.missed_fraction) * keep**missed
-        if self.missed_fraction <= safety.overrun_fraction:
+        missing = self.missed_fraction * _MISSED_TIME
+        tolerated = max(_MISSING, safety.state_timeout)
+        if missing <= tolerated:
             return None
         text = (
-            f'{100.0 * self.missed_fraction:.0f} % of the joint states were missed: more than '
-            'safety.overrun_fraction allows, or the arm sends them less often than every '
+            f'{100.0 * self.missed_fraction:.0f} % of the joint states were missed in the last '
+            f'second, and {100.0 * tolerated:.0f} % may be: the computer is too slow, or the arm '
+            'sends them less often than every '
             f'{self._sample_time:g} s (sample_time)'
         )
         return Fault(Reason.OVERRUN, text)
