@@ -127,9 +127,9 @@ _RUN = Command(
 _DRIVE = Command(
     name='drive',
     module='drive',
-    about='Control an arm over its own interface, without ROS: a Franka Research 3, or motors by '
-    'Damiao on CAN. The law runs in the loop that reads states and writes torques; --ros adds '
-    'the topics. Ctrl-C or SIGTERM brings the arm to rest and ends; a second one ends at once. '
+    about='Control an arm over its own interface: a Franka Research 3, motors by Damiao on CAN, or '
+    'a robot behind ROS. The law runs in the loop that reads states and writes torques; --ros adds '
+    'the topics where there are none. Ctrl-C or SIGTERM brings the arm to rest and ends; a second one ends at once. '
     'Exit code: 0 the duration is over, 5 the controller or the robot stopped before, 130 '
     'interrupted, 1 an error.',
     example='--robot 172.16.0.2 --config fr3_direct.yaml --duration 60 --out first',
@@ -510,7 +510,7 @@ _DOCTOR = Command(
     name='doctor',
     module='doctor',
     about='Say what is installed, what this computer is like for a control loop, and what to '
-    'mend. It takes some seconds and changes nothing. Paste what it prints into a report of a '
+    'correct. It takes some seconds and changes nothing. Paste what it prints into a report of a '
     'bug. With --compile, compile the kernels of a configuration instead, so that controller and '
     'simulated arm start within seconds. Exit code: 0 no problem, 1 a problem.',
     example='--config my.yaml --robot 172.16.0.2\n'
