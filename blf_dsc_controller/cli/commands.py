@@ -129,9 +129,9 @@ _DRIVE = Command(
     module='drive',
     about='Control an arm over its own interface: a Franka Research 3, motors by Damiao on CAN, or '
     'a robot behind ROS. The law runs in the loop that reads states and writes torques; --ros '
-    'adds the topics where there are none. Ctrl-C or SIGTERM brings the arm to rest and ends; a second one ends at once. '
-    'Exit code: 0 the duration is over, 5 the controller or the robot stopped before, 130 '
-    'interrupted, 1 an error.',
+    'adds the topics where there are none. Ctrl-C or SIGTERM brings the arm to rest and ends; a '
+    'second one ends at once. Exit code: 0 the duration is over, 5 the controller or the robot '
+    'stopped before, 130 interrupted, 1 an error.',
     example='--robot 172.16.0.2 --config fr3_direct.yaml --duration 60 --out first',
     options=(
         option(
