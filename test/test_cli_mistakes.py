@@ -71,7 +71,7 @@ def test_unwritable_output_path_is_reported(
 LONG = {  # commands, and what takes minutes, or moves a robot
     'commission --config ur5e --out no/x.yaml': 'commission._simulated',
     'commission --config fr3_direct --robot 172.16.0.2 --yes --out no/x.yaml': (
-        'commission._arm'
+        'commission.robot'
     ),
     'identify BAG --urdf panda.urdf --out no/x.urdf': 'identify._identified',
     'identify BAG --urdf panda.urdf --report no/x.html': 'identify._identified',

@@ -222,4 +222,4 @@ def test_every_own_shell_line_of_the_page_is_executed(
                 else:
                     continue
                 own.append(line)
-    assert len(own) == 9
+    assert len(own) == 8

@@ -108,5 +108,8 @@ def test_intervals_hold_where_the_arm_is_not_as_its_model_says(what):
     off = np.abs(found.parts.terms[0] - truth.rotors)
     held = [*is_covered(found, truth), *(off < 1.96 * found.deviations.terms[0])]
     assert np.mean(held) >= 0.85
-    words = {'gain': 'KNOWN UP TO THESE GAINS ONLY', 'elasticity': 'give way'}[what]
+    words = {
+        'gain': 'KNOWN UP TO THESE GAINS ONLY',
+        'elasticity': 'are elastic behind',
+    }[what]
     assert mentions(found, words)

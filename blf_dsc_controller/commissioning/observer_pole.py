@@ -22,6 +22,8 @@ square, and a hundredth as a rule; of efforts in another unit, of another sign o
 more than half.  Commands are U, a few samples late, and nothing else.
 
 Poles end with `POLES`: a faster one gains little and hands the noise of velocities to the torque.
+At 300 rad/s a Panda's error at a pick-up is 6.0 instead of 6.8 mrad, but its r, which noise moves
+by 0.6 N m rms, is taken for one that oscillates and left out within 8 s; at 200 rad/s not in 300 s.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ from blf_dsc_controller.commissioning.response import Response, Sensed
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-POLES = (10.0, 16.0, 25.0, 40.0, 60.0, 100.0, 150.0, 200.0, 300.0)
+POLES = (10.0, 16.0, 25.0, 40.0, 60.0, 100.0, 150.0, 200.0)
 """Poles of r [rad/s] that are tried, from slow to fast."""
 
 ENOUGH = 0.25
