@@ -225,7 +225,7 @@ class RosDriver(Driver):
         """Return the error of this time [s] without joint states of the arm."""
         return ConnectionLostError(
             f'no joint states on {self._node.states} for {seconds:.2g} s: start the driver, or '
-            'name its topic with --states, or as drive.states'
+            'name its topic as drive.states (of commission, --states)'
         )
 
     def _check_for_loss(self) -> None:
@@ -237,7 +237,7 @@ class RosDriver(Driver):
             if not node.is_heard:
                 raise ConnectionLostError(
                     f'nobody takes torques on {node.commands}: start the effort controller, or '
-                    'name its topic with --commands, or as drive.commands'
+                    'name its topic as drive.commands (of commission, --commands)'
                 )
         if silent > _PATIENCE:
             raise self._no_states(silent)
