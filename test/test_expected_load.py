@@ -106,7 +106,8 @@ def test_reset_carries_the_box_on():
         ((1.0, (0.0, 0.1)), 'three coordinates'),
         ((20.0,), 'got 20 kg, but robot.payload'),
         ((1.0, (0.0, 0.0, 50.0)), 'would need .* at joint .*, whose limit is'),
-        ((1.0, (0.0, 0.0, 0.0), -0.1), 'between 0 and 10 s'),
+        ((1.0, (0.0, 0.0, 0.0), -0.1), 'seconds between 0 and 10'),
+        ((1.0, (0.0, 0.0, 0.0), 'soon'), "got an interval of 'soon'"),
     ],
 )
 def test_what_is_no_load_is_refused(given, message):

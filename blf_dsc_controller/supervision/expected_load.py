@@ -8,6 +8,8 @@ described with that load, except for the gains, which a wrong word must not make
 
 from __future__ import annotations
 
+from numbers import Real
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -119,10 +121,10 @@ class ExpectedLoad:
         self, load: TipLoad, parameters: Vector, interval: float, q: Vector
     ) -> None:
         config, settings = self._config, self._controller.settings
-        if not 0.0 <= interval <= LONGEST:
+        if not (isinstance(interval, Real) and 0.0 <= interval <= LONGEST):
             raise BlfDscError(
-                f'expected load: got an interval of {interval:g} s, but one between 0 and '
-                f'{LONGEST:g} s is needed'
+                f'expected load: got an interval of {interval!r}, but seconds between 0 and '
+                f'{LONGEST:g} are needed'
             )
         rated = config.robot.payload
         carried = 0.0 if self.weighed is None else self.weighed.mass
