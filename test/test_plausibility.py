@@ -55,6 +55,13 @@ CASES = {
     'tool': (UR5E, 'barrier.tool_bound', 3.0, 'mm. Give 0.003', 0.1),
     'angle': (UR5E, 'barrier.tool_angle_bound', 2.0, 'Give 0.0349', 0.3),
     'gravity': (UR5E, 'robot.gravity', [0.0, 0.0, -9810.0], 'Give 9.81', [0, 0, 25.0]),
+    'gravity of drives': (
+        COMPENSATED,
+        'robot.drive_gravity',
+        [0.0, 0.0, -9810.0],
+        'Give 9.81',
+        [0, 0, 25.0],
+    ),
     'payload': (UR5E, 'robot.payload', 5000.0, 'in g. Give 5', 20.0),
     'told': (COMPENSATED, 'robot.drive_payload', 700.0, 'in g. Give 0.7', 20.0),
     'centre': (

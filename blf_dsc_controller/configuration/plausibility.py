@@ -237,6 +237,11 @@ def _coarsest(config: ArmConfig) -> float:
     return _COARSEST * min(ranges)
 
 
+def _fallen(name: str) -> Callable[[ArmConfig], tuple[float, float]]:
+    """Return the acceleration of gravity by name [m/s^2], and the most on a planet."""
+    return lambda config: (math.hypot(*getattr(config.robot, name)), _HEAVIEST)
+
+
 def _reach(config: ArmConfig) -> float:
     return config.robot.chain(config.joints).reach or math.inf
 
@@ -244,12 +249,15 @@ def _reach(config: ArmConfig) -> float:
 _IN_DEGREES = math.radians(1.0)
 
 OF_ROBOT = (
-    _number(
-        'robot.gravity',
-        'm/s^2',
-        lambda config: (np.linalg.norm(config.robot.gravity), _HEAVIEST),
-        'on no planet it is more than',
-        'mm/s^2',
+    *(
+        _number(
+            f'robot.{name}',
+            'm/s^2',
+            _fallen(name),
+            'on no planet it is more than',
+            'mm/s^2',
+        )
+        for name in ('gravity', 'drive_gravity')
     ),
     _number(
         'robot.drive_payload_centre',
