@@ -134,7 +134,7 @@ def check_sample(
     if not T > 0.0:
         return flags
     n = settings.n
-    begins = state.samples[0] <= 1.0
+    begins = state.samples[0] == 0.0
     now = effect.Sample(
         q=checks.repeats.read[:n],
         qr=sample.qr,

@@ -14,7 +14,7 @@ from blf_dsc_controller.compiled.jit import direct
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import barrier, external_torque, friction, load_observer
-from blf_dsc_controller.law.check_state import checks_of, checks_size
+from blf_dsc_controller.law.check_state import INVALID, checks_of, checks_size
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
 from blf_dsc_controller.law.perception import sense, weigh
@@ -29,7 +29,7 @@ from blf_dsc_controller.law.state import (
     state_of,
     state_size,
 )
-from blf_dsc_controller.law.step import compare, update
+from blf_dsc_controller.law.step import advance, compare, update
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference import terms as reference
 
@@ -86,6 +86,7 @@ class Controller:
         views = self.settings, self.state, self.signals
         self.given_law = given = for_kernels(self.law, *views)
         self._update = direct(for_law(update, given), *self.arguments, 0.0, 0.0)
+        self._advance = direct(for_law(advance, given), *self.arguments_after)
         self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
         self._compare = direct(compare, *self._compared, 0.0)
         if self.settings.weighing.size:
@@ -97,6 +98,11 @@ class Controller:
     def arguments(self) -> tuple[Any, ...]:
         """What the kernel `update` takes before t and dt."""
         return self.given_law, *self._vectors, self.reference_vector
+
+    @property
+    def arguments_after(self) -> tuple[Any, ...]:
+        """What the kernel `advance` takes."""
+        return self.given_law, *self._vectors[:5]
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
@@ -128,7 +134,21 @@ class Controller:
         keep(start, before, self.state)
 
     def update(self, t: float, dt: float, measurement: Array) -> Array:
-        """Return the torque (n,) [N m] for a measurement: a view that the next update overwrites.
+        """Return the torque (n,) [N m] of `command`, and `advance`."""
+        torque = self.command(t, dt, measurement)
+        if not self.flags & INVALID:
+            self.advance()
+        return torque
+
+    def advance(self) -> None:
+        """Advance the state by the sample of the last command, whose torque has been sent."""
+        self._advance(*self.arguments_after)
+
+    def command(self, t: float, dt: float, measurement: Array) -> Array:
+        """Return the torque (n,) [N m] for a measurement: a view that the next one overwrites.
+
+        Then call `advance`, which learns: that takes longer, and no torque of this sample needs
+        it.
 
         The measurement is [q (n,) rad, dq (n,) rad/s, effort (n,) N m]. The effort is
         that of the last interval, and for the checks and the load observer alone: the law
@@ -227,7 +247,7 @@ class Controller:
         limit = self.checks.velocity_limit[0]
         self.checks.velocity_limit[0] = 0.0
         try:
-            torque: Array = self.update(t, dt, measurement).copy()
+            torque: Array = self.command(t, dt, measurement).copy()
         finally:
             self.checks.velocity_limit[0] = limit
         self.restore(saved)

@@ -8,7 +8,7 @@ the loop
     1. reads the measurement, evaluates the reference, and computes the error and its bound,
     2. asks the law for the torque (`compute_demand`),
     3. cuts it at the limits of level and rate, less what the drives add (`torque.saturate`),
-    4. lets the law advance its memory (`finish`).
+    4. and, once it is sent, lets the law advance its memory (`finish`).
 
 Everything that a law keeps from one sample to the next is in `State`, so that a
 controller is saved, restored, replayed and compared as one vector.  A law of a file
@@ -50,4 +50,4 @@ class Law(Protocol):
         dt: float,
         saturated: bool,
     ) -> None:
-        """Advance `state` by `dt` [s], once the torque is known; `saturated`: it was cut."""
+        """Advance `state` by `dt` [s], once the torque is sent; `saturated`: it was cut."""

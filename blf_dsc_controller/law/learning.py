@@ -8,11 +8,11 @@ prediction        a row [X | u] with X theta = u, of the last interval
 joint_sensors     what joint torque sensors show, where there are any
 window            sums of the rows over tau_d
 change            whether the arm has changed, so that the window must be forgotten
-excitation        whether a window is excited, consistent, and latched
 friction          friction from reversals, and how much of it is used
 
-`adapt`, once it is known:
+`adapt`, once it is sent:
 
+excitation        whether a window is excited, consistent, and latched
 adaptation        the step of theta^, by the tracking error and the latched window
 disturbance       the step of d^3, which gives up what is learned
 """
@@ -47,17 +47,14 @@ from blf_dsc_controller.law.window import Window
 def observe(
     settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
-    """Compute the regressors; add the row of the last interval; check the excitation when due."""
+    """Compute the regressors at time t [s]; add the row of the last interval."""
     compute_regressors(settings, state, signals)
     fill_learned(settings, state, signals, dt)
     friction.follow_motion(settings.friction, state.friction, signals.friction)
     fill_columns(settings, signals, t)
     form_row(settings, state, signals, dt)
     friction.filter_shapes(settings.friction, state.friction, signals.dq, dt)
-    if state.samples[0] == 0.0:
-        return
-    if state.frozen[0] > 0.0:  # the row is of a contact
-        state.frozen[0] = max(0.0, state.frozen[0] - dt)
+    if state.samples[0] == 0.0 or state.frozen[0] > 0.0:  # the row is of a contact
         return
     samples = int(state.samples[0])
     if samples % settings.window.row_interval == 0:
@@ -67,15 +64,17 @@ def observe(
         measure_reversals(settings, state, signals, settings.window.row_interval * dt)
     if settings.excitation.change_detection == 1:
         detect_change(settings, state, signals, dt)
-    if samples % settings.window.interval == 0:
-        check_excitation(settings, state, signals, t, dt)
 
 
 @inner
 def check_excitation(
-    settings: Settings, state: State, signals: Signals, t: float, dt: float
+    settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Latch the window at time t [s] if it suffices."""
+    """Latch the window if it suffices, where it is due: O(m^3), which no torque waits for."""
+    samples = int(state.samples[0])
+    if samples == 0 or samples % settings.window.interval != 0:
+        return
+    t = signals.t[0]
     sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.prior_mean, settings.information)
     excitation.update_excitation(
@@ -280,10 +279,12 @@ def adapt(
     something reacts to it, only d^3 follows.
     """
     if state.frozen[0] > 0.0:
+        state.frozen[0] = max(0.0, state.frozen[0] - dt)
         if not saturated:
             follow_disturbance(settings, state, signals, dt)
         transfer_friction(settings, state, signals)
         return
+    check_excitation(settings, state, signals, dt)
     of, work = settings.adaptation, signals.scratch.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
     adaptation.fill_newton_step(work, latch, estimate)

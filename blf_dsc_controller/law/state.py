@@ -128,6 +128,8 @@ class Scratch(NamedTuple):
 class Signals(NamedTuple):
     """Values of one sample that the parts of a law pass on to one another."""
 
+    t: Cell  # s, since the start
+    dt: Cell  # s, since the last sample
     q: Annotated[Array, 'n']  # rad
     dq: Annotated[Array, 'n']  # rad/s
     qr: Annotated[Array, 'n']  # rad

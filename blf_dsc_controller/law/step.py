@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One sample of the loop: from the measurement to the torque.
+"""One sample of the loop: from the measurement to the torque, and what follows once that is sent.
 
-See `interface` for what the loop does for every law, and what a law does itself.
+`update` computes the torque, for which the arm waits, and `advance` what the next sample needs of
+this one: the estimate, and the telemetry.  See `interface` for what the loop does for every law,
+and what a law does itself.
 """
 
 from __future__ import annotations
@@ -57,20 +59,13 @@ compile_methods(Law, ('compute_demand', 'finish'), BlfDsc, CalledLaw)
 def fill_sample(
     settings: Settings, state: State, signals: Signals, sample: Sample
 ) -> None:
-    """Fill the telemetry sample."""
+    """Fill the telemetry of what is learned."""
     for i in range(settings.n):
-        sample.qr[i] = signals.qr[i]
-        sample.dqr[i] = signals.dqr[i]
-        sample.xi1[i] = signals.xi1[i]
-        sample.xi2[i] = signals.xi2[i]
-        sample.torque[i] = signals.torque[i]
         sample.disturbance[i] = state.disturbance[i] + signals.friction.torque[i]
         for j in range(settings.p, settings.m):
             sample.disturbance[i] += signals.H[i, j] * state.estimate[j]
         if settings.observer.enabled == 1:
             sample.disturbance[i] += state.observer.torque[i]
-        sample.bound[i] = signals.bound[i]
-        sample.cuts[i] = signals.saturation.cuts[i]
     for j in range(settings.m):
         sample.estimate[j] = state.estimate[j] if state.latch.active[j] != 0.0 else nan
     sample.lambda_min[0] = state.latch.lambda_min[0]
@@ -124,8 +119,10 @@ def prepare(
     signals: Signals,
     reference_vector: Array,
     t: float,
+    dt: float,
 ) -> None:
     """Find what every law reads: torques at work, reference, bound and error."""
+    signals.t[0], signals.dt[0] = t, dt
     torque.find_added(settings.torque, signals.saturation, signals.q)
     torque.find_applied(
         state.saturation, signals.saturation, state.torque, signals.applied
@@ -137,13 +134,14 @@ def prepare(
 
 
 @inner
-def advance(
-    law: Law, settings: Settings, state: State, signals: Signals, t: float, dt: float
+def compute_torque(
+    law: Law, settings: Settings, state: State, signals: Signals, sample: Sample
 ) -> None:
-    """Let the law compute its torque, within its limits, and advance its memory by `dt` [s]."""
+    """Let the law compute its torque, within its limits; fill the telemetry of it."""
+    t, dt = signals.t[0], signals.dt[0]
     has_last = state.samples[0] > 0.0 or state.saturation.takes_over[0] > 0.0
     law.compute_demand(settings, state, signals, t, dt)
-    saturated = torque.saturate(
+    torque.saturate(
         settings.torque,
         state.saturation,
         signals.saturation,
@@ -153,10 +151,15 @@ def advance(
         dt,
         signals.torque,
     )
-    law.finish(settings, state, signals, dt, saturated)
     for i in range(settings.n):
         state.torque[i] = signals.torque[i]
-    state.samples[0] += 1.0
+        sample.qr[i] = signals.qr[i]
+        sample.dqr[i] = signals.dqr[i]
+        sample.xi1[i] = signals.xi1[i]
+        sample.xi2[i] = signals.xi2[i]
+        sample.torque[i] = signals.torque[i]
+        sample.bound[i] = signals.bound[i]
+        sample.cuts[i] = signals.saturation.cuts[i]
 
 
 @inner
@@ -209,11 +212,10 @@ def step(
         return flags
     begins = state.samples[0] == 0.0
     take_measurement(checks, signals, measurement, begins, dt)
-    prepare(settings, state, signals, reference_vector, t)
+    prepare(settings, state, signals, reference_vector, t, dt)
     oscillates = watch_oscillation(settings, checks, signals, begins, dt)
     had_fault = state.sensors.fault[0]
-    advance(law, settings, state, signals, t, dt)
-    fill_sample(settings, state, signals, sample)
+    compute_torque(law, settings, state, signals, sample)
     if not are_on(checks):
         return 0
     flags = check_sample(settings, checks, state, signals, sample)
@@ -252,6 +254,25 @@ def update(
         measurement,
         sample,
     )
+
+
+@kernel
+def advance(
+    law: Law,
+    model: ArmModel,
+    settings_vector: Array,
+    state_vector: Array,
+    signals_vector: Array,
+    sample_vector: Array,
+) -> None:
+    """Advance the memory of the law by the sample of the last `update`, whose torque is sent."""
+    settings = settings_of(settings_vector, model)
+    state = state_of(state_vector, settings)
+    signals = signals_of(signals_vector, settings)
+    dt, saturated = signals.dt[0], torque.is_cut(signals.saturation)
+    law.finish(settings, state, signals, dt, saturated)
+    state.samples[0] += 1.0
+    fill_sample(settings, state, signals, sample_of(sample_vector, settings))
 
 
 @kernel

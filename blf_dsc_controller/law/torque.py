@@ -135,13 +135,12 @@ def saturate(
     has_last: bool,
     dt: float,
     torque: Array,
-) -> bool:
-    """Limit the `demand` (n,), giving the command `torque` (n,) [N m]; return whether it is cut.
+) -> None:
+    """Limit the `demand` (n,), giving the command `torque` (n,) [N m]; `cuts` tells which.
 
     `last` (n,) [N m] is the last command, `dt` [s] ago, if it `has_last`.
     """
     added, cuts = work.added, work.cuts
-    saturated = False
     for i in range(demand.size):
         top = settings.limit[i]
         low = max(-top, added[i] - top)
@@ -163,5 +162,12 @@ def saturate(
         else:
             state.held_back[i] = 0.0
         torque[i] = whole - added[i]
-        saturated = saturated or cuts[i] > 0.0
-    return saturated
+
+
+@inner
+def is_cut(work: Work) -> bool:
+    """Whether a torque of this sample is cut."""
+    found = False
+    for cut in work.cuts:
+        found = found or cut > 0.0
+    return found

@@ -77,10 +77,9 @@ def observe(
     state: State,
     signals: Signals,
     omega: float,
-    t: float,
     dt: float,
 ) -> None:
-    """Add the row (24) to the window; check the excitation when due."""
+    """Add the row (24) to the window."""
     memory = memory_of(state.memory, settings)
     begins = state.samples[0] == 0.0
     differentiate(memory, signals.xi2, omega, begins, dt)
@@ -92,13 +91,8 @@ def observe(
         for j in range(settings.p):
             row[i, j] = H[i, j]
         row[i, settings.m] = scale * signals.applied[i]
-    if begins:
-        return
-    samples = int(state.samples[0])
-    if samples % settings.window.row_interval == 0:
+    if not begins and int(state.samples[0]) % settings.window.row_interval == 0:
         window.push_row(state.window, row)
-    if samples % settings.window.interval == 0:
-        learning.check_excitation(settings, state, signals, t, dt)
 
 
 class Paper(NamedTuple):
@@ -126,7 +120,7 @@ class Paper(NamedTuple):
         compute_surface(settings, state, signals, dt)
         compute_regressors_at_state(settings, state, signals)
         fill_learned(settings, state, signals, dt)
-        observe(settings, state, signals, self.omega, t, dt)
+        observe(settings, state, signals, self.omega, dt)
         begins = state.samples[0] == 0.0
         feedback.advance(settings.feedback, state.feedback, signals.xi2, begins, dt)
         for i in range(settings.n):
@@ -143,6 +137,7 @@ class Paper(NamedTuple):
     ) -> None:
         """Adapt P^ along the gradient, and d^3; advance alpha2."""
         work, estimate = signals.scratch.adaptation, state.estimate
+        learning.check_excitation(settings, state, signals, dt)
         adaptation.fill_prediction_error(work, state.latch, estimate)
         adaptation.adapt(
             settings.adaptation,

@@ -46,7 +46,7 @@ from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.perception import sense
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.state import Sample
-from blf_dsc_controller.law.step import update
+from blf_dsc_controller.law.step import advance, update
 from blf_dsc_controller.messages.journal import Journal
 from blf_dsc_controller.reference.approach import MotionError
 from blf_dsc_controller.run import Floats
@@ -216,7 +216,7 @@ def versions() -> dict[str, str]:
         'blf_dsc_controller': blf_dsc_controller.__version__,
         'kernels': ' '.join(
             cache_folder(each).name
-            for each in (update, sense, run_plant, run_elastic_plant)
+            for each in (update, advance, sense, run_plant, run_elastic_plant)
         ),
         'numpy': np.__version__,
         # `missing` goes by the names of the chunks

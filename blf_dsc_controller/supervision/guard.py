@@ -167,7 +167,7 @@ class Guard(InCommand):
         before = perf_counter()
         self.expected.advance()
         t = self.reference.time_of(reading.stamp)
-        torque = self.controller.update(t, dt, reading.measurement)
+        torque = self.controller.command(t, dt, reading.measurement)
         self.compute_time = perf_counter() - before
         return torque
 
@@ -182,7 +182,7 @@ class Guard(InCommand):
         now = Motion(signals.q, signals.dq, signals.xi1, signals.dqr)
         whole = torque + added
         estimate = self.estimates.estimate[: controller.settings.p]
-        last = self.hold.commanded if controller.samples > 1 else None
+        last = self.hold.commanded if controller.samples > 0 else None
         braked = envelope.brake(now, whole, estimate, dt)
         leaves = torque if braked is whole else braked - added
         leaves = limited(leaves, last, envelope.limits.torque, envelope.limits.step)
@@ -194,12 +194,13 @@ class Guard(InCommand):
         return self.states.braked(asking, envelope.joint, now, envelope.speeds(now))
 
     def perceive(self) -> None:
-        """Weigh what the tip holds, and detect contact, by the last state.
+        """Learn from the last state, weigh what the tip holds, and detect contact.
 
-        Call it after its torque has been sent.
+        Call it after each `update`, once its torque has been sent.
         """
         if not self.has_sample:
             return
+        self.controller.advance()
         if self.controller.perceive(self.config.sample_time):
             self.findings.react_to_contact()
         self.expected.observe()
