@@ -6,12 +6,12 @@
 columns           the columns of what is learned besides P
 prediction        a row [X | u] with X theta = u, of the last interval
 joint_sensors     what joint torque sensors show, where there are any
-window            sums of the rows over tau_d
-change            whether the arm has changed, so that the window must be forgotten
-friction          friction from reversals, and how much of it is used
 
 `adapt`, once it is sent:
 
+window            sums of the rows over tau_d
+friction          friction from reversals, and how much of it is used
+change            whether the arm has changed, so that the window must be forgotten
 excitation        whether a window is excited, consistent, and latched
 adaptation        the step of theta^, by the tracking error and the latched window
 disturbance       the step of d^3, which gives up what is learned
@@ -47,16 +47,21 @@ from blf_dsc_controller.law.window import Window
 def observe(
     settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
-    """Compute the regressors at time t [s]; add the row of the last interval."""
+    """Compute the regressors at time t [s], and the row of the last interval."""
     compute_regressors(settings, state, signals)
     fill_learned(settings, state, signals, dt)
     friction.follow_motion(settings.friction, state.friction, signals.friction)
     fill_columns(settings, signals, t)
     form_row(settings, state, signals, dt)
     friction.filter_shapes(settings.friction, state.friction, signals.dq, dt)
-    if state.samples[0] == 0.0 or state.frozen[0] > 0.0:  # the row is of a contact
-        return
+
+
+@inner
+def learn(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Add the row to the window; find whether the arm has changed, and what the window shows."""
     samples = int(state.samples[0])
+    if samples == 0:
+        return
     if samples % settings.window.row_interval == 0:
         if settings.observer.enabled == 1:
             joint_sensors.add_friction_row(settings, state, signals)
@@ -64,16 +69,15 @@ def observe(
         measure_reversals(settings, state, signals, settings.window.row_interval * dt)
     if settings.excitation.change_detection == 1:
         detect_change(settings, state, signals, dt)
+    if samples % settings.window.interval == 0:
+        check_excitation(settings, state, signals, dt)
 
 
 @inner
 def check_excitation(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Latch the window if it suffices, where it is due: O(m^3), which no torque waits for."""
-    samples = int(state.samples[0])
-    if samples == 0 or samples % settings.window.interval != 0:
-        return
+    """Latch the window if it suffices."""
     t = signals.t[0]
     sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.prior_mean, settings.information)
@@ -278,13 +282,13 @@ def adapt(
     correlated noise and ignored (`change_detection`).  While a contact lasts, and
     something reacts to it, only d^3 follows.
     """
-    if state.frozen[0] > 0.0:
+    if state.frozen[0] > 0.0:  # the row is of a contact
         state.frozen[0] = max(0.0, state.frozen[0] - dt)
         if not saturated:
             follow_disturbance(settings, state, signals, dt)
         transfer_friction(settings, state, signals)
         return
-    check_excitation(settings, state, signals, dt)
+    learn(settings, state, signals, dt)
     of, work = settings.adaptation, signals.scratch.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
     adaptation.fill_newton_step(work, latch, estimate)

@@ -79,7 +79,7 @@ def observe(
     omega: float,
     dt: float,
 ) -> None:
-    """Add the row (24) to the window."""
+    """Form the row (24)."""
     memory = memory_of(state.memory, settings)
     begins = state.samples[0] == 0.0
     differentiate(memory, signals.xi2, omega, begins, dt)
@@ -91,8 +91,18 @@ def observe(
         for j in range(settings.p):
             row[i, j] = H[i, j]
         row[i, settings.m] = scale * signals.applied[i]
-    if not begins and int(state.samples[0]) % settings.window.row_interval == 0:
-        window.push_row(state.window, row)
+
+
+@inner
+def learn(settings: Settings, state: State, signals: Signals, dt: float) -> None:
+    """Add the row to the window; check the excitation when due."""
+    samples = int(state.samples[0])
+    if samples == 0:
+        return
+    if samples % settings.window.row_interval == 0:
+        window.push_row(state.window, signals.row.Xu)
+    if samples % settings.window.interval == 0:
+        learning.check_excitation(settings, state, signals, dt)
 
 
 class Paper(NamedTuple):
@@ -137,7 +147,7 @@ class Paper(NamedTuple):
     ) -> None:
         """Adapt P^ along the gradient, and d^3; advance alpha2."""
         work, estimate = signals.scratch.adaptation, state.estimate
-        learning.check_excitation(settings, state, signals, dt)
+        learn(settings, state, signals, dt)
         adaptation.fill_prediction_error(work, state.latch, estimate)
         adaptation.adapt(
             settings.adaptation,
