@@ -109,6 +109,7 @@ class Rig:
             torque = self.guard.reject(error)
         else:
             torque = self.guard.update(stamp, self._decoder.values)
+            self.guard.perceive()
         self._command(torque)
         return torque
 

@@ -20,7 +20,7 @@ from sim_plant.plant import plant_of
 
 CASES = {'recommended': QUICK, 'panda': {}}
 SETTINGS = 'blf_dsc_law.bin'
-SOURCES = ('example.c', 'blf_dsc_law.c', 'blf_dsc_law.o')
+SOURCES = ('example.c', 'blf_dsc_law.c', 'blf_dsc_update.o', 'blf_dsc_advance.o')
 MISSED = range(700, 712)  # samples whose states do not arrive
 PERIOD = 1_000_000  # ns
 STOPPED = 5  # exit code of the example
@@ -112,7 +112,7 @@ def test_settings_that_are_damaged_or_of_another_object_are_refused(case, tmp_pa
         (damaged, 'damaged'),
         (whole[:-1], 'damaged'),
         (whole + b'0', 'damaged'),
-        (other, 'of another object'),
+        (other, 'of other objects'),
     ):
         file.write_bytes(content)
         run, found = run_in_c(program, file, lines)

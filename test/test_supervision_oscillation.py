@@ -57,6 +57,7 @@ def stopped(loop, stiffened=None):
             guard.retune(stiffened)
         measured = plant.measure()
         torque = guard.update(FIRST_STAMP + at, measured).copy()
+        guard.perceive()
         position.append(measured[:n].copy())
         speed.append((plant.truth()[-n:].copy(), plant.motors[1].copy()))
         if stop < 0 and guard.supervisor.phase is blf.Phase.SAFE_STOP:

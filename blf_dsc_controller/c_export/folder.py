@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of an exported law: its object, settings with initial state, and the C around them.
+"""The files of an exported law: its objects, settings with initial state, and the C around them.
 
-Each vector that the kernel `update` takes is a part of one array, which is the file of settings.
+Each vector that the kernels `update` and `advance` take is a part of one array, which is the file of settings.
 The C code has the places of these parts, and passes them by numba's calling convention.
 """
 
@@ -28,7 +28,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law import check_state
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.state import sample_of, state_of
-from blf_dsc_controller.law.step import update
+from blf_dsc_controller.law.step import advance, update
 from blf_dsc_controller.reference.terms import pack, spline_term
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.recent_motion import shortest_gap
@@ -62,15 +62,11 @@ def export(config: ControllerConfig, folder: Path) -> None:
     n = law.settings.n
     # a piece of a spline, which begins at each sample with what the caller gives
     law.reference_vector = pack(n, [spline_term(np.zeros(1), np.zeros((1, n, 6)))])
-    symbol, code = object_file_of(update, *law.arguments, 0.0, 0.0)
-    if code is None:
-        raise BlfDscError(
-            'the machine code is not in the cache: let NUMBA_CACHE_DIR be a folder that you '
-            'can write'
-        )
-    code = without_python(code)
-    texts = {'SYMBOL': symbol} | _places(law) | _numbers(config)
-    digest = hashlib.sha256(code + repr(texts).encode()).hexdigest()
+    of_update, code = _object(update, *law.arguments, 0.0, 0.0)
+    of_advance, learns = _object(advance, *law.arguments_after)
+    texts = {'SYMBOL': of_update, 'ADVANCE_SYMBOL': of_advance}
+    texts |= _places(law) | _numbers(config)
+    digest = hashlib.sha256(code + learns + repr(texts).encode()).hexdigest()
     values = np.concatenate([np.ravel(each) for each in _flat(law.arguments)])
     settings = digest.encode() + values.astype('<f8').tobytes()
     texts |= {
@@ -78,12 +74,24 @@ def export(config: ControllerConfig, folder: Path) -> None:
         'VALUES': f'{values.size}',
         'MEGABYTES': f'{1e-6 * values.nbytes:.2g}',
     }
-    (folder / 'blf_dsc_law.o').write_bytes(code)
+    (folder / 'blf_dsc_update.o').write_bytes(code)
+    (folder / 'blf_dsc_advance.o').write_bytes(learns)
     checksum = zlib.crc32(settings).to_bytes(4, 'little')
     (folder / 'blf_dsc_law.bin').write_bytes(settings + checksum)
     for file in files(__package__).joinpath('files').iterdir():
         text = re.sub('@([A-Z_]+)@', lambda name: texts[name[1]], file.read_text())
         (folder / file.name).write_text(text)
+
+
+def _object(kernel: Any, *arguments: Any) -> tuple[str, bytes]:
+    """Return the symbol of a kernel for these arguments, and the object that has it."""
+    symbol, code = object_file_of(kernel, *arguments)
+    if code is None:
+        raise BlfDscError(
+            'the machine code is not in the cache: let NUMBA_CACHE_DIR be a folder that you '
+            'can write'
+        )
+    return symbol, without_python(code)
 
 
 def _check(config: ControllerConfig) -> None:
@@ -124,7 +132,10 @@ def _numbers(config: ControllerConfig) -> dict[str, str]:
 
 
 def _places(law: Controller) -> dict[str, str]:
-    """Return the arguments of the kernel in C, and the places of what C writes and reads."""
+    """Return the arguments of the kernels in C, and the places of what C writes and reads.
+
+    `advance` takes the first of those that `update` takes.
+    """
     types, arguments, begins = [], [], []
     at = 0
     for each in _flat(law.arguments):
@@ -138,13 +149,16 @@ def _places(law: Controller) -> dict[str, str]:
             types.append('int64_t' if isinstance(each, int) else 'double')
             arguments.append(f'now[{at}]')
             at += 1
-    *_, state, _, sample, _, measurement, _ = begins
+    *_, state, _, sample, checks, measurement, _ = begins
+    shared = begins.index(checks)
     indices = np.arange(float(at))
     last_torque = state_of(indices, law.settings).torque[0]
     torque = sample_of(indices, law.settings).torque[0]
     return {
         'TYPES': ', '.join(types),
         'ARGUMENTS': ', '.join(arguments),
+        'ADVANCE_TYPES': ', '.join(types[:shared]),
+        'ADVANCE_ARGUMENTS': ', '.join(arguments[:shared]),
         'MEASUREMENT': f'{measurement}',
         'KNOT': f'{at - 6 * law.settings.n - 1}',
         'TORQUE': f'{sample + int(torque)}',

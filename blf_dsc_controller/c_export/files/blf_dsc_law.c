@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * Calls the compiled law in blf_dsc_law.o.  All its vectors are parts of one array of doubles.
+ * Calls the compiled law in blf_dsc_update.o and blf_dsc_advance.o.  All its vectors are parts of one array of doubles.
  */
 #include "blf_dsc_law.h"
 
@@ -11,11 +11,11 @@
 #include <string.h>
 
 #if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
-#error "blf_dsc_law.o is for a little-endian processor"
+#error "the law is compiled for a little-endian processor"
 #endif
 
 #define N BLF_DSC_JOINTS
-#define DIGEST "@DIGEST@" /* of the object, and of the places below */
+#define DIGEST "@DIGEST@" /* of the objects, and of the places below */
 #define VALUES @VALUES@
 /* places among the values */
 #define MEASUREMENT @MEASUREMENT@
@@ -27,9 +27,12 @@
 #define ARRAY void *, void *, int64_t, int64_t, double *, int64_t, int64_t
 #define VECTOR(at, size) NULL, NULL, size, sizeof(double), now + (at), size, sizeof(double)
 
-int32_t blf_dsc_kernel(int64_t *flags, void **error,
-                       @TYPES@,
-                       double t, double dt) __asm__("@SYMBOL@");
+int32_t update_kernel(int64_t *flags, void **error,
+                      @TYPES@,
+                      double t, double dt) __asm__("@SYMBOL@");
+
+int32_t advance_kernel(void **none, void **error,
+                       @ADVANCE_TYPES@) __asm__("@ADVANCE_SYMBOL@");
 
 struct blf_dsc_law {
   /* as in the file */
@@ -38,6 +41,7 @@ struct blf_dsc_law {
   uint32_t checksum;
   /* at work */
   double now[VALUES];
+  int is_advanced;
 };
 
 #define CHECKED offsetof(struct blf_dsc_law, checksum)
@@ -63,7 +67,7 @@ static const char *read_law(const char *path, blf_dsc_law *law) {
   if (!is_whole || crc32_of(law, CHECKED) != law->checksum)
     return "the file of the settings is damaged: copy it again";
   if (memcmp(law->digest, DIGEST, sizeof law->digest) != 0)
-    return "the file of the settings is of another object: take all files of one folder";
+    return "the file of the settings is of other objects: take all files of one folder";
   return NULL;
 }
 
@@ -80,11 +84,14 @@ const char *blf_dsc_load(const char *path, blf_dsc_law **law) {
   return NULL;
 }
 
-void blf_dsc_begin(blf_dsc_law *law) { memcpy(law->now, law->initial, sizeof law->now); }
+void blf_dsc_begin(blf_dsc_law *law) {
+  memcpy(law->now, law->initial, sizeof law->now);
+  law->is_advanced = 1;
+}
 
 int blf_dsc_update(blf_dsc_law *law, double t, double dt, const double *state,
                    const double *reference, double *torque) {
-  if (!(dt > 0.0 && dt < BLF_DSC_GAP)) return BLF_DSC_INVALID;
+  if (!law->is_advanced || !(dt > 0.0 && dt < BLF_DSC_GAP)) return BLF_DSC_INVALID;
   double *now = law->now;
   memcpy(now + MEASUREMENT, state, 3 * N * sizeof *state);
   now[KNOT] = t;
@@ -96,16 +103,26 @@ int blf_dsc_update(blf_dsc_law *law, double t, double dt, const double *state,
   }
   int64_t flags = 0;
   void *error = NULL;
-  if (blf_dsc_kernel(&flags, &error,
-                     @ARGUMENTS@,
-                     t, dt) != 0)
+  if (update_kernel(&flags, &error,
+                    @ARGUMENTS@,
+                    t, dt) != 0)
     return BLF_DSC_INVALID;
-  if (!(flags & BLF_DSC_INVALID)) memcpy(torque, now + TORQUE, N * sizeof *torque);
+  if (flags & BLF_DSC_INVALID) return (int)flags;
+  memcpy(torque, now + TORQUE, N * sizeof *torque);
+  law->is_advanced = 0;
   return (int)flags;
 }
 
-void blf_dsc_sent(blf_dsc_law *law, const double *torque) {
-  memcpy(law->now + LAST_TORQUE, torque, N * sizeof *torque);
+int blf_dsc_advance(blf_dsc_law *law, const double *sent) {
+  if (law->is_advanced) return BLF_DSC_INVALID;
+  double *now = law->now;
+  memcpy(now + LAST_TORQUE, sent, N * sizeof *sent);
+  void *none = NULL, *error = NULL;
+  if (advance_kernel(&none, &error,
+                     @ADVANCE_ARGUMENTS@) != 0)
+    return BLF_DSC_INVALID;
+  law->is_advanced = 1;
+  return 0;
 }
 
 void blf_dsc_free(blf_dsc_law *law) { free(law); }

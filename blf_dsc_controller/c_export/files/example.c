@@ -44,7 +44,7 @@ int main(int count, char **words) {
     return 1;
   }
   int64_t first = 0, last = 0, stamp;
-  double values[6 * N], torque[N], total = 0.0, longest = 0.0;
+  double values[6 * N], torque[N], total = 0.0, longest = 0.0, learning = 0.0;
   int samples = 0, stopped = 0;
   while (!stopped && next_state(&stamp, values)) {
     if (samples == 0) first = stamp;
@@ -57,16 +57,19 @@ int main(int count, char **words) {
       fprintf(stderr, "flags %d at %g s: here you stop the arm\n", flags, t);
       stopped = 1;
     } else {
-      send(torque);
-      blf_dsc_sent(law, torque); /* needed where they were limited */
+      send(torque); /* as limited */
+      before = microseconds();
+      blf_dsc_advance(law, torque);
+      double learned = microseconds() - before;
+      learning = learned > learning ? learned : learning;
     }
     total += taken;
     longest = taken > longest ? taken : longest;
     last = stamp;
     samples++;
   }
-  fprintf(stderr, "%d samples, %.3g us each, at most %.3g us\n", samples,
-          samples > 0 ? total / samples : 0.0, longest);
+  fprintf(stderr, "%d samples, %.3g us each, at most %.3g us, and %.3g us of learning after it\n",
+          samples, samples > 0 ? total / samples : 0.0, longest, learning);
   blf_dsc_free(law);
   return stopped ? STOPPED : 0;
 }
