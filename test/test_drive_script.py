@@ -242,6 +242,19 @@ def arm():
         yield found
 
 
+def test_a_motion_begins_at_a_time_of_the_wall_clock(arm):
+    apart, start = 600.0, arm.state.reference
+    arm.follow([(1.0, start + 0.01)], begin=time.time() + apart, wait=False)
+    before = arm.state.time
+    wait_for(lambda: arm.state.time > before + 1.5)
+    np.testing.assert_array_equal(arm.state.reference, start)
+    assert arm.is_moving
+    arm.follow([(apart + 3.0, start + 0.01)], begin=time.time() - apart, timeout=60.0)
+    np.testing.assert_allclose(arm.state.reference, start + 0.01, atol=1e-9)
+    with pytest.raises(blf.DriveError, match='begin: .*a time of the wall clock in s'):
+        arm.follow([(1.0, start)], begin='soon')
+
+
 def test_stream_without_ruckig_says_what_to_install(arm, monkeypatch):
     monkeypatch.setitem(sys.modules, 'ruckig', None)
     with pytest.raises(

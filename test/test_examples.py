@@ -32,6 +32,7 @@ EXPECTED = {
     '09_ros2_nodes': (['lockstep'], ['rclpy'], r'the arm is there: \[0\.0\d, '),
     '10_openarm': ([], [], r'at \[-0\.6 .*\n?.* mrad off on the way\nat \[-0\.9 .*'),
     '11_own_model': ([], [], r'both identities hold'),
+    '12_two_arms': ([], [], r'at 0\.3 rad.*\nat 0\.0 rad.*'),
 }
 
 

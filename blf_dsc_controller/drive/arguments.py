@@ -127,6 +127,16 @@ def checked_timeout(timeout: Any) -> float:
     )
 
 
+def checked_begin(begin: Any) -> float | None:
+    """Return a time of the wall clock [s]; None: now."""
+    if begin is None or _is_number(begin):
+        return begin
+    raise DriveError(
+        f'begin: got {begin!r}, but a time of the wall clock in s is needed, as in '
+        'time.time() + 1.0'
+    )
+
+
 def checked_load(mass: Any, centre: Any) -> dict[str, Any]:
     """Return a load [kg] and its centre (3,) [m] as JSON has them."""
     try:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blf_dsc_controller.drive.arguments import (
+    checked_begin,
     checked_config,
     checked_interval,
     checked_joints,
@@ -150,6 +151,7 @@ class Drive:
         points: Sequence[Sequence[Any]],
         joints: Sequence[str] = (),
         *,
+        begin: float | None = None,
         wait: bool = True,
         timeout: float | None = None,
     ) -> None:
@@ -159,6 +161,8 @@ class Drive:
             points: each a `TrajectoryPoint`, or likewise the time [s] from now, positions
                 [rad], and perhaps velocities [rad/s] and accelerations [rad/s^2].
             joints: names, in the order of the values; by default the arm's.
+            begin: when the times begin instead of now, on the wall clock (`time.time()`) [s], so
+                that several arms move in step.
             wait, timeout: as for `move_to`.
 
         Raises:
@@ -183,6 +187,7 @@ class Drive:
         wanted = {
             'points': given,
             'joints': checked_joints(joints) or list(self.joints),
+            'begin': checked_begin(begin),
         }
         self._begin(script_link.FOLLOW, wanted, wait=wait, timeout=timeout)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -118,7 +119,8 @@ class Script(Beside):
             return
         if kind == script_link.FOLLOW:
             (number,) = script_link.HEAD.unpack_from(content)
-            self._begin_goal(number, lambda: _trajectory(content))
+            now = self._guard.reference.time
+            self._begin_goal(number, lambda: _trajectory(content, now))
             return
         wanted = topic_link.decode(content)
         match kind:
@@ -156,8 +158,8 @@ class Script(Beside):
         (there,), _ = short_way(np.array([wanted['positions']]), here, config)
         limits = config.limits.velocity, config.limits.acceleration
         speed, acceleration = wanted['speed'] * np.array(limits)
-        time = max(_SHORTEST, duration_of(np.abs(there - here), speed, acceleration))
-        points = (TrajectoryPoint(time, tuple(there.tolist())),)
+        duration = duration_of(np.abs(there - here), speed, acceleration)
+        points = (TrajectoryPoint(max(_SHORTEST, duration), tuple(there.tolist())),)
         return Trajectory(config.joints, points)
 
     def _brake(self, number: int) -> None:
@@ -277,10 +279,14 @@ def _far_beyond(positions: np.ndarray, config: ControllerConfig) -> str:
     )
 
 
-def _trajectory(content: bytes) -> Trajectory:
+def _trajectory(content: bytes, now: float) -> Trajectory:
+    """Return the trajectory of a request, at the time `now` since the start [s]."""
     wanted = topic_link.decode(content[script_link.HEAD.size :])
+    begin = wanted['begin']
+    if begin is not None:
+        begin += now - time.time()
     points = tuple(TrajectoryPoint(*map(_field, each)) for each in wanted['points'])
-    return Trajectory(tuple(wanted['joints']), points)
+    return Trajectory(tuple(wanted['joints']), points, begin)
 
 
 def _field(value: Any) -> Any:
