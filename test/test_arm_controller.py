@@ -140,6 +140,25 @@ def test_law_takes_what_it_commanded_for_efforts_that_are_not_given():
         np.testing.assert_array_equal(with_efforts, without)
 
 
+def test_torque_is_sent_before_anything_is_learned_from_its_state():
+    """What is learned takes up to fifty times as long as a torque."""
+    controller = blf.ArmController(LOOP.controller)
+    plant = plant_of(LOOP.plant)
+    at_sending, after = [], []
+    for step in range(800):
+        controller.update(
+            1.0 + 1e-3 * step,
+            *plant.measure().reshape(3, -1),
+            send=lambda torque: (
+                plant.step(torque),
+                at_sending.append([*controller.estimates.values()]),
+            ),
+        )
+        after.append([*controller.estimates.values()])
+    np.testing.assert_array_equal(at_sending[1:], after[:-1])
+    assert after[-2] != after[-1]
+
+
 def test_it_follows_trajectories_and_stops_on_request():
     arm = Scenario(LOOP)
     controller = arm.controller
