@@ -26,7 +26,10 @@ with (
             arm.follow([(2.0, start + way)], begin=begin, wait=False)
         apart = 0.0
         while left.is_moving and right.is_moving:
-            ways = [arm.state.reference - start for arm, start in zip(arms, starts, strict=True)]
+            ways = [
+                arm.state.reference - start
+                for arm, start in zip(arms, starts, strict=True)
+            ]
             apart = max(apart, np.abs(ways[0] - ways[1]).max())
             time.sleep(0.01)
         for arm in arms:

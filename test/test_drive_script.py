@@ -251,7 +251,7 @@ def test_a_motion_begins_at_a_time_of_the_wall_clock(arm):
     assert arm.is_moving
     arm.follow([(apart + 3.0, start + 0.01)], begin=time.time() - apart, timeout=60.0)
     np.testing.assert_allclose(arm.state.reference, start + 0.01, atol=1e-9)
-    with pytest.raises(blf.DriveError, match='begin: .*a time of the wall clock in s'):
+    with pytest.raises(blf.DriveError, match=r'begin: .*a time of the wall clock in s'):
         arm.follow([(1.0, start)], begin='soon')
 
 

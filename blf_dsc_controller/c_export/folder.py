@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of an exported law: its objects, settings with initial state, and the C around them.
 
-Each vector that the kernels `update` and `advance` take is a part of one array, which is the file of settings.
-The C code has the places of these parts, and passes them by numba's calling convention.
+Each vector that the kernels `update` and `advance` take is a part of one array, which is the
+file of settings.  The C code has the places of these parts, and passes them by numba's calling
+convention.
 """
 
 from __future__ import annotations

@@ -129,8 +129,10 @@ def checked_timeout(timeout: Any) -> float:
 
 def checked_begin(begin: Any) -> float | None:
     """Return a time of the wall clock [s]; None: now."""
-    if begin is None or _is_number(begin):
-        return begin
+    if begin is None:
+        return None
+    if _is_number(begin):
+        return float(begin)
     raise DriveError(
         f'begin: got {begin!r}, but a time of the wall clock in s is needed, as in '
         'time.time() + 1.0'
