@@ -289,7 +289,7 @@ def test_erratum_2_both_integrals_carry_the_same_factor():
         cholesky_factor(latch.factor)
         law.signals.xi2[:] = 0.0
         for _ in range(2000):
-            learning.adapt(settings, law.state, law.signals, 1e-3, False)  # noqa: FBT003
+            learning.adapt_estimate(settings, law.state, law.signals, 1e-3, False)  # noqa: FBT003
         return law.state.estimate.copy()
 
     np.testing.assert_allclose(rest_point(law.state.latch.Phi.copy()), theta, atol=1e-4)

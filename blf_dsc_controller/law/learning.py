@@ -274,13 +274,9 @@ def transfer_learned(
 def adapt(
     settings: Settings, state: State, signals: Signals, dt: float, saturated: bool
 ) -> None:
-    """Advance theta^ and d^3 by `dt` [s]: (20), (30).
+    """Learn from the row, and advance theta^ and d^3 by `dt` [s]: (20), (30).
 
-    While a torque is saturated, the tracking error reflects the limit, not the
-    parameters, so only the prediction error, which uses the applied torque, adapts the
-    estimate.  While a full window is not excited, as at standstill, H^T xi2 is
-    correlated noise and ignored (`change_detection`).  While a contact lasts, and
-    something reacts to it, only d^3 follows.
+    While a contact lasts, and something reacts to it, only d^3 follows.
     """
     if state.frozen[0] > 0.0:  # the row is of a contact
         state.frozen[0] = max(0.0, state.frozen[0] - dt)
@@ -289,6 +285,20 @@ def adapt(
         transfer_friction(settings, state, signals)
         return
     learn(settings, state, signals, dt)
+    adapt_estimate(settings, state, signals, dt, saturated)
+
+
+@inner
+def adapt_estimate(
+    settings: Settings, state: State, signals: Signals, dt: float, saturated: bool
+) -> None:
+    """Advance theta^ and d^3 by `dt` [s], with the latched window.
+
+    While a torque is saturated, the tracking error reflects the limit, not the
+    parameters, so only the prediction error, which uses the applied torque, adapts the
+    estimate.  While a full window is not excited, as at standstill, H^T xi2 is
+    correlated noise and ignored (`change_detection`).
+    """
     of, work = settings.adaptation, signals.scratch.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
     adaptation.fill_newton_step(work, latch, estimate)
