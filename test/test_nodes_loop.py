@@ -59,7 +59,6 @@ JITTER = {
 WEAK = {  # gravity alone takes 9.7 N m
     'torque.limit': [9.0, 3.2],
     'safety.torque': 'hold_gravity',
-    'safety.stop_ramp': 0.05,
 }
 
 

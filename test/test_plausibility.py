@@ -155,7 +155,10 @@ def test_joints_without_an_effort_have_that_of_an_arm_of_their_weight():
         ({'barrier.tool_angle_bound': 1.5}, 'barrier.tool_angle_bound: .* give less'),
         ({'barrier.bound': each(0.5)}, 'barrier.bound: 0.5 rad is 28.6 degrees'),
         ({'safety.state_timeout': 40.0}, 'safety.state_timeout: in 40 s .* Give 0.04'),
-        ({'safety.stop_ramp': 500.0}, 'safety.stop_ramp: in 500 s .* in ms'),
+        (
+            {'safety.deactivation_ramp': 500.0},
+            'safety.deactivation_ramp: in 500 s .* in ms',
+        ),
     ],
 )
 def test_value_that_may_be_of_another_unit_is_named_before_the_start(given, words):

@@ -22,8 +22,7 @@ from blf_dsc_controller.reference.trajectory import Trajectory
 # Messages show neither a corrupted state of the law nor the end of a process.
 IN_MESSAGES = [fault for fault in FAULTS if 'poison' not in fault.inject.__qualname__]
 NAN = struct.pack('<d', float('nan'))
-# no two torques alike
-DAMPED = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.02}
+DAMPED = {'safety.torque': 'hold_gravity'}
 
 
 class Recorder(Rig):

@@ -24,7 +24,7 @@ from blf_dsc_controller.messages.journal import decode_change
 from blf_dsc_controller.messages.topics import CHANGES
 from blf_dsc_controller.simulation.loop import simulate_into_bag, write_bag
 
-HELD = {'safety.torque': 'hold_gravity', 'safety.stop_ramp': 0.05}
+HELD = {'safety.torque': 'hold_gravity'}
 NOISY = {'sensor.position_noise': 1e-6, 'sensor.velocity': 'differenced', 'seed': 3}
 WEAK = {'torque.limit': [9.0, 3.2]}  # gravity alone takes 9.7 N m
 CASES = {

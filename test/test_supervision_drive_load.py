@@ -54,7 +54,6 @@ def test_load_is_declared_in_steps_kept_over_a_reset_and_taken_back():
     assert (steps <= limit * (1.0 + 1e-9)).all()
 
     last = moving.torque[-1]
-    arm.change({'safety.stop_ramp': 0.3})
     assert (
         np.abs(arm.run(arm.T).torque[0] - last).max() < 1.0
     )  # N m: left to the drives

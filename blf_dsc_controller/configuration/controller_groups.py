@@ -104,11 +104,10 @@ class Safety:
         'N m s/rad',
         'D',
     )
-    stop_ramp: float = non_negative(
-        0.0, 'ramp to the safe torque after a fault; 0: at once', 's'
-    )
     deactivation_ramp: float = non_negative(
-        0.5, 'the same ramp when the node is deactivated', 's'
+        0.5,
+        'ramp to the safe torque when the node is deactivated; a fault has none',
+        's',
     )
 
 

@@ -132,15 +132,15 @@ class Hold:
         """The torque (n,) [N m] that holds the arm: gravity and load."""
         return self.gravity(self._estimate) + self.load
 
-    def begin_ramp(
+    def begin(
         self,
-        duration: float,
         load: Vector,
         *,
+        ramp: float = 0.0,
         source: Load = Load.OBSERVED,
         oscillates: bool = False,
     ) -> None:
-        """Start a linear ramp of `duration` [s] at the last torque, with this `load`.
+        """Begin to hold, with this `load`, by a linear `ramp` [s] from the last torque.
 
         The load of an arm that `oscillates` is observed more slowly.
         """
@@ -152,7 +152,7 @@ class Hold:
         self._source = source
         self._rested = 0.0
         self._start[:] = self.commanded
-        self._duration = duration
+        self._duration = ramp
         self._elapsed = 0.0
 
     def yield_to_contact(self) -> None:

@@ -82,7 +82,7 @@ class SafeStop:
         was_running: bool,
         oscillates: bool,
     ) -> None:
-        """Begin the ramp of a stop at a speed [rad/s], the largest of a joint."""
+        """Begin a stop at a speed [rad/s], the largest of a joint."""
         self._speed.begin(speed)
         self._swings.begin()
         load = self._hold.load.copy()
@@ -90,8 +90,7 @@ class SafeStop:
             self._continue_from_held()
             load = self._load_at_stop(reason)
         awaits = is_in_doubt(reason, Doubtful.EFFECT) and not oscillates
-        self._hold.begin_ramp(
-            safety.stop_ramp,
+        self._hold.begin(
             load,
             source=Load.AWAITED if awaits else Load.OBSERVED,
             oscillates=oscillates,
@@ -108,12 +107,12 @@ class SafeStop:
         ramp = safety.deactivation_ramp
         if safety.torque == 'hold_gravity' and fastest * ramp > 2.0 * _FASTER:
             ramp = 2.0 * _FASTER / fastest
-        self._hold.begin_ramp(ramp, self._held.load(), source=Load.UNTIL_MOVED)
+        self._hold.begin(self._held.load(), ramp=ramp, source=Load.UNTIL_MOVED)
 
     def begin_anew(self, safety: Safety, load: Vector) -> None:
-        """Begin the ramp of a law that forgets what it has learned, with this load (n,) [N m]."""
+        """Begin the torque of a law that forgets what it has learned, with this load (n,) [N m]."""
         self._swings.begin()
-        self._hold.begin_ramp(safety.stop_ramp, load)
+        self._hold.begin(load)
 
     def carried(self, safety: Safety, estimate: Vector) -> Vector | None:
         """Return the load (n,) [N m] besides an estimate (m,) that the safe torque carries.
