@@ -2,6 +2,7 @@
 """What the presets err by with learning, and without it but with all else equal.
 
     python -m benchmark presets [PRESET ...]
+    python -m benchmark presets fr3_direct panda ur5e --arms 10
 
 Each runs for 60 s; by default those with elastic gears, which pick up 2 kg at 20 s, in full motion,
 and put them down at 45 s.  A cell has the largest error of any joint [mrad], with learning /
@@ -9,6 +10,9 @@ without: a PID over the URDF's model along the reference, with the load observer
 has joint torque sensors.  The next rows are of a law that is told both as they happen, and of one
 that is told 2 kg and holds nothing.  The last row is the load with its 95 % interval, 5 s after the
 pick-up.
+
+With `--arms` that many arms of each preset, which differ in masses, centres and noise, run until
+the load is put down: a cell has the median of the errors and, in brackets, that of the worst arm.
 """
 
 from __future__ import annotations
@@ -103,6 +107,45 @@ def column(preset: str) -> list[str]:
     return [*cells, *known, wrong, weight_of(records[0])]
 
 
+def two(error: float) -> str:
+    """Return an error [mrad] with two digits."""
+    return f'{error:#.2g}'.rstrip('.')
+
+
+def errors_of(controller: ControllerConfig, plant: PlantConfig) -> list[float]:
+    """Return the largest error [mrad] in each span; NaN: the arm stops."""
+    run = simulate(controller, plant).run()
+    if run.stops or run.oscillations:
+        return [np.nan] * len(SPANS)
+    error = 1e3 * np.abs(np.asarray(run.error)).max(axis=1)
+    spans = (error[(run.time >= a) & (run.time < b)] for a, b in SPANS.values())
+    return [float(each.max(initial=0.0)) for each in spans]
+
+
+def errors_of_arm(given: tuple[str, int]) -> list[list[float]]:
+    """Return the errors of an arm of a preset, with this seed, with and without learning."""
+    preset, seed = given
+    arm = {'duration': SPANS['put down'][0], 'seed': seed, 'truth.seed': seed}
+    loop = load_loop(preset, {PLANT: arm})
+    laws = loop.controller, without_learning(loop.controller)
+    return [errors_of(law, loop.plant) for law in laws]
+
+
+def rows_of_arms(presets: list[str], arms: int) -> Iterator[list[str]]:
+    """Compute the rows of the table of the medians and of the worst of this many arms."""
+    given = [(preset, seed) for preset in presets for seed in range(1, arms + 1)]
+    with ProcessPoolExecutor(cores()) as pool:
+        found = np.array(list(pool.map(errors_of_arm, given)))
+    found = found.reshape(len(presets), arms, 2, len(SPANS))
+    medians, worst = np.median(found, axis=1), found.max(axis=1)
+    for k, span in enumerate(list(SPANS)[:-1]):
+        cells = [
+            ' / '.join(f'{two(m)} ({two(w)})' for m, w in zip(*both, strict=True))
+            for both in zip(medians[:, :, k], worst[:, :, k], strict=True)
+        ]
+        yield [span, *cells]
+
+
 def rows(presets: list[str]) -> Iterator[list[str]]:
     """Compute the rows of the table."""
     with ProcessPoolExecutor(cores()) as pool:
@@ -114,8 +157,15 @@ def rows(presets: list[str]) -> Iterator[list[str]]:
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument('presets', nargs='*', metavar='PRESET', default=list(PRESETS))
+    about = 'medians of this many arms of each preset'
+    parser.add_argument('--arms', type=int, default=0, help=about)
 
 
 def main(options: argparse.Namespace) -> None:
     """Print the table."""
-    print_table(['', *options.presets], rows(options.presets))
+    found = (
+        rows_of_arms(options.presets, options.arms)
+        if options.arms
+        else rows(options.presets)
+    )
+    print_table(['', *options.presets], found)

@@ -568,19 +568,22 @@ FAULTS = (
 )
 
 
-RULE = '| --- | --- | --- |\n'
+RULE = '| --- | --- |\n'
 
 
 def measured() -> str:
-    """Return the rows of the faults that stop the loop, and the list of the others."""
-    stops, tolerated = [], []
+    """Return a row of faults for each reason of a stop, and the list of the other faults."""
+    stops: dict[str, list[str]] = {}
+    tolerated = []
     for fault in FAULTS:
         outcome = run(fault)
         if outcome.noticed < 0:
             tolerated.append(f'- {fault.name}\n')
         else:
-            stops.append(f'| {fault.name} | {outcome.noticed} | {outcome.reason} |\n')
-    return ''.join([*stops, '\nTolerated:\n\n', *tolerated])
+            found = stops.setdefault(outcome.reason, [])
+            found.append(f'{fault.name} ({outcome.noticed})')
+    rows = (f'| {reason} | {"; ".join(found)} |\n' for reason, found in stops.items())
+    return ''.join([*rows, '\nTolerated:\n\n', *tolerated])
 
 
 def page(text: str) -> str:

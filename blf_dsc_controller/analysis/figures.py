@@ -61,6 +61,10 @@ _WIDEST = 5.0
 _DPI = 130
 _CHARACTER = 0.085  # inches, approximate width in a title or legend
 _HANDLE = 0.5
+_POINTS = 72.0  # of an inch
+# points: below the top of a panel, the height of the name of a mark
+_GAP = 2.0
+_ROW = 12.0
 _MARGIN = 0.75  # inches of a panel, beside its axes
 _SETTINGS: Any = {
     'font.family': 'DejaVu Sans',
@@ -190,7 +194,7 @@ def draw(run: Run, folder: str | Path, metrics: Metrics | None = None) -> list[P
     paths = [tracking]
     changes = true_change_times(run)
     if changes and run.column('error', 0) is not None:
-        title = f'The first change of the arm, from {changes[0] - _BEFORE:g} s on'
+        title = f'Errors and torques as the arm changes at {changes[0]:g} s'
         draw_panels(change, title, list(close_up(run, changes[0])), 1, _CLOSE_UP)
         paths.append(change)
     if _of_groups(found, ('Parameters',)):
@@ -301,6 +305,7 @@ def draw_panels(
     picture = Picture(-(-len(shown) // columns), columns, title, size)
     for k, (axes, panel) in enumerate(zip(picture.axes.flat, shown, strict=False)):
         _draw_panel(axes, panel, runs)
+        _make_room(axes, panel.marks, size[1])
         title = panel.title + (panel.note and f': {panel.note}')
         head(axes, title, legend_at=_ABOVE * (k < columns) if legend_above else None)
     for axes in picture.axes.flat[len(shown) :]:
@@ -321,8 +326,10 @@ def _draw_panel(axes: Axes, panel: Panel, runs: Sequence[str]) -> None:
     for line in panel.lines:
         if line.colour:
             _draw_line(axes, line, label=line.name, color=line.colour, lw=1.2)
-    for row, mark in enumerate(panel.marks):
+    row = 0
+    for mark in panel.marks:
         _draw_mark(axes, mark, row)
+        row += _is_named(mark)
     _set_scale(axes, panel)
 
 
@@ -364,6 +371,22 @@ def _draw_line(axes: Axes, line: Line, *, label: str, **style: Any) -> None:
         axes.plot(time, -values, **style)
 
 
+def _make_room(axes: Axes, marks: Sequence[Mark], height: float) -> None:
+    """Raise the top of a panel of this height [inches], so that names of marks hide no line."""
+    rows = sum(map(_is_named, marks))
+    if not rows:
+        return
+    share = (_ROW * rows + _GAP) / (_POINTS * (height - _MARGIN))
+    to_axis, to_value = axes.transScale, axes.transScale.inverted()
+    (_, low), (_, high) = (to_axis.transform((1.0, each)) for each in axes.get_ylim())
+    top = high + (high - low) * share / (1.0 - share)
+    axes.set_ylim(top=to_value.transform((0.0, top))[1])
+
+
+def _is_named(mark: Mark) -> bool:
+    return bool(mark.colour and mark.text)
+
+
 def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
     if mark.until > mark.time:
         axes.axvspan(mark.time, mark.until, color=mark.colour, alpha=_SHADED, lw=0)
@@ -373,13 +396,13 @@ def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
         axes.axvline(
             mark.time, color=mark.colour or INK, lw=1.1, ls=(0, (1, 2)), zorder=1
         )
-    if not mark.colour:
+    if not _is_named(mark):
         return
     is_early = mark.time < sum(axes.get_xlim()) / 2.0
     axes.annotate(
         mark.text,
         (mark.time, 1.0),
-        (4 if is_early else -4, -2 - 12 * row),
+        (4 if is_early else -4, -_GAP - _ROW * row),
         xycoords=axes.get_xaxis_transform(),
         textcoords='offset points',
         ha='left' if is_early else 'right',

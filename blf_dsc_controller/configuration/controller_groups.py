@@ -265,10 +265,10 @@ class Learning:
 
 @dataclass(frozen=True)
 class DeclaredLoad:
-    """Whether the weighed load is declared to drives that compensate gravity, and how."""
+    """Whether the estimated load is declared to drives that compensate gravity, and how."""
 
     tell_drive: bool = sizing(
-        False, 'declare the weighed load to the drives, once it is known well'
+        False, 'declare the estimated load to the drives, once it is known well'
     )
     service: str = sizing(
         '',
