@@ -97,7 +97,7 @@ def drive(options: Namespace) -> int:
         print(f'recorded      only a part: {controller.output_problem}')
     elif options.out is not None:
         print(
-            f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
+            f'recorded      {options.out}: blf_dsc replay, report, export and identify read it'
         )
     return CODES[outcome.end] or int(bool(controller.output_problem))
 
