@@ -16,6 +16,7 @@ from blf_dsc_controller.cli.result_folder import (
     keep,
 )
 from blf_dsc_controller.cli.run import STOPPED
+from blf_dsc_controller.cli.softer_gains import print_softer_gains
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -91,6 +92,8 @@ def drive(options: Namespace) -> int:
             keep(options.out)
             outcome = loop.run()
         _print(outcome, loop, controller)
+    if driver.config.feedback == 'host':  # motors bear others
+        print_softer_gains(outcome.text, config)
     if ros is not None and ros.problem:
         print(f'topics        {ros.problem}')
     if controller.output_problem:
