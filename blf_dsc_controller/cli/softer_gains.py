@@ -16,7 +16,7 @@ from blf_dsc_controller.configuration.controller import (
 )
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.supervision.oscillation_check import LOWER, is_oscillation
+from blf_dsc_controller.supervision.oscillation_check import LOWER, OSCILLATES
 from blf_dsc_controller.warnings.expected_errors import expectation
 
 
@@ -25,15 +25,13 @@ def print_softer_gains(text: str, config: ControllerConfig) -> None:
 
     Nothing, unless an arm of a URDF oscillated whose joints have gains, each on its own.
     """
-    if not is_oscillation(text) or config.model != 'urdf':
+    if OSCILLATES not in text or config.model != 'urdf':
         return
     arm = used_design_of(config)
     if arm.joints is None:
         return
     gains = arm.joints.scaled(LOWER * arm.stiffness)
-    values = as_parameters(
-        *([float(f'{each:.3g}') for each in of_joints] for of_joints in gains[:2])
-    )
+    values = as_parameters(gains.stiffness.round(3), gains.damping.round(3))
     softer = with_gains(config, values)
     try:
         values |= widened_bounds(softer)

@@ -27,7 +27,9 @@ _BORNE = 0.2
 LOWER = 0.5
 """Part of the present gains that is advised after an oscillation."""
 
-_OSCILLATES = ' oscillates at '
+OSCILLATES = ' oscillates at '
+"""In the text of each stop of an arm that oscillates."""
+
 _LATELY = 0.1  # s
 
 
@@ -43,14 +45,9 @@ class Shaking(NamedTuple):
     def text(self) -> str:
         """A sentence with the numbers, without its end."""
         return (
-            f'joint {self.joint!r}{_OSCILLATES}{two_digits(self.frequency)} Hz with '
+            f'joint {self.joint!r}{OSCILLATES}{two_digits(self.frequency)} Hz with '
             f'+-{two_digits(self.torque)} {self.unit}'
         )
-
-
-def is_oscillation(text: str) -> bool:
-    """Return whether a stop with this text is that of an arm that oscillates."""
-    return _OSCILLATES in text
 
 
 class OscillationCheck:
