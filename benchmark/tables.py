@@ -22,6 +22,7 @@ GROUPS = {
     },
     'gains': {
         'presets': 'what the presets err by, with and without learning',
+        'pick-and-place': 'what the same box costs that comes again, announced or not',
         'commissioning': 'random arms, commissioned and put to work',
     },
     'time': {

@@ -20,7 +20,6 @@ from command import COMPILED, wait_for
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.bags.content import read_content
-from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.drive import loop_process
 
 # rad: the bound of the preset, to which any error of the arm adds up
@@ -37,14 +36,6 @@ def rests(arm):
     before = arm.state
     wait_for(lambda: arm.state.time > before.time + 0.05)
     return np.array_equal(before.reference, arm.state.reference)
-
-
-def test_command_controls_the_simulated_arm_too(tmp_path, capsys):
-    out = tmp_path / 'bag'
-    words = ['drive', '--robot', 'simulated', '--config', 'panda', '--duration', '0.5']
-    assert main([*words, '--out', str(out)]) == 0
-    assert re.search(r'states +\d{3,}, and 0 missed', capsys.readouterr().out)
-    assert blf.verify(out).difference is None
 
 
 def test_motions_arrive_and_the_bag_replays_bit_equal(tmp_path):

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every preset runs by its name, offline and over ROS."""
+"""Every preset runs by its name, on every path that a page names for it, or is refused."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
+from pathlib import Path
 
 import pytest
 
@@ -27,6 +30,33 @@ LAW = {
     'paper_tuned': 'paper',
     'slotine_li': 'slotine_li',
 }
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ROOT / 'README.md', *sorted((ROOT / 'doc').glob('*.md'))
+
+
+def walks():
+    """Yield each command of a page that runs a preset, but for its time and place, as a parameter.
+
+    Not by the wall clock, which is slower here than some arms; what else runs by day, too, and what
+    is over ROS are for the night.
+    """
+    found = {('widowx', 'run --config widowx --physics mujoco --offline')}  # in words
+    for page in PAGES:
+        for line in re.findall(r'blf_dsc ((?:run|drive) [^`#\n]*)', page.read_text()):
+            words = re.sub(r' --(view|(out|duration) \S+)', '', line)
+            name = re.search(r'--config (\w+)(?= |$)', words)
+            is_real = words.startswith('drive') and '--robot simulated' not in words
+            if name and name[1] in NAMES and not is_real:
+                found.add((name[1], words.strip()))
+    for preset, words in sorted(found):
+        is_run = words.startswith('run')
+        by_clock = is_run and not re.search('--offline|lockstep', words)
+        if by_clock or (is_run and preset in IN_MOTORS):
+            continue
+        is_long = is_run and '--physics' not in words
+        yield pytest.param(words, id=words, marks=[pytest.mark.nightly] * is_long)
+
 
 # Figures are drawn with and without a barrier, and of an arm from a URDF; others have
 # no more.
@@ -63,14 +93,22 @@ def test_preset_runs_by_name_and_saves_its_configuration(
 
 
 @pytest.mark.usefixtures('blank_pictures')
+@pytest.mark.parametrize('words', [*walks()])
+def test_preset_runs_as_a_page_says(words, tmp_path, capfd):
+    """Without a stop: for 60 s at night, in which arms pick up a load and put it down."""
+    if 'lockstep' in words:
+        pytest.importorskip('rclpy')
+    seconds = '60' if os.environ.get('NIGHTLY') else '0.5'
+    out = tmp_path / 'out'
+    assert main([*words.split(), '--duration', seconds, '--out', str(out)]) == 0
+    if words.startswith('drive'):
+        assert 'and 0 missed' in capfd.readouterr().out
+        assert blf.verify(out).difference is None
+
+
 @pytest.mark.parametrize('preset', IN_MOTORS)
-def test_preset_with_feedback_in_its_motors_is_driven_by_name(preset, tmp_path, capsys):
-    """Over the bus its gains would shake it: every other path refuses it, with the command."""
-    bag = tmp_path / 'bag'
-    arguments = ['--robot', 'simulated', '--config', preset, '--out', str(bag)]
-    assert main(['drive', *arguments, '--duration', '0.5']) == 0
-    assert 'and 0 missed' in capsys.readouterr().out
-    assert blf.verify(bag).difference is None
+def test_preset_with_feedback_in_its_motors_is_refused_elsewhere(preset, capsys):
+    """Over the bus its gains would shake it; the refusal has the command that drives it."""
     drive = f'blf_dsc drive --robot simulated --config {preset}'
     for words in (['--offline'], ['--offline', '--physics', 'mujoco'], []):
         assert main(['run', '--config', preset, '--duration', '0.5', *words]) == 1

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+import yaml
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.cli.main import main
+from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.run import FIRST_STAMP
@@ -116,6 +120,63 @@ def test_arm_that_shakes_stops_calmly_and_says_what_it_did(arm):
     before = largest[first : run.stop + 1].max()
     assert largest[run.stop + 1 :].max() < 1.7 * before + 0.02
     assert largest[run.stop + round(1.0 / run.period) :].max() < 0.15
+
+
+@pytest.fixture
+def soft_ur5e(tmp_path, capsys):
+    """Return the sections of a UR5e with gears half as stiff, and a run of them for some time [s].
+
+    It picks up 2 kg at 4 s and puts them down at 7 s.
+    """
+    path = blf.share_folder() / 'config' / 'ur5e.yaml'
+    sections = yaml.safe_load(path.read_text())
+    sections['/**']['ros__parameters']['robot']['urdf'] = str(path.with_suffix('.urdf'))
+    arm = sections['/**/sim_plant']['ros__parameters']
+    arm['joint'] = {'stiffness': [1.5e4] * 6}
+    arm['events'] = {'begin': [4.0], 'duration': [3.0], 'payload': [2.0]}
+
+    def run(seconds):
+        (tmp_path / 'my.yaml').write_text(yaml.safe_dump(sections))
+        place = [
+            '--config',
+            str(tmp_path / 'my.yaml'),
+            '--out',
+            str(tmp_path / seconds),
+        ]
+        code = main(['run', '--offline', '--duration', seconds, *place])
+        return code, capsys.readouterr().out
+
+    return sections, run
+
+
+@pytest.mark.usefixtures('blank_pictures')
+def test_block_that_is_printed_after_a_stop_holds_a_pick_up(soft_ur5e):
+    """It is pasted in place of what the file has."""
+    sections, run = soft_ur5e
+    code, told = run('3')
+    assert code == STOPPED
+    (block,) = re.findall(r'^/\*\*/blf_dsc_controller:\n(?: .*\n)+', told, re.MULTILINE)
+    law = sections['/**/blf_dsc_controller']['ros__parameters']
+    for name, value in yaml.safe_load(block).popitem()[1]['ros__parameters'].items():
+        group, _, parameter = name.partition('.')
+        law[group][parameter] = value
+    code, told = run('20')
+    assert code == 0
+    assert 'held by every joint' in told
+
+
+@pytest.mark.usefixtures('blank_pictures')
+def test_arm_that_half_of_its_gains_cannot_load_is_said_to_need_commissioning(
+    soft_ur5e,
+):
+    """140 kg: bounds would be wider than a quarter turn."""
+    sections, run = soft_ur5e
+    sections['/**']['ros__parameters']['robot']['payload'] = 140.0
+    _, told = run('3')
+    assert (
+        'no bound holds when 140 kg (robot.payload) are picked up: commission' in told
+    )
+    assert '/**/blf_dsc_controller' not in told
 
 
 def test_arm_that_oscillates_is_stopped_with_the_load_that_it_carries():

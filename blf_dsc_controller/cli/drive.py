@@ -16,6 +16,7 @@ from blf_dsc_controller.cli.result_folder import (
     keep,
 )
 from blf_dsc_controller.cli.run import STOPPED
+from blf_dsc_controller.cli.softer_gains import print_softer_gains
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -91,13 +92,15 @@ def drive(options: Namespace) -> int:
             keep(options.out)
             outcome = loop.run()
         _print(outcome, loop, controller)
+    if driver.config.feedback == 'host':  # motors bear others
+        print_softer_gains(outcome.text, config)
     if ros is not None and ros.problem:
         print(f'topics        {ros.problem}')
     if controller.output_problem:
         print(f'recorded      only a part: {controller.output_problem}')
     elif options.out is not None:
         print(
-            f'recorded      {options.out}: blf_dsc replay, report, plot and identify read it'
+            f'recorded      {options.out}: blf_dsc replay, report, export and identify read it'
         )
     return CODES[outcome.end] or int(bool(controller.output_problem))
 

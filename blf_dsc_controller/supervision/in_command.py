@@ -176,7 +176,6 @@ class InCommand:
         self.journal.note(EventType.STOP, reason=reason, text=text)
         self.clean = self.reference.resumable = False
         self.safe_stop.begin(
-            self.config.safety,
             reason,
             self.readings.speed,
             was_running=was_running,

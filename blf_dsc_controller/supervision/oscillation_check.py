@@ -23,7 +23,13 @@ from blf_dsc_controller.supervision.not_sensors import fault_of
 # of the torque limit, as amplitude: the tones of a commissioning, which calm arms follow, have
 # looked like an oscillation of up to 0.16
 _BORNE = 0.2
-_LOWER = 0.5  # of the present stiffness, which is advised
+
+LOWER = 0.5
+"""Part of the present gains that is advised after an oscillation."""
+
+OSCILLATES = ' oscillates at '
+"""In the text of each stop of an arm that oscillates."""
+
 _LATELY = 0.1  # s
 
 
@@ -39,7 +45,7 @@ class Shaking(NamedTuple):
     def text(self) -> str:
         """A sentence with the numbers, without its end."""
         return (
-            f'joint {self.joint!r} oscillates at {two_digits(self.frequency)} Hz with '
+            f'joint {self.joint!r}{OSCILLATES}{two_digits(self.frequency)} Hz with '
             f'+-{two_digits(self.torque)} {self.unit}'
         )
 
@@ -138,8 +144,7 @@ class OscillationCheck:
                 f'{too_stiff}; lower two_link.mu, two_link.surface_gain and '
                 'two_link.feedback_gain'
             )
-        stiffness = _LOWER * config.feedback.stiffness
         return (
             f'{too_stiff}; commission it (`blf_dsc commission`), or give a feedback.stiffness of '
-            f'{stiffness:.2g}'
+            f'{LOWER * config.feedback.stiffness:.2g}'
         )

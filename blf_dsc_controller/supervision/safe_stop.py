@@ -75,7 +75,6 @@ class SafeStop:
 
     def begin(
         self,
-        safety: Safety,
         reason: Reason,
         speed: float,
         *,
@@ -109,7 +108,7 @@ class SafeStop:
             ramp = 2.0 * _FASTER / fastest
         self._hold.begin(self._held.load(), ramp=ramp, source=Load.UNTIL_MOVED)
 
-    def begin_anew(self, safety: Safety, load: Vector) -> None:
+    def begin_anew(self, load: Vector) -> None:
         """Begin the torque of a law that forgets what it has learned, with this load (n,) [N m]."""
         self._swings.begin()
         self._hold.begin(load)

@@ -89,7 +89,7 @@ class Starting:
         self._start_over()
         self._load = load
         if load is not None:
-            command.safe_stop.begin_anew(command.config.safety, load)
+            command.safe_stop.begin_anew(load)
 
     def _added_by_drives(self) -> Vector:
         """Return the torque (n,) [N m] of the drives at the last state, by the model."""
