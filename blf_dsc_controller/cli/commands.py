@@ -273,12 +273,6 @@ _COMMISSION = Command(
             action='store_true',
         ),
         option(
-            '--ripple',
-            'also find the torque ripple of the drives in a slow motion of a minute that does not '
-            'repeat, and write learning.ripple_cycles to --out; of a robot with --prove',
-            action='store_true',
-        ),
-        option(
             '--states', 'joint states of its driver (joint_states)', metavar='TOPIC'
         ),
         option(

@@ -8,10 +8,6 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
-from blf_dsc_controller.cli.commission_ripple import (
-    after_proof,
-    on_simulated,
-)
 from blf_dsc_controller.cli.commission_robot import (
     ask,
     measured_on,
@@ -27,7 +23,6 @@ from blf_dsc_controller.commissioning import (
     files,
     page,
     proof,
-    ripple_page,
     simulated,
 )
 from blf_dsc_controller.commissioning.choice import LAGS
@@ -36,7 +31,6 @@ from blf_dsc_controller.commissioning.commissioning import Commissioning
 from blf_dsc_controller.commissioning.measurement import Measured, measured_in
 from blf_dsc_controller.commissioning.picture import draw
 from blf_dsc_controller.commissioning.postures import EndedError
-from blf_dsc_controller.commissioning.slow_motion import slow_motion
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import (
@@ -76,8 +70,6 @@ def commission(options: Namespace) -> int:
     if ignored := ignored_in(path, (CONTROLLER, DRIVE)):
         print_notice(f'warning: {ignored}')
     config = config_of(options.robot or '', path, topics_of(options))
-    if options.ripple:
-        slow_motion(config)  # an error comes before anything moves
     in_motors = load(path, DRIVE, DriveConfig).feedback == 'motor'
     commissioning = Commissioning(
         config,
@@ -112,7 +104,6 @@ def _measure(options: Namespace, path: Path, commissioning: Commissioning) -> in
         name=options.config,
         command=options.line,
         is_simulated=not (options.bags or options.robot),
-        ripple_follows=options.ripple,
     )
     announce_reading(options.bags, 'read')
     runs = [(str(bag), measured_in(bag, commissioning.config)) for bag in options.bags]
@@ -127,19 +118,15 @@ def _measure(options: Namespace, path: Path, commissioning: Commissioning) -> in
     print_notice(_CHOOSING)
     names = [name for name, _ in runs]
     found = commissioning.result([run for _, run in runs], names)
-    shaken = [name for name, run in runs if not commissioning.is_slow_motion(run)]
-    code = _written(file, found, shaken)
-    if code or not file.is_simulated:
-        return code
-    stop = _prove(file.path)
-    return on_simulated(file, found, stop) if options.ripple else 0
+    code = _written(file, found, names)
+    if code == 0 and file.is_simulated:
+        _prove(file.path)
+    return code
 
 
 def _written(file: CommissionedFile, found: Commissioned, names: Sequence[str]) -> int:
     """Print, draw and write what was found, by runs of these names; return the exit code."""
     print(page.table(found))  # also if the gains are too soft for any bound: an error
-    if found.ripples:
-        print(f'\n{ripple_page.ripple_table(found.before, found.ripples)}')
     content = file.content(found)
     print('\n'.join(['', *content.lines]))
     picture = _picture(file.path)
@@ -148,7 +135,7 @@ def _written(file: CommissionedFile, found: Commissioned, names: Sequence[str]) 
     if not found.has_margin:
         print(f'not written: {file.path}')
         return NO_MARGIN
-    file.write(found, content)
+    file.write(content)
     print(f'wrote {file.path}', flush=True)
     return 0
 
@@ -174,20 +161,6 @@ def _check(options: Namespace) -> None:
             '--prove runs a commissioned file on a robot: give --robot or --ros, no bags and no '
             '--write'
         )
-    if options.ripple and options.write:
-        raise BlfDscError(
-            '--ripple is found with the gains that are chosen, and --write measures nothing: leave '
-            'out one of them'
-        )
-    if options.ripple and options.bags:
-        raise BlfDscError(
-            '--ripple makes a motion, and its bag needs no option: leave out --ripple'
-        )
-    if options.ripple and is_robot and not options.prove:
-        raise BlfDscError(
-            '--ripple moves a robot with gains that are proven: measure it without --ripple, and '
-            'then give --prove --ripple with the file that is written'
-        )
     if not is_robot and (options.yes or options.record):
         raise BlfDscError(
             '--yes and --record are for a robot: give --robot or --ros, too'
@@ -202,22 +175,14 @@ def _check(options: Namespace) -> None:
 def _prove_on_robot(
     options: Namespace, path: Path, commissioning: Commissioning
 ) -> int:
-    """Raise the gains of a file step by step on a robot, and say how far it errs.
-
-    Then look for the torque ripple, if that is asked for.
-    """
+    """Raise the gains of a file step by step on a robot, and say how far it errs."""
     config = commissioning.config
     planned = proof.steps(config)
-    before = [*of_proof(options, config)]
-    if options.ripple:
-        make_room(options.out, force=options.force)
-        before.append(ripple_page.description(slow_motion(config)))
     with robot(options, path, commissioning) as arm:
-        ask(options, before)
+        ask(options, [*of_proof(options, config)])
         prove(arm, planned, config)
-        code = after_proof(options, arm, config, path) if options.ripple else 0
         arm.hold_after()
-    return code
+    return 0
 
 
 def _write_motions(
@@ -266,8 +231,8 @@ def _simulated(path: Path, commissioning: Commissioning) -> tuple[Runs, list[str
     return runs, missing
 
 
-def _prove(path: Path) -> str:
-    """Say what the simulated arm does with its new gains; return why it stops, if it does."""
+def _prove(path: Path) -> None:
+    """Say what the simulated arm does with its new gains."""
     loop = load_loop(path)
     print_notice(
         'simulating the arm with these gains along its own motion: some seconds'
@@ -277,11 +242,10 @@ def _prove(path: Path) -> str:
         print(
             f'with these gains the simulated arm stops on its own motion: {made.stop}'
         )
-        return made.stop
+        return
     print(
         f'with these gains the simulated arm follows its own motion for {made.duration:g} s, '
         f'with {largest_error(made.error, loop.controller.units)} at most'
     )
     for each in made.cycles:
         print(page.of_limit_cycle(each))
-    return ''

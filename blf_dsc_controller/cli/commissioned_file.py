@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from blf_dsc_controller import __version__
-from blf_dsc_controller.commissioning import files, page, ripple_page
+from blf_dsc_controller.commissioning import files, page
 from blf_dsc_controller.commissioning.commissioned import Commissioned
 from blf_dsc_controller.configuration.nodes import dump, load_loop, read
 from sim_plant.settings import true_rotors
@@ -32,7 +32,6 @@ class CommissionedFile(NamedTuple):
     name: str  # of this file, as it was given
     command: str
     is_simulated: bool
-    ripple_follows: bool  # the slow motion that shows torque ripple
     missing: tuple[str, ...] = ()  # sentences on what could not be measured
 
     def content(self, found: Commissioned) -> Content:
@@ -44,9 +43,7 @@ class CommissionedFile(NamedTuple):
             f'{self.name} commissioned on {found.date} by blf_dsc_controller {__version__}, with a '
             f'modulus margin of {found.choice.margin.value:.2g}'
         )
-        found_out = page.sentences(
-            found, is_simulated=self.is_simulated, ripple_follows=self.ripple_follows
-        )
+        found_out = page.sentences(found, is_simulated=self.is_simulated)
         lines = wrapped([origin, *found_out, *self.missing])
         if not found.has_margin:
             return Content(lines, {})
@@ -55,12 +52,9 @@ class CommissionedFile(NamedTuple):
             rotors = true_rotors(load_loop(self.source).plant)
         return Content(lines, files.of_commissioned(read(self.source), found, rotors))
 
-    def write(self, found: Commissioned, content: Content) -> None:
-        """Write the file; with the table of the torque ripple, if it was looked for."""
-        table = ''
-        if found.ripples:
-            table = ripple_page.ripple_table(found.before, found.ripples)
-        lines = [self.command, *content.lines, *table.splitlines()]
+    def write(self, content: Content) -> None:
+        """Write the file."""
+        lines = [self.command, *content.lines]
         dump(self.path, content.nodes, ''.join(f'# {line}\n' for line in lines))
 
 

@@ -34,12 +34,9 @@ from blf_dsc_controller.commissioning.motion import lines_in
 from blf_dsc_controller.commissioning.observer_pole import ObserverPole, SensedLoops
 from blf_dsc_controller.commissioning.planned import measuring_gains
 from blf_dsc_controller.commissioning.response import Response, response_of
-from blf_dsc_controller.commissioning.ripple import to_learn
-from blf_dsc_controller.commissioning.slow_motion import SlowMotion, slow_motion
 from blf_dsc_controller.configuration.controller import ControllerConfig, design_of
 from blf_dsc_controller.configuration.schema import Value
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.numerics.digits import two_digits
 
 Floats = NDArray[np.float64]
@@ -73,7 +70,6 @@ class Commissioned(NamedTuple):
     # None: there are no joint torque sensors, or they are not used
     sensed: SensedLoops | None
     observer: ObserverPole | None  # likewise
-    ripples: tuple[Ripples, ...] = ()  # of each joint; empty: there was no slow motion
 
     @property
     def has_margin(self) -> bool:
@@ -121,14 +117,6 @@ class Commissioned(NamedTuple):
         """
         return with_gains(self.before, self.parameters())
 
-    @property
-    def slow_motion(self) -> SlowMotion:
-        """The motion that shows the torque ripple, with the chosen gains.
-
-        Raises BlfDscError if no gains have the margin, or the reference is no sum of sinusoids.
-        """
-        return slow_motion(self.config)
-
     def parameters_but_bounds(self) -> dict[str, Value]:
         """Return the parameters that follow, without bounds, also of gains without the margin."""
         gains = self.choice.gains
@@ -145,8 +133,6 @@ class Commissioned(NamedTuple):
             )
         if self.observer is not None:
             of_arm['disturbance.observer_bandwidth'] = self.observer.pole
-        if listed := to_learn(self.ripples):
-            of_arm['learning.ripple_cycles'] = tuple(each.cycles for each in listed)
         return {
             **of_arm,
             'robot.lag': float(f'{self.lag:.3g}'),

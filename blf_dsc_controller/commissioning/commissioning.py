@@ -37,13 +37,10 @@ from blf_dsc_controller.commissioning.planned import (
     postures_of,
     softer,
 )
-from blf_dsc_controller.commissioning.ripple import ripples_in
-from blf_dsc_controller.commissioning.slow_motion import is_slow_motion
 from blf_dsc_controller.commissioning.strength import MOST, shown_by
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.progress import print_notice
 from blf_dsc_controller.run import Run
 from blf_dsc_controller.warnings.table import refuse
@@ -68,7 +65,6 @@ class Commissioning:
         found = commissioning.result(['run_0', 'run_1', 'run_2'])
         controller = ArmController(found.config)
 
-    With `found.slow_motion`, run likewise, `result` also finds the torque ripple.
 
     Attributes:
         config: the configuration that the arm is measured for.
@@ -297,8 +293,7 @@ class Commissioning:
         """Return what runs of motions show, and the gains that follow.
 
         Args:
-            runs: folders of bags, or runs with the configurations that they had.  Those of
-                the slow motion show the torque ripple, all others the gains.
+            runs: folders of bags, or runs with the configurations that they had.
             names: what errors call the runs; without them, bags are named by their folders.
 
         Raises:
@@ -314,22 +309,4 @@ class Commissioning:
         ]
         if not names:
             names = ['' if isinstance(each, tuple) else str(each) for each in runs]
-        pairs = list(zip(measured, names, strict=True))
-        slow = [pair for pair in pairs if self.is_slow_motion(pair[0])]
-        shaken = [pair for pair in pairs if not self.is_slow_motion(pair[0])]
-        ripples: tuple[Ripples, ...] = ()
-        if slow:
-            ripples = ripples_in([run for run, _ in slow], [name for _, name in slow])
-        found = commissioned(
-            self.config,
-            [run for run, _ in shaken],
-            self.margin,
-            self._lags,
-            [name for _, name in shaken],
-        )
-        return found._replace(ripples=ripples)
-
-    def is_slow_motion(self, measured: tuple[Run, ControllerConfig]) -> bool:
-        """Whether a run is the slow motion that shows the torque ripple."""
-        _, made = measured
-        return is_slow_motion(made, self.config)
+        return commissioned(self.config, measured, self.margin, self._lags, names)

@@ -48,14 +48,6 @@ def of_commissioned(
     return _with(sections, given, removed=(INTEGRAL, 'truth.rotor_factor'))
 
 
-def with_ripple(
-    sections: Sequence[Section], cycles: Sequence[float]
-) -> dict[str, _Values]:
-    """Return the sections of a file with the periods of the torque ripple."""
-    learning = {'learning.ripple_cycles': tuple(cycles)}
-    return _with(sections, {f'/**/{CONTROLLER}': learning})
-
-
 def _with(
     sections: Iterable[Section],
     given: Mapping[str, _Values],

@@ -15,7 +15,6 @@ from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.observer_pole import ENOUGH, POLES
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
-from blf_dsc_controller.commissioning.ripple_page import of_ripple
 from blf_dsc_controller.commissioning.strength import LITTLE
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.tool_bound import ANGLE, POSITION
@@ -82,13 +81,10 @@ def table(found: Commissioned) -> str:
     return aligned(rows)
 
 
-def sentences(
-    found: Commissioned, *, is_simulated: bool = False, ripple_follows: bool = False
-) -> Iterator[str]:
+def sentences(found: Commissioned, *, is_simulated: bool = False) -> Iterator[str]:
     """Yield what was found, what limits the gains, and what to do about it.
 
-    Gains of an arm that `is_simulated` cannot be proven: --prove is for a robot.  The slow motion
-    that shows torque ripple may follow.
+    Gains of an arm that `is_simulated` cannot be proven: --prove is for a robot.
     """
     yield from _of_states(found)
     yield from _of_hidden(found, is_simulated=is_simulated)
@@ -100,7 +96,6 @@ def sentences(
     if found.has_margin:
         yield f'errors to expect with these gains: {expectation(found.config)}'
         yield from _of_bound(found)
-        yield from of_ripple(found.before, found.ripples, follows=ripple_follows)
     yield (
         f'measured in {len(found.responses)} runs: with another load, or far from their postures, '
         'measure again'

@@ -38,9 +38,7 @@ from blf_dsc_controller.commissioning.proof import (
     start_of,
 )
 from blf_dsc_controller.commissioning.response import response_of
-from blf_dsc_controller.commissioning.ripple import ripples_in
 from blf_dsc_controller.commissioning.run_parameters import undisturbed_parameters
-from blf_dsc_controller.commissioning.slow_motion import SlowMotion
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import change
 from blf_dsc_controller.control.arm_controller import ArmController
@@ -48,7 +46,6 @@ from blf_dsc_controller.control.slow_move import duration_of
 from blf_dsc_controller.drive.driver import Driver
 from blf_dsc_controller.drive.loop import DriveLoop, End
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.topics import Topic
@@ -141,14 +138,6 @@ def better_known_by_bag(
     Raises BlfDscError if the bag does not show the response.
     """
     return commissioning.better_known(planned, measured_in(bag).run)
-
-
-def ripples_by_bag(bag: Path) -> tuple[Ripples, ...]:
-    """Return the torque ripple of each joint by the bag of a slow motion.
-
-    Raises BlfDscError as `ripples_in`.
-    """
-    return ripples_in([measured_in(bag)])
 
 
 def check(bag: Path) -> None:
@@ -350,16 +339,6 @@ class PostureByPosture:
             cycles = self.aside(cycles_in, still, bag, step.config) if is_last else []
             yield step, self.aside(errors_of, bag, step.config), cycles
             held = f'{step.share:.0%} of them were calm'
-
-    def slow(self, motion: SlowMotion) -> Path:
-        """Return the bag of a slow motion, to whose start the arm goes slowly.
-
-        Raises EndedError or BlfDscError as `runs`.
-        """
-        self._left = f'The gains are proven; bags are in {self._folder}'
-        way = self.aside(move, motion.config, self.position(), motion.posture)
-        self._run(way.config, way.duration, 'way to slow motion')
-        return self._run(motion.config, motion.duration, 'slow motion')
 
     def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:
         """Control the robot for so long [s]; return the bag."""

@@ -14,7 +14,6 @@ from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.measurement import Measured, oscillation_in
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import cycles_of
-from blf_dsc_controller.commissioning.slow_motion import SlowMotion
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.plant import PlantConfig, pick_ups
@@ -93,14 +92,6 @@ def proof(loop: LoopConfig) -> Proof:
     if run.error is not None:
         largest = np.nanmax(np.abs(run.error), axis=0)
     return Proof(duration, largest, stop, cycles)
-
-
-def slow_run(motion: SlowMotion, plant: PlantConfig) -> Measured:
-    """Return the run of a slow motion, of an arm that carries nothing.
-
-    Raises BlfDscError if the arm stopped.
-    """
-    return _run(motion.config, plant, motion.duration, motion.posture)
 
 
 def runs_of(

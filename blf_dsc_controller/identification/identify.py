@@ -135,21 +135,6 @@ def identify_arm(
     return found._replace(other=convention_problem(found.joints, found.score, *better))
 
 
-def find_ripples(
-    recording: Recording, robot: Robot, effort: Effort = 'torque'
-) -> tuple[Ripples, ...]:
-    """Return the ripple of each joint as `identify_arm` does, and look for nothing else.
-
-    Signs of the efforts are right.
-
-    Raises:
-        BlfDscError: the recording is too short or has no motion.
-    """
-    problem = problem_of(recording, robot, effort, None, find_signs=False)
-    selected = _selected(problem)
-    return ripples_left(problem, selected.distances, _final_fit(problem, selected))
-
-
 class _Trained(NamedTuple):
     """An arm fitted to the first four fifths of a recording, and scored on the rest."""
 

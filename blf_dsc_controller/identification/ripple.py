@@ -107,25 +107,12 @@ def ripples_of(short: Rows, theta: Floats) -> tuple[Ripples, ...]:
     return tuple(found)
 
 
-class Listed(NamedTuple):
-    """An entry of `learning.ripple_cycles`, and how sure it is."""
-
-    cycles: float  # N, with no more digits than are known
-    deviation: float  # of N
-    joints: tuple[int, ...]  # numbers of those that have it, the most disturbed first
-
-
 def listed_cycles(ripples: Sequence[Ripples]) -> tuple[float, ...]:
     """Return the N of `learning.ripple_cycles`: of all joints, the few that disturb most."""
-    return tuple(each.cycles for each in listed_ripples(ripples))
-
-
-def listed_ripples(ripples: Sequence[Ripples]) -> tuple[Listed, ...]:
-    """Return what `listed_cycles` lists, with its deviations and joints."""
     groups: list[list[_Candidate]] = []
     candidates = [
-        _Candidate(i, each, _worth(each, own), own.seen[0] / _PERIODS)
-        for i, own in enumerate(ripples)
+        _Candidate(each, _worth(each, own), own.seen[0] / _PERIODS)
+        for own in ripples
         for each in own.found
     ]
     for each in sorted(candidates, key=lambda one: -one.worth):
@@ -142,7 +129,6 @@ def listed_ripples(ripples: Sequence[Ripples]) -> tuple[Listed, ...]:
 class _Candidate(NamedTuple):
     """A ripple that may be listed."""
 
-    joint: int
     ripple: Ripple
     worth: float
     lobe: float  # of its joint
@@ -162,7 +148,7 @@ def _is_same(one: _Candidate, other: _Candidate) -> bool:
     return abs(a.cycles - b.cycles) < max(lobe, TWO_SIDED * deviation)
 
 
-def _together(same: Sequence[_Candidate]) -> Listed:
+def _together(same: Sequence[_Candidate]) -> float:
     """Return the mean N of ripples, with no more digits than are known: 30.0 for 29.98 +- 0.03."""
     ripples = [each.ripple for each in same]
     weights = np.array([1.0 / (each.cycles_deviation**2 + _TINY) for each in ripples])
@@ -173,8 +159,7 @@ def _together(same: Sequence[_Candidate]) -> Listed:
         rounded = round(mean, digits)
         if abs(rounded - mean) < half:
             break
-    joints = tuple(dict.fromkeys(each.joint for each in same))
-    return Listed(rounded, deviation, joints)
+    return rounded
 
 
 class _Share:

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
 from blf_dsc_controller.analysis.output import aligned
-from blf_dsc_controller.arms.urdf import Joint
 from blf_dsc_controller.identification.identified import (
     IDLE,
     Identified,
@@ -180,8 +179,13 @@ def stiffness_table(found: Identified) -> Iterator[str]:
 
 
 def ripple_table(found: Identified) -> Iterator[str]:
-    """Yield the torque ripple of each joint, and the parameter by which it is learned."""
-    lines = [table_of_ripples(found.chain.joints, found.ripples)]
+    """Yield the ripple of each joint with its 95 % interval, and the parameter to learn it by."""
+    rows = [('joint', 'torque ripple: its amplitude, and periods per turn')]
+    for joint, own in zip(found.chain.joints, found.ripples, strict=True):
+        slides = joint.kind == 'prismatic'
+        cells = _ripple_cells(own, units_of(joint.kind)[OFFSET], ' rad/m' * slides)
+        rows.append((joint.name, cells))
+    lines = [aligned(rows)]
     if cycles := listed_cycles(found.ripples):
         lines += [
             'the controller learns to compensate it with this parameter:',
@@ -190,16 +194,6 @@ def ripple_table(found: Identified) -> Iterator[str]:
         if any(each.found and each.repeats for each in found.ripples):
             lines.append(_OF_REPEATED)
     yield '\n'.join(lines)
-
-
-def table_of_ripples(joints: Sequence[Joint], ripples: Sequence[Ripples]) -> str:
-    """Return the torque ripple of each joint, with its 95 % interval."""
-    rows = [('joint', 'torque ripple: its amplitude, and periods per turn')]
-    for joint, own in zip(joints, ripples, strict=True):
-        slides = joint.kind == 'prismatic'
-        cells = _ripple_cells(own, units_of(joint.kind)[OFFSET], ' rad/m' * slides)
-        rows.append((joint.name, cells))
-    return aligned(rows)
 
 
 def _ripple_cells(own: Ripples, torque: str, cycles: str) -> str:
