@@ -164,8 +164,8 @@ class ArmController:
             motors: positions and velocities (2, n) of the motors, where these have encoders
                 and q is of the links. They are recorded for `blf_dsc identify`, which finds
                 the stiffness of gears, and are not used.
-            send: called with the torques as soon as they are known, before weighing
-                and recording. Its errors are raised after these.
+            send: called with the torques as soon as they are known, before learning, weighing
+                and recording, which take longer. Its errors are raised after these.
 
         Raises:
             StateError: an array has another shape, or the stamp is not finite.
