@@ -48,10 +48,10 @@ def print_softer_gains(text: str, config: ControllerConfig) -> None:
     }
     section = {'/**/blf_dsc_controller': {'ros__parameters': listed}}
     print(
-        'half of these gains, and the bounds that they keep, for the same section of the file. '
-        'At the frequency of the oscillation their margin is 0.5 if it just went on, and less if '
-        'it grew: halve them again if the arm stops again, or commission it. Errors to expect: '
-        f'{expectation(change(softer, values))}\n'
+        'to paste in place of what the file has: half of these gains, and the bounds that they '
+        'keep. At the frequency of the oscillation their margin is 0.5 if it just went on, and '
+        'less if it grew: halve them again if the arm stops again, or commission it. Errors to '
+        f'expect: {expectation(change(softer, values))}\n'
         f'{yaml.safe_dump(section, default_flow_style=None, sort_keys=False, width=1000)}',
         end='',
     )
