@@ -93,8 +93,10 @@ def test_torques_are_those_of_python_bit_for_bit_also_with_missed_states(case):
 def test_a_state_that_cannot_be_and_a_gap_have_a_flag_and_no_torque(case):
     program, lines, torques = case
     settings = program.with_name(SETTINGS)
-    invalid = ' '.join([lines[100].split()[0], 'nan', *lines[100].split()[2:]])
-    for rest in (invalid, lines[140]):
+    words = lines[100].split()
+    no_position = ' '.join([words[0], 'nan', *words[2:]])
+    no_reference = ' '.join([*words[:-1], 'nan'])
+    for rest in (no_position, no_reference, lines[140]):
         run, found = run_in_c(program, settings, [*lines[:100], rest])
         assert run.returncode == STOPPED
         assert run.stderr.startswith('flags 4 at ')

@@ -242,8 +242,24 @@ def test_a_motion_begins_at_a_time_of_the_wall_clock(arm):
     assert arm.is_moving
     arm.follow([(apart + 3.0, start + 0.01)], begin=time.time() - apart, timeout=60.0)
     np.testing.assert_allclose(arm.state.reference, start + 0.01, atol=1e-9)
-    with pytest.raises(blf.DriveError, match=r'begin: .*a time of the wall clock in s'):
-        arm.follow([(1.0, start)], begin='soon')
+    for given in ('soon', np.nan, 0.0, time.time_ns()):
+        with pytest.raises(blf.DriveError, match=r'begin: .*a time of the wall clock'):
+            arm.follow([(1.0, start)], begin=given)
+
+
+def test_an_exception_beside_one_arm_brakes_the_others(arm):
+    start = arm.state.reference
+    arm.follow([(200.0, start + STEP)], wait=False)
+
+    def fails():
+        with drive():
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fails()
+    with pytest.raises(blf.MotionFailedError):
+        arm.wait(timeout=60.0)
+    assert np.abs(arm.state.reference - start).max() < 0.5 * STEP.max()
 
 
 def test_stream_without_ruckig_says_what_to_install(arm, monkeypatch):

@@ -92,7 +92,7 @@ def drive(options: Namespace) -> int:
             keep(options.out)
             outcome = loop.run()
         _print(outcome, loop, controller)
-    if driver.config.feedback == 'host':  # motors bear others
+    if driver.config.feedback == 'host':  # motors tolerate more
         print_softer_gains(outcome.text, config)
     if ros is not None and ros.problem:
         print(f'topics        {ros.problem}')

@@ -36,10 +36,10 @@ def print_softer_gains(text: str, config: ControllerConfig) -> None:
     try:
         values |= widened_bounds(softer)
     except BlfDscError:
+        tool = ' and a barrier.tool_bound' if config.barrier.tool_bound else ''
         print(
-            f'with half of these gains no bound holds when {config.robot.payload:g} kg '
-            '(robot.payload) are picked up: commission the arm (`blf_dsc commission`), or give '
-            'less robot.payload'
+            f'no bounds were found for half of these gains, with a robot.payload of '
+            f'{config.robot.payload:g} kg{tool}: commission the arm (`blf_dsc commission`)'
         )
         return
     listed = {
@@ -48,9 +48,10 @@ def print_softer_gains(text: str, config: ControllerConfig) -> None:
     }
     section = {'/**/blf_dsc_controller': {'ros__parameters': listed}}
     print(
-        'to paste in place of what the file has: half of these gains, and the bounds that they '
-        'keep. At the frequency of the oscillation their margin is 0.5 if it just went on, and '
-        'less if it grew: halve them again if the arm stops again, or commission it. Errors to '
+        'put these parameters in the place of those in the file, whose others stay: half of these '
+        'gains, and the bounds that they keep. At the frequency of the oscillation their margin is '
+        '0.5 if it just went on, and less if it grew: halve them again if the arm stops again, or '
+        'commission it. Errors to '
         f'expect: {expectation(change(softer, values))}\n'
         f'{yaml.safe_dump(section, default_flow_style=None, sort_keys=False, width=1000)}',
         end='',

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.errors import BlfDscError, DriveError
 from blf_dsc_controller.messages.tip_load import TipLoad
+from blf_dsc_controller.reference.trajectory import LONGEST
 
 _TURNS = 4.0 * math.pi  # rad, beyond which hardly a joint turns
 _NODES = ('blf_dsc_controller', 'drive', 'sim_plant')
@@ -131,11 +133,11 @@ def checked_begin(begin: Any) -> float | None:
     """Return a time of the wall clock [s]; None: now."""
     if begin is None:
         return None
-    if _is_number(begin):
+    if _is_number(begin) and abs(begin - time.time()) <= LONGEST:
         return float(begin)
     raise DriveError(
         f'begin: got {begin!r}, but a time of the wall clock in s is needed, as in '
-        'time.time() + 1.0'
+        'time.time() + 1.0, within an hour of now'
     )
 
 

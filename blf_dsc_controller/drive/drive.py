@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,7 +63,11 @@ class Drive:
     arm is held where it rests.  At the end of the block, or of the script, the arm is
     brought to rest, and the robot holds it by its own means.  Warnings and remarks of
     the loop go to the logger `blf_dsc_controller`.
+
+    Several arms have a `Drive` each.  An exception in the block of one brakes them all.
     """
+
+    _loops: ClassVar[weakref.WeakSet[LoopProcess]] = weakref.WeakSet()
 
     def __init__(
         self,
@@ -114,6 +119,9 @@ class Drive:
         trace: TracebackType | None,
     ) -> None:
         ended = self.ended
+        if kind is not None:
+            for each in self._loops:
+                each.brake()
         self.close()
         if kind is None and ended:
             raise LoopEndedError(ended)
@@ -403,7 +411,7 @@ class Drive:
         record = self._record
         if record is not None and self._starts > 1:
             record = record.with_name(f'{record.name}_{self._starts}')
-        return LoopProcess(
+        loop = LoopProcess(
             {
                 'config': self._config,
                 'overrides': self._overrides,
@@ -411,6 +419,8 @@ class Drive:
                 'record': str(record) if record else None,
             }
         )
+        self._loops.add(loop)
+        return loop
 
     def _begin(
         self,

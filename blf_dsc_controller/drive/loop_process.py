@@ -6,6 +6,7 @@ A thread listens to what `script_process` tells: states, results of requests, an
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -32,6 +33,7 @@ from blf_dsc_controller.messages.script_link import ArmState
 _MODULE = 'blf_dsc_controller.drive.script_process'
 _POLL = 0.1  # s
 _SILENCE = 60.0  # s without a word of a loop that runs
+_NOBODY = 0  # number of a request whose end nobody waits for
 _END = 5.0  # s, for a process that was told to end at once
 _LOG = logging.getLogger('blf_dsc_controller')
 
@@ -110,6 +112,11 @@ class LoopProcess:
         """
         self.check()
         self._send(kind, content)
+
+    def brake(self) -> None:
+        """Let the arm brake within the limits, if the loop runs, and return at once."""
+        with contextlib.suppress(DriveError):
+            self.put(script_link.BRAKE, topic_link.encode(_NOBODY))
 
     def has_result(self, number: int) -> bool:
         """Return whether it has told what became of a request."""

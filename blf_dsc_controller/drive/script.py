@@ -119,8 +119,8 @@ class Script(Beside):
             return
         if kind == script_link.FOLLOW:
             (number,) = script_link.HEAD.unpack_from(content)
-            now = self._guard.reference.time
-            self._begin_goal(number, lambda: _trajectory(content, now))
+            shift = self._guard.reference.time - time.time()
+            self._begin_goal(number, lambda: _trajectory(content, shift))
             return
         wanted = topic_link.decode(content)
         match kind:
@@ -279,12 +279,10 @@ def _far_beyond(positions: np.ndarray, config: ControllerConfig) -> str:
     )
 
 
-def _trajectory(content: bytes, now: float) -> Trajectory:
-    """Return the trajectory of a request, at the time `now` since the start [s]."""
+def _trajectory(content: bytes, shift: float) -> Trajectory:
+    """Return the trajectory of a request; `shift` [s] turns wall time into time since the start."""
     wanted = topic_link.decode(content[script_link.HEAD.size :])
-    begin = wanted['begin']
-    if begin is not None:
-        begin += now - time.time()
+    begin = None if wanted['begin'] is None else wanted['begin'] + shift
     points = tuple(TrajectoryPoint(*map(_field, each)) for each in wanted['points'])
     return Trajectory(tuple(wanted['joints']), points, begin)
 

@@ -61,13 +61,13 @@ static uint32_t crc32_of(const void *bytes, size_t size) {
 static const char *read_law(const char *path, blf_dsc_law *law) {
   FILE *file = fopen(path, "rb");
   if (file == NULL) return "the file of the settings cannot be opened";
-  size_t size = CHECKED + sizeof law->checksum;
-  int is_whole = fread(law, 1, size, file) == size && fgetc(file) == EOF;
+  size_t size = CHECKED + sizeof law->checksum, got = fread(law, 1, size, file);
+  int is_whole = got == size && fgetc(file) == EOF;
   fclose(file);
+  if (got < sizeof law->digest || memcmp(law->digest, DIGEST, sizeof law->digest) != 0)
+    return "the file of the settings is of other objects: take all files of one folder";
   if (!is_whole || crc32_of(law, CHECKED) != law->checksum)
     return "the file of the settings is damaged: copy it again";
-  if (memcmp(law->digest, DIGEST, sizeof law->digest) != 0)
-    return "the file of the settings is of other objects: take all files of one folder";
   return NULL;
 }
 
@@ -84,6 +84,13 @@ const char *blf_dsc_load(const char *path, blf_dsc_law **law) {
   return NULL;
 }
 
+/* Whether some values are finite: zero times any other is not zero. */
+static int are_finite(const double *values, int size) {
+  int finite = 1;
+  for (int i = 0; i < size; i++) finite = finite && 0.0 * values[i] == 0.0;
+  return finite;
+}
+
 void blf_dsc_begin(blf_dsc_law *law) {
   memcpy(law->now, law->initial, sizeof law->now);
   law->is_advanced = 1;
@@ -91,7 +98,9 @@ void blf_dsc_begin(blf_dsc_law *law) {
 
 int blf_dsc_update(blf_dsc_law *law, double t, double dt, const double *state,
                    const double *reference, double *torque) {
-  if (!law->is_advanced || !(dt > 0.0 && dt < BLF_DSC_GAP)) return BLF_DSC_INVALID;
+  if (!law->is_advanced || !(dt > 0.0 && dt < BLF_DSC_GAP) || !are_finite(&t, 1) ||
+      !are_finite(reference, 3 * N))
+    return BLF_DSC_INVALID;
   double *now = law->now;
   memcpy(now + MEASUREMENT, state, 3 * N * sizeof *state);
   now[KNOT] = t;
@@ -114,7 +123,7 @@ int blf_dsc_update(blf_dsc_law *law, double t, double dt, const double *state,
 }
 
 int blf_dsc_advance(blf_dsc_law *law, const double *sent) {
-  if (law->is_advanced) return BLF_DSC_INVALID;
+  if (law->is_advanced || !are_finite(sent, N)) return BLF_DSC_INVALID;
   double *now = law->now;
   memcpy(now + LAST_TORQUE, sent, N * sizeof *sent);
   void *none = NULL, *error = NULL;

@@ -24,7 +24,7 @@ extern "C" {
 enum {
   BLF_DSC_SUSPECT = @SUSPECT@, /* not finite, past the limit of a torque, or of the error */
   BLF_DSC_OUTSIDE = @OUTSIDE@, /* an error outside its bound */
-  BLF_DSC_INVALID = @INVALID@, /* a state or time that cannot be; the law has not used it */
+  BLF_DSC_INVALID = @INVALID@, /* a state, time or reference that cannot be, and is not used */
   BLF_DSC_NO_EFFECT = @NO_EFFECT@, /* commands do not reach the arm, or it is held */
   BLF_DSC_CONTRADICTION = @CONTRADICTION@, /* velocities are not those of the positions */
   BLF_DSC_OSCILLATES = @OSCILLATES@, /* the arm oscillates */
@@ -64,7 +64,7 @@ int blf_dsc_update(blf_dsc_law *law, double t, double dt, const double *state,
                    const double *reference, double *torque);
 
 /* Learn from the last update, whose torques [N m] have left as `sent`; return 0, or BLF_DSC_INVALID
- * without one.
+ * without an update, or if they are not finite.
  *
  * No torque waits for it: call it after sending.  Of a Panda on a busy virtual core, the update takes
  * 12 us, at most 40; learning 17 us, every 50th time 0.15 ms, and 0.8 ms once, when the window is first
