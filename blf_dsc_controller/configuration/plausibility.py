@@ -237,7 +237,7 @@ def _coarsest(config: ArmConfig) -> float:
     return _COARSEST * min(ranges)
 
 
-def _fallen(name: str) -> Callable[[ArmConfig], tuple[float, float]]:
+def _gravity(name: str) -> Callable[[ArmConfig], tuple[float, float]]:
     """Return the acceleration of gravity by name [m/s^2], and the most on a planet."""
     return lambda config: (math.hypot(*getattr(config.robot, name)), _HEAVIEST)
 
@@ -253,7 +253,7 @@ OF_ROBOT = (
         _number(
             f'robot.{name}',
             'm/s^2',
-            _fallen(name),
+            _gravity(name),
             'on no planet it is more than',
             'mm/s^2',
         )

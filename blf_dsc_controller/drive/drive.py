@@ -120,7 +120,7 @@ class Drive:
     ) -> None:
         ended = self.ended
         if kind is not None:
-            for each in self._loops:
+            for each in list(self._loops):
                 each.brake()
         self.close()
         if kind is None and ended:
