@@ -45,10 +45,10 @@ compiling = pytest.mark.skipif(numba.config.DISABLE_JIT, reason='nothing is comp
 FOLDERS = """
 from blf_dsc_controller.compiled import kernel_cache
 from blf_dsc_controller.law.step import update
-from blf_dsc_controller.law.perception import weigh
+from blf_dsc_controller.law.perception import estimate_payload
 from sim_plant.kernels import run_plant
 
-assert {update, weigh, run_plant} <= {*kernel_cache.KERNELS}
+assert {update, estimate_payload, run_plant} <= {*kernel_cache.KERNELS}
 for kernel in kernel_cache.KERNELS:
     assert str(kernel_cache.cache_folder(kernel)) in kernel._cache.cache_path, kernel
 """

@@ -65,7 +65,7 @@ def test_soft_elastic_arm_takes_up_a_load_by_its_torque_sensors():
     without, _ = picked_up({'disturbance.observer_bandwidth': 0.0})
     largest, record = picked_up({})
     assert largest < 0.4 * without
-    load = record.controller.state.weighing.load
+    load = record.controller.state.payload.load
     assert load[0] == pytest.approx(2.0, abs=0.05)
     assert not record.run().stops
     state, kept = record.controller.state, record.controller.checks.estimates.kept

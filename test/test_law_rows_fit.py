@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 from law_part import part
 
-from blf_dsc_controller.law import innovation, weighing
+from blf_dsc_controller.law import innovation, payload
 
 N, M, P = 2, 5, 3  # joints, entries of theta; base parameters, the others are friction
-LOAD = weighing.LOAD
+LOAD = payload.LOAD
 SINCE = LOAD + N
 K = M + 2 * N  # theta, breakaway torques, shares of the torque that are lost
 UNSURE = np.repeat(
@@ -22,7 +22,7 @@ COLUMNS = np.zeros((K + 1, SINCE))  # [N D | E]
 COLUMNS[:M, :LOAD] = random.normal(size=(M, 4)) @ SCALE[:, :LOAD]
 COLUMNS[P:M, LOAD:] = 0.2 * np.eye(N)
 PRIOR = innovation.Prior(random.normal(size=M), np.diag(random.uniform(0.5, 2.0, M)))
-SETTINGS = weighing.Settings(
+SETTINGS = payload.Settings(
     size=K + 1,
     inertial=P,
     since=SINCE,
@@ -42,14 +42,14 @@ SETTINGS = weighing.Settings(
 def test_load_is_that_of_joint_least_squares_with_all_priors():
     """Of random rows before and since; intervals by the inverse of the normal equations."""
     state, work = (
-        part(layout, n=N, weighing=SETTINGS)
-        for layout in (weighing.State, weighing.Work)
+        part(layout, n=N, payload=SETTINGS)
+        for layout in (payload.State, payload.Workspace)
     )
     truth = random.normal(size=K + SINCE)
-    rows, sums = [], {weighing.BEFORE: 90, weighing.NEWER: 40, weighing.LATEST: 20}
+    rows, sums = [], {payload.BEFORE: 90, payload.NEWER: 40, payload.LATEST: 20}
     for which, count in sums.items():
         X = random.normal(size=(count * N, K))
-        held = X[:, :M] @ COLUMNS[:M] * (which != weighing.BEFORE)
+        held = X[:, :M] @ COLUMNS[:M] * (which != payload.BEFORE)
         u = np.hstack((X, held)) @ truth + 0.04 * random.normal(size=count * N)
         rows.append(np.column_stack((X, held, u)))
         Xu = np.column_stack((X, u))
@@ -58,8 +58,8 @@ def test_load_is_that_of_joint_least_squares_with_all_priors():
     a = 7.0 * 0.04**2
     grown = 5.0 / 20.0  # of the variance of changed friction
     state.complete[0], state.age[0], state.innovation.noise[0] = 1.0, 5.0, 0.04**2
-    weighing.solve(SETTINGS, state, work, PRIOR, period)
-    weighing.describe(SETTINGS, state, work, period)
+    payload.solve(SETTINGS, state, work, PRIOR, period)
+    payload.describe(SETTINGS, state, work, period)
 
     H = np.eye(K + SINCE)
     H[:M, :M] = PRIOR.information

@@ -251,7 +251,7 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
     touched = run.run(ENDED - THERE, until=lambda: arm.data.ncon).t[-1]
     before = state.estimate.copy()
     changes = state.change.changes[0]
-    assert state.weighing.load[0] == pytest.approx(LOAD, abs=0.05)
+    assert state.payload.load[0] == pytest.approx(LOAD, abs=0.05)
     torques = run.run(ENDED - touched).torque
     events = [e for e in run.events if e.type is EventType.CONTACT]
     assert -1e-6 <= 1e-9 * events[0].stamp - START - touched < 0.05
@@ -261,8 +261,8 @@ def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
         # what was learned in the milliseconds before it was found
         assert np.abs(state.estimate - before).max() < 1e-3 * np.abs(before).max()
         assert state.change.changes[0] == changes
-        assert state.weighing.load[0] == pytest.approx(LOAD, abs=0.05)
+        assert state.payload.load[0] == pytest.approx(LOAD, abs=0.05)
     else:
         assert state.change.changes[0] > changes
-        assert state.weighing.load[0] == 0.0  # unknown
+        assert state.payload.load[0] == 0.0  # unknown
     assert np.isfinite(torques).all()

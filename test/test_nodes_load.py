@@ -115,7 +115,7 @@ def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tm
     arm = Arm(ros, services['ur'], wait_for_subscribers=1)
     guard = arm.law.guard
     arm.run_until(9.5)
-    assert guard.controller.state.weighing.load[0] == pytest.approx(2.0, abs=0.1)
+    assert guard.controller.state.payload.load[0] == pytest.approx(2.0, abs=0.1)
     masses = [request.mass for request in arm.requests]
     assert len(masses) > 10
     assert (np.diff(masses) > 0.0).all()

@@ -94,7 +94,7 @@ def test_only_a_load_that_is_well_known_is_declared(mass, deviations, is_declare
     arm = Scenario('fr3_direct', GIVEN)
     arm.run(0.05)
     state = arm.guard.controller.state
-    state.weighing.load[:] = (mass, 0.01, -0.02, 0.05, *deviations)
+    state.payload.load[:] = (mass, 0.01, -0.02, 0.05, *deviations)
     assert (arm.controller.load_to_tell() is not None) == is_declared
     state.contact.phase[0] = TOUCHED
     assert arm.controller.load_to_tell() is None
@@ -105,7 +105,7 @@ def test_told_load_is_left_as_it_is_until_another_is_weighed():
     arm = Scenario('fr3_direct', GIVEN)
     arm.run(0.05)
     arm.controller.take_over(TipLoad(2.0, (0.01, -0.02, 0.05)))
-    load = arm.guard.controller.state.weighing.load
+    load = arm.guard.controller.state.payload.load
     declared = []
     for mass in (2.05, 2.2, 2.05):  # which begins in several steps, and goes on
         load[:] = (mass, 0.01, -0.02, 0.05, *SURE)

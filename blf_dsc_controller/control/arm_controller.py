@@ -22,7 +22,7 @@ from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.loop_outputs import LoopOutputs
 from blf_dsc_controller.control.outputs import Output, Outputs
 from blf_dsc_controller.errors import BlfDscError, LoopEndedError, check_type
-from blf_dsc_controller.law.weighing import DEVIATION, MASS, mass_interval
+from blf_dsc_controller.law.payload import DEVIATION, MASS, mass_interval
 from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.messages.tip_load import TAKEN_UP, TipLoad
 from blf_dsc_controller.reference.retargeting import TrajectoryError
@@ -458,7 +458,7 @@ class ArmController:
     @property
     def load(self) -> Load:
         """What the tip has picked up since the first window, by weighing."""
-        values = self._loop.guard.controller.state.weighing.load
+        values = self._loop.guard.controller.state.payload.load
         if values[DEVIATION] <= 0.0:
             return Load(math.nan, math.nan)
         return Load(float(values[MASS]), mass_interval(values))

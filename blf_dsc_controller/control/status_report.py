@@ -71,7 +71,7 @@ class StatusReport:
         parts = [self._state(lifecycle, guard)]
         if guard is not None:
             parts += [self._loop(guard, others, missing), self._learning(guard)]
-            if guard.controller.settings.weighing.size:
+            if guard.controller.settings.payload.size:
                 parts.append(_load(guard))
             if guard.config.contact.enabled:
                 parts.append(_contact(guard))

@@ -90,7 +90,7 @@ class MotorFeedback:
             Motion(signals.q, signals.dq),
             Motion(signals.qr, signals.dqr),
             Motion(later[0], later[1]),
-            Gains(*self._gains.now()),
+            Gains(*self._gains.evaluate()),
             self.ranges,
         )
 

@@ -47,11 +47,11 @@ from blf_dsc_controller.law import (
     friction,
     load_observer,
     motor_friction,
+    payload,
     prediction,
     reversals,
     surface,
     torque,
-    weighing,
     window,
 )
 from blf_dsc_controller.law.state import Settings
@@ -161,11 +161,11 @@ def _parts_of_learning(
             filter_pole=row.filter_pole,
             length=sliding.length,
             period=sliding.row_interval * config.sample_time,
-            least_weight=sliding.prior_weight + sliding.regularization,
+            min_weight=sliding.prior_weight + sliding.regularization,
         ),
         'external': _external(config, sliding),
         'contact': _contact(config),
-        'weighing': _weighing(config, learned, row, sliding),
+        'payload': _payload(config, learned, row, sliding),
     }
 
 
@@ -232,7 +232,7 @@ def _observer(config: ControllerConfig, p: int, lag: float) -> load_observer.Set
         enabled=int(is_on),
         sensor_lag=0.5 * lag,  # the other half is that of the drives
         unmodelled=np.array(config.learning.residual_floor),
-        most=load_observer.most_load(np.array(config.torque.limit)),
+        max_torque=load_observer.max_load_torque(np.array(config.torque.limit)),
         rotors=rotors,
     )
 
@@ -340,8 +340,8 @@ def _adaptation(
         radius=gains.radius,
         adaptation_gain=np.array(gains.adaptation + (of_columns,) * len(learned)),
         variance=np.diag(covariance).copy(),
-        least=np.array([-np.inf] * p + [column.least for column in learned]),
-        most=np.array([np.inf] * p + [column.most for column in learned]),
+        lower=np.array([-np.inf] * p + [column.least for column in learned]),
+        upper=np.array([np.inf] * p + [column.most for column in learned]),
     )
 
 
@@ -392,8 +392,8 @@ def friction_settings(settings: Settings) -> friction.Settings:
             unmodelled=settings.external.unmodelled,
             initial=of_coulomb(settings.initial_estimate),
             variance=of_coulomb(adapts.variance),
-            least=of_coulomb(adapts.least),
-            most=of_coulomb(adapts.most),
+            lower=of_coulomb(adapts.lower),
+            upper=of_coulomb(adapts.upper),
         ),
         gain=of_coulomb(adapts.adaptation_gain * adapts.weight),
     )
@@ -406,18 +406,18 @@ def _joint_inertia(config: ControllerConfig) -> np.ndarray:
     return joint_inertia(config, law_gains(config).initial_estimate)
 
 
-def _weighing(
+def _payload(
     config: ControllerConfig,
     learned: Sequence[Column],
     row: prediction.Settings,
     sliding: window.Settings,
-) -> weighing.Settings:
+) -> payload.Settings:
     """Return how a load in the tip changes the base parameters, and which rows count."""
     n = len(config.joints)
-    settings = weighing.Settings(
+    settings = payload.Settings(
         size=0,
         inertial=0,
-        since=weighing.LOAD,
+        since=payload.LOAD,
         unknowns=0,
         window=sliding.length,
         row_interval=sliding.row_interval,
@@ -426,8 +426,8 @@ def _weighing(
         unmodelled=_excitation(config).residual_floor / n,
         load_friction=_LOAD_FRICTION**-2.0,
         breakaway=np.zeros(n),
-        columns=np.zeros((0, weighing.LOAD)),
-        scale=np.zeros((4, weighing.LOAD)),
+        columns=np.zeros((0, payload.LOAD)),
+        scale=np.zeros((4, payload.LOAD)),
     )
     if not config.weighs:
         return settings
@@ -437,12 +437,12 @@ def _weighing(
     loaded = tip_parameters(config, map(pseudo_inertia, D.T))
     p = len(loaded)
     changed = _changed_friction(learned)
-    since = weighing.LOAD + changed.shape[1]
+    since = payload.LOAD + changed.shape[1]
     columns = np.zeros((p + len(learned) + 2 * n + 1, since))
-    columns[:p, : weighing.LOAD] = loaded
-    columns[p:, weighing.LOAD :][: len(learned)] = changed
+    columns[:p, : payload.LOAD] = loaded
+    columns[p:, payload.LOAD :][: len(learned)] = changed
     scale = np.zeros((4, since))
-    scale[:, : weighing.LOAD] = D[:4]
+    scale[:, : payload.LOAD] = D[:4]
     return settings._replace(
         size=len(columns),
         inertial=p,

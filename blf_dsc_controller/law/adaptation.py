@@ -29,7 +29,7 @@ from blf_dsc_controller.numerics.algebra import cholesky_solve
 _ON_SPHERE = 1.0 - 1e-12  # of radius^2: `retract` ends within rounding of the sphere
 _LENGTH_ROUNDED = 1.0 + 1e-14
 # of Newton's method; 12 for Gamma spanning eight decades, ten radii outside
-_MOST_STEPS = 20
+_MAX_STEPS = 20
 
 
 class Settings(NamedTuple):
@@ -39,11 +39,11 @@ class Settings(NamedTuple):
     radius: float  # omega_a of (4)
     adaptation_gain: Annotated[Array, 'm']  # diagonal of Gamma
     variance: Annotated[Array, 'm']  # diagonal of R^-1, of the prior
-    least: Annotated[Array, 'm']  # value that theta^ can have: friction is not negative
-    most: Annotated[Array, 'm']  # value that theta^ can have
+    lower: Annotated[Array, 'm']  # value that theta^ can have: friction is not negative
+    upper: Annotated[Array, 'm']  # value that theta^ can have
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     rate: Annotated[Array, 'm']  # eps or W eps, then theta^' [1/s]
@@ -84,7 +84,7 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
         return
     nu = 0.0
     length = radius
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         # of the length of P^_j / (1 + nu Gamma_j): minus half the slope
         square, slope = 0.0, 0.0
         for j in range(gain.size):
@@ -102,31 +102,35 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
 
 
 @inner
-def fill_prediction_error(work: Work, latch: excitation.State, estimate: Array) -> None:
-    """Write eps (m,) to `work.rate`; zero while no window is latched."""
+def fill_prediction_error(
+    workspace: Workspace, latch: excitation.State, estimate: Array
+) -> None:
+    """Write eps (m,) to `workspace.rate`; zero while no window is latched."""
     m = estimate.size
     for i in range(m):
-        work.rate[i] = 0.0
+        workspace.rate[i] = 0.0
     if latch.latched[0] == 0.0:
         return
     for i in range(m):
-        work.rate[i] = latch.b[i]
+        workspace.rate[i] = latch.b[i]
         for j in range(m):
-            work.rate[i] -= latch.Phi[i, j] * estimate[j]
+            workspace.rate[i] -= latch.Phi[i, j] * estimate[j]
 
 
 @inner
-def fill_newton_step(work: Work, latch: excitation.State, estimate: Array) -> None:
-    """Write W eps (m,) to `work.rate`; zero while no window is latched."""
-    fill_prediction_error(work, latch, estimate)
+def fill_newton_step(
+    workspace: Workspace, latch: excitation.State, estimate: Array
+) -> None:
+    """Write W eps (m,) to `workspace.rate`; zero while no window is latched."""
+    fill_prediction_error(workspace, latch, estimate)
     if latch.latched[0] == 1.0:
-        cholesky_solve(latch.factor, work.rate)
+        cholesky_solve(latch.factor, workspace.rate)
 
 
 @inner
 def adapt(
     settings: Settings,
-    work: Work,
+    workspace: Workspace,
     estimate: Array,
     H: Array,
     xi2: Array,
@@ -134,7 +138,7 @@ def adapt(
     tracks: bool,
     dt: float,
 ) -> None:
-    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20), with eps or W eps in `work.rate`.
+    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20), with eps or W eps in `workspace.rate`.
 
     H is (n, m); the tracking error acts on the p parameters, where it `tracks`.
     """
@@ -146,12 +150,12 @@ def adapt(
             for i in range(xi2.size):
                 tracking += H[i, j] * xi2[i]
             tracking = settings.variance[j] * tracking
-        work.tracked[j] = estimate[j] - dt * gain[j] * tracking
-        work.rate[j] = gain[j] * (settings.weight * work.rate[j] - tracking)
+        workspace.tracked[j] = estimate[j] - dt * gain[j] * tracking
+        workspace.rate[j] = gain[j] * (settings.weight * workspace.rate[j] - tracking)
     parameters = part(estimate, 0, (p,))
-    of_parameters = part(gain, 0, (p,))
-    project(parameters, part(work.rate, 0, (p,)), of_parameters, settings.radius)
+    parameter_gain = part(gain, 0, (p,))
+    project(parameters, part(workspace.rate, 0, (p,)), parameter_gain, settings.radius)
     for j in range(estimate.size):
-        moved = estimate[j] + dt * work.rate[j]
-        estimate[j] = clip(moved, settings.least[j], settings.most[j])
-    retract(parameters, of_parameters, settings.radius)
+        moved = estimate[j] + dt * workspace.rate[j]
+        estimate[j] = clip(moved, settings.lower[j], settings.upper[j])
+    retract(parameters, parameter_gain, settings.radius)

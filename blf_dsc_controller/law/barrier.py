@@ -46,7 +46,7 @@ class Settings(NamedTuple):
     knee: Annotated[Array, 'n']
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     knee: Annotated[Array, 'n']  # knee of the barrier for k(t), rad
@@ -110,14 +110,16 @@ def potential(
 
 
 @inner
-def update_bound(settings: Settings, work: Work, t: float, bound: Array) -> None:
+def update_bound(
+    settings: Settings, workspace: Workspace, t: float, bound: Array
+) -> None:
     """Write k(t) [rad] at time t [s] to `bound` (n,); find the knee of its barrier and k'/k."""
     for i in range(settings.bound.size):
         final = settings.bound[i]
         above = (settings.initial_bound[i] - final) * exp(-settings.funnel_rate * t)
         bound[i] = final + above
-        work.knee[i] = settings.knee[i] * (bound[i] / final)
-        work.narrowing[i] = -settings.funnel_rate * above / bound[i]
+        workspace.knee[i] = settings.knee[i] * (bound[i] / final)
+        workspace.narrowing[i] = -settings.funnel_rate * above / bound[i]
 
 
 def bound_at(settings: Settings, t: float) -> Array:
@@ -129,17 +131,17 @@ def bound_at(settings: Settings, t: float) -> Array:
 
 @inner
 def joint_gradient(
-    settings: Settings, work: Work, xi: float, bound: float, i: int
+    settings: Settings, workspace: Workspace, xi: float, bound: float, i: int
 ) -> float:
     """Return dV/dxi [N m] of joint i with an error and its bound k(t) [rad]."""
     weight, limit = settings.weight[i], settings.slope_limit[i]
-    return gradient(xi, bound, weight, limit, work.knee[i])
+    return gradient(xi, bound, weight, limit, workspace.knee[i])
 
 
 @inner
 def joint_potential(
-    settings: Settings, work: Work, xi: float, bound: float, i: int
+    settings: Settings, workspace: Workspace, xi: float, bound: float, i: int
 ) -> float:
     """Return V [J] of joint i with an error and its bound k(t) [rad]."""
     weight, limit = settings.weight[i], settings.slope_limit[i]
-    return potential(xi, bound, weight, limit, work.knee[i])
+    return potential(xi, bound, weight, limit, workspace.knee[i])

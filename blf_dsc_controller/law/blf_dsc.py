@@ -73,24 +73,24 @@ def compute_surface(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Compute beta2 of (15) and (18), alpha2' of the filter (13), xi2, and -dV/dxi1."""
-    of, work = settings.surface, signals.surface
-    gain = filter_gain(of.time_constant, dt)
+    gains, surface = settings.surface, signals.surface
+    gain = filter_gain(gains.time_constant, dt)
     for i in range(settings.n):
         xi1, bound = signals.xi1[i], signals.bound[i]
         dqr, narrowing = signals.dqr[i], signals.barrier.narrowing[i]
-        work.beta2[i] = virtual_control(
-            xi1, bound, of.gain[i], of.mu[i], dqr + narrowing * xi1
+        surface.beta2[i] = virtual_control(
+            xi1, bound, gains.gain[i], gains.mu[i], dqr + narrowing * xi1
         )
-        work.rate[i] = 0.0
-        if of.known_rate == 1:
+        surface.rate[i] = 0.0
+        if gains.known_rate == 1:
             dq, ddqr = signals.dq[i], signals.ddqr[i]
-            f, late = known_rate(of, xi1, bound, narrowing, dq, dqr, ddqr, i)
-            work.beta2[i] -= late
-            work.rate[i] = f
+            f, lag_offset = known_rate(gains, xi1, bound, narrowing, dq, dqr, ddqr, i)
+            surface.beta2[i] -= lag_offset
+            surface.rate[i] = f
         if state.samples[0] == 0.0:
-            state.alpha2[i] = work.beta2[i]
-        signals.dalpha2[i] = gain * (work.beta2[i] - state.alpha2[i]) / dt
-        signals.dalpha2[i] += work.rate[i]
+            state.alpha2[i] = surface.beta2[i]
+        signals.dalpha2[i] = gain * (surface.beta2[i] - state.alpha2[i]) / dt
+        signals.dalpha2[i] += surface.rate[i]
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
         signals.feedback.restoring[i] = -barrier.joint_gradient(
             settings.barrier, signals.barrier, xi1, bound, i
@@ -102,18 +102,18 @@ def advance_surface(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Advance alpha2 of the filter (13) by `dt` [s], exactly for the held beta2."""
-    work = signals.surface
+    surface = signals.surface
     gain = filter_gain(settings.surface.time_constant, dt)
     for i in range(settings.n):
-        state.alpha2[i] += gain * (work.beta2[i] - state.alpha2[i])
-        state.alpha2[i] += dt * work.rate[i]
+        state.alpha2[i] += gain * (surface.beta2[i] - state.alpha2[i])
+        state.alpha2[i] += dt * surface.rate[i]
 
 
 def shift_surface(state: State, change: Array) -> None:
     """Shift alpha2 by `change` (n,) [rad/s], and the lagged xi2 with it: no transient follows."""
-    late = state.feedback.late
+    lagged = state.feedback.lagged
     state.alpha2[:] += change
-    late -= change[: late.size]
+    lagged -= change[: lagged.size]
 
 
 @inner
@@ -121,10 +121,10 @@ def joint_feedback(
     settings: Settings, state: State, signals: Signals, layer: float, i: int
 ) -> float:
     """Return the feedback of joint i [N m]: barrier, robust term and damping of (28)."""
-    of = settings.feedback
+    gains = settings.feedback
     xi1, xi2 = signals.xi1[i], signals.xi2[i]
-    late = feedback.damped(of, state.feedback, signals.xi2, i)
-    torque = feedback.joint_torque(of, xi1, xi2, late, layer, i)
-    if of.follows_inertia == 1:  # the barrier is in `model_torque`
+    lagged_xi2 = feedback.damped_velocity(gains, state.feedback, signals.xi2, i)
+    torque = feedback.joint_torque(gains, xi1, xi2, lagged_xi2, layer, i)
+    if gains.follows_inertia == 1:  # the barrier is in `model_torque`
         return torque
     return torque + float(signals.feedback.restoring[i])

@@ -78,24 +78,28 @@ def called(law: Law, settings: Settings, state: State, signals: Signals) -> Call
 def _methods(law: type, gains: str) -> list[Callable[..., None]]:
     """Return both methods of a law as kernels that take its gains as a vector."""
     names: dict[str, Any] = {'LAW': law, '__name__': __name__}
-    found = []
-    for name, rest in (('compute_demand', 't, dt'), ('finish', 'dt, saturated')):
-        arguments = f'settings, state, signals, {rest}'
+    methods = []
+    for name, last_arguments in (
+        ('compute_demand', 't, dt'),
+        ('finish', 'dt, saturated'),
+    ):
+        arguments = f'settings, state, signals, {last_arguments}'
         exec(  # noqa: S102 - of the gains of a law that is loaded
             f'def {name}(gains, {arguments}):\n    LAW({gains}).{name}({arguments})\n',
             names,
         )
         method = uncallable(names[name], law)
         tell_mistakes(method, law)
-        found.append(method)
-    return found
+        methods.append(method)
+    return methods
 
 
 def _source(law: Any) -> str:
     """Return the gains of a law, of the types that they have, as entries of the vector `gains`."""
-    of_type = {bool: 'gains[{}] != 0.0', int: 'int(gains[{}])'}
+    entry_of_type = {bool: 'gains[{}] != 0.0', int: 'int(gains[{}])'}
     return ', '.join(
-        of_type.get(type(gain), 'gains[{}]').format(k) for k, gain in enumerate(law)
+        entry_of_type.get(type(gain), 'gains[{}]').format(k)
+        for k, gain in enumerate(law)
     )
 
 

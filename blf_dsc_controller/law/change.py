@@ -48,7 +48,7 @@ class State(NamedTuple):
     innovation: innovation.State  # of these rows
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of one row."""
 
     predicted: Annotated[Array, 'n', 'm']
@@ -91,7 +91,7 @@ def compare_row(
 def compare_with_solution(
     settings: excitation.Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     latch: excitation.State,
     row: Array,
     dt: float,
@@ -99,50 +99,58 @@ def compare_with_solution(
     """Compare this row with the latched solution; return whether the last ones contradict it."""
     if latch.latched[0] == 0.0:
         return False
-    compare_row(state, row, latch.solution, dt, work.innovation)
-    least = latch.least_residual[0]
-    allowed = _ALARM_RATIO * excitation.explained(settings, least, latch.residual[0])
+    compare_row(state, row, latch.solution, dt, workspace.innovation)
+    min_residual = latch.min_residual[0]
+    allowed = _ALARM_RATIO * excitation.explained(
+        settings, min_residual, latch.residual[0]
+    )
     return bool(state.recent_residual[0] > allowed)
 
 
 @inner
 def compare_with_rows(
     state: State,
-    work: Work,
+    workspace: Workspace,
     sliding: Window,
     prior: Prior,
     row: Array,
-    share: float,
+    square_weight: float,
     unmodelled: float,
     samples: int,
     dt: float,
 ) -> bool:
     """Compare this row with those before it; return whether the last ones contradict them.
 
-    `share` is the mean square weight of its joints, `unmodelled` the mean square torque
+    `square_weight` is the mean square weight of its joints, `unmodelled` the mean square torque
     that no column describes [(N m)^2], `samples` the number of samples of `dt` [s].
     """
-    of = sliding.settings
-    if samples % of.row_interval != 0:
+    window_settings = sliding.settings
+    if samples % window_settings.row_interval != 0:
         return False
-    period = of.row_interval * dt
+    period = window_settings.row_interval * dt
     if not innovation.has_begun(state.innovation):
         innovation.begin(state.innovation, unmodelled)
         fit_rows(state, sliding, prior, period)
-    compare_row(state, row, state.rows_fit, period, work.innovation)
-    n, m = work.predicted.shape
+    compare_row(state, row, state.rows_fit, period, workspace.innovation)
+    n, m = workspace.predicted.shape
     for i in range(n):
         for j in range(m):
-            work.predicted[i, j] = row[i, j]
+            workspace.predicted[i, j] = row[i, j]
     square = innovation.normalized_square(
-        work.predicted, work.innovation, state.rows_factor, period, work.covariance
+        workspace.predicted,
+        workspace.innovation,
+        state.rows_factor,
+        period,
+        workspace.covariance,
     )
-    now = state.innovation
-    if innovation.update(now, square, share, unmodelled, period, of.length):
+    statistics = state.innovation
+    if innovation.update(
+        statistics, square, square_weight, unmodelled, period, window_settings.length
+    ):
         return True
     refresh = max(1, round(innovation.REFRESH / period))
     # a quarter later than the excitation is checked: not both in one sample
-    if samples // of.row_interval % refresh == refresh // 4:
+    if samples // window_settings.row_interval % refresh == refresh // 4:
         fit_rows(state, sliding, prior, period)
     return False
 
@@ -172,10 +180,10 @@ def count_change(
 
     The third of three that come soon after one another is of a torque that lasts.
     """
-    of = sliding.settings
-    since = sliding.state.rows[0] * of.row_interval * dt
+    window_settings = sliding.settings
+    age = sliding.state.rows[0] * window_settings.row_interval * dt
     state.changes[0] += 1.0
-    state.hasty[0] = state.hasty[0] + 1.0 if since < _SOON_TIME else 0.0
+    state.hasty[0] = state.hasty[0] + 1.0 if age < _SOON_TIME else 0.0
     if state.hasty[0] >= _HASTY_TIME:
         innovation.raise_noise(state.innovation)
     state.contradiction[0] = state.recent_residual[0]
@@ -183,4 +191,4 @@ def count_change(
     excitation.unlatch(latch, estimate)
     window.forget(sliding.state)
     innovation.forget_recent(state.innovation)
-    fit_rows(state, sliding, prior, of.row_interval * dt)
+    fit_rows(state, sliding, prior, window_settings.row_interval * dt)

@@ -46,13 +46,13 @@ def watch_oscillation(
     """Follow the half waves of the joints, if checked; return whether to report an oscillation."""
     if not are_on(checks) or checks.sample_time[0] <= 0.0:
         return False
-    now = checks.oscillation
+    half_waves = checks.oscillation
     limit = settings.torque.limit
     if begins:
-        oscillation.begin(now, signals.xi1, signals.applied)
+        oscillation.begin(half_waves, signals.xi1, signals.applied)
         return False
     oscillation.watch(
-        now,
+        half_waves,
         limit,
         signals.xi1,
         signals.applied,
@@ -60,7 +60,7 @@ def watch_oscillation(
         checks.sensor.resolution,
         dt,
     )
-    return oscillation.count_down(now, limit, dt)
+    return oscillation.count_down(half_waves, limit, dt)
 
 
 @inner
@@ -72,13 +72,13 @@ def check_error(
     largest = 0.0
     error_ratio = checks.error_ratio[0] if has_barrier else 0.0
     for i in range(xi1.size):
-        now = abs(xi1[i]) / bound[i]
-        largest = max(largest, now)
-        if now == now:  # noqa: PLR0124 - not NaN
-            checks.ratio[i] = max(checks.ratio[i], now)
-        if not now < 1.0:
+        ratio = abs(xi1[i]) / bound[i]
+        largest = max(largest, ratio)
+        if ratio == ratio:  # noqa: PLR0124 - not NaN
+            checks.ratio[i] = max(checks.ratio[i], ratio)
+        if not ratio < 1.0:
             flags |= OUTSIDE
-        if error_ratio > 0.0 and not now < error_ratio:
+        if error_ratio > 0.0 and not ratio < error_ratio:
             flags |= SUSPECT
     return flags, largest
 
@@ -135,7 +135,7 @@ def check_sample(
         return flags
     n = settings.n
     begins = state.samples[0] == 0.0
-    now = effect.Sample(
+    effect_sample = effect.Sample(
         q=checks.repeats.read[:n],
         qr=sample.qr,
         effort=checks.repeats.used[2 * n :],
@@ -144,11 +144,11 @@ def check_sample(
         begins=begins,
         dt=T,
     )
-    effect.average_steps(checks.effect, now)
+    effect.average_steps(checks.effect, effect_sample)
     is_sound = is_sound and not may_oscillate(checks)
     kept_estimates.keep_consistent(estimates, ratio, is_sound, begins, T)
     is_missing, moves = effect.check_effect(
-        settings.torque, checks.effect, checks.sensor, now
+        settings.torque, checks.effect, checks.sensor, effect_sample
     )
     if is_missing:
         flags |= NO_EFFECT | SUSPECT

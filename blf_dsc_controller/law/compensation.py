@@ -34,13 +34,13 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 @inner
 def fill_model(settings: Settings, state: State, signals: Signals) -> None:
     """Compute H, Yp and Yr at the state, and H P^(0) with the feedback as `model_torque` [N m]."""
-    of, row = settings.feedback, signals.row
+    gains, row = settings.feedback, signals.row
     H, a_f = signals.H, signals.feedback.acceleration
     v, a = state.alpha2, signals.dalpha2
-    if of.decoupled == 1:
+    if gains.decoupled == 1:
         v, a = signals.dqr, signals.ddqr
     feedback.fill_acceleration(
-        of, signals.feedback, a, signals.xi2, settings.joint_inertia
+        gains, signals.feedback, a, signals.xi2, settings.joint_inertia
     )
     settings.model.regressors(signals.q, signals.dq, v, a_f, H, row.Yp, row.Yr)
     for i in range(settings.n):
@@ -63,8 +63,8 @@ def compute_regressors_at_state(
 ) -> None:
     """Compute the same with H of what is learned at the state, as in the paper."""
     fill_model(settings, state, signals)
-    of = settings.feedback
-    if of.damping_rate > 0.0 or of.follows_inertia == 1:
+    gains = settings.feedback
+    if gains.damping_rate > 0.0 or gains.follows_inertia == 1:
         q, dq = signals.q, signals.dq
         settings.model.regressor(q, dq, state.alpha2, signals.dalpha2, signals.H)
 
@@ -78,19 +78,24 @@ def fill_learned(settings: Settings, state: State, signals: Signals, dt: float) 
     into the torque.  The p first columns of H are those along the reference.
     """
     lead = 1.5 * dt + 0.5 * settings.row.lag
-    H, work = signals.H, signals.friction
+    H, friction_values = signals.H, signals.friction
     for i in range(settings.n):
         dqr, ddqr = signals.dqr[i], signals.ddqr[i]
         velocity = dqr + lead * ddqr
         friction.compensate(
-            settings.friction, state.friction, work, state.estimate, velocity, i
+            settings.friction,
+            state.friction,
+            friction_values,
+            state.estimate,
+            velocity,
+            i,
         )
         load = 0.0
         for j in range(settings.p):
             load += H[i, j] * state.estimate[j]
         signals.gear_torque[i] = load
         position = signals.qr[i] + lead * (dqr + 0.5 * lead * ddqr)
-        at = columns.Point(0.0, position, velocity, work.sign[i], load)
+        at = columns.Point(0.0, position, velocity, friction_values.sign[i], load)
         columns.fill(settings.columns, columns.COMPENSATED, i, at, H)
 
 

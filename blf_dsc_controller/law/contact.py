@@ -2,7 +2,7 @@
 """Whether something touches the arm: external torque that is large, and of no load in the tip.
 
 A contact is r of `external_torque` with r^T S^-1 r > h^2, unless a load explains it.  A load in
-the tip with phi = D z adds X_L N D z (see `weighing`).  Once r is past h, z ~ (0, 1) is filtered
+the tip with phi = D z adds X_L N D z (see `payload`).  Once r is past h, z ~ (0, 1) is filtered
 from r, and only what is past h of S + X_L N D Cov(z) (X_L N D)^T is a contact: a load follows the
 arm in every posture and acceleration, another force does not.  A load cannot have negative mass: an
 arm that is known to hold no more than what z takes away presses on something.  A contact ends when
@@ -46,7 +46,7 @@ class State(NamedTuple):
     load_covariance: Annotated[Array, '10 * contact.enabled', 10]
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of one sample."""
 
     columns: Annotated[Array, 'n * contact.enabled', 10]  # X_L N D, whitened
@@ -55,7 +55,7 @@ class Work(NamedTuple):
     gain: Annotated[Array, '10 * contact.enabled']
 
 
-class Seen(NamedTuple):
+class Residual(NamedTuple):
     """What `external_torque` sees."""
 
     rows: Array  # [X_L | u_L] (n, m + 1)
@@ -67,7 +67,7 @@ class Seen(NamedTuple):
 class TipLoad(NamedTuple):
     """How a load in the tip acts, and what is known to be held."""
 
-    columns: Array  # of `weighing`: those of N D are first
+    columns: Array  # of `payload`: those of N D are first
     scale: Array  # rows of D, likewise: mass [kg] and moments [kg m]
     mass: float  # kg
     deviation: float  # of the mass, kg; infinite where it is unknown
@@ -81,7 +81,12 @@ def is_touched(state: State) -> bool:
 
 @inner
 def absorb(
-    columns: Array, e: Array, noise: float, z: Array, covariance: Array, work: Array
+    columns: Array,
+    e: Array,
+    noise: float,
+    z: Array,
+    covariance: Array,
+    workspace: Array,
 ) -> float:
     """Update z and its covariance by e = columns z + white noise of variance `noise`.
 
@@ -94,15 +99,15 @@ def absorb(
         variance = noise
         for a in range(size):
             innovation -= columns[i, a] * z[a]
-            work[a] = 0.0
+            workspace[a] = 0.0
             for b in range(size):
-                work[a] += covariance[a, b] * columns[i, b]
-            variance += columns[i, a] * work[a]
+                workspace[a] += covariance[a, b] * columns[i, b]
+            variance += columns[i, a] * workspace[a]
         square += innovation * innovation / variance
         for a in range(size):
-            z[a] += work[a] * innovation / variance
+            z[a] += workspace[a] * innovation / variance
             for b in range(size):
-                covariance[a, b] -= work[a] * work[b] / variance
+                covariance[a, b] -= workspace[a] * workspace[b] / variance
     return square
 
 
@@ -116,9 +121,11 @@ def forget_load(state: State) -> None:
 
 
 @inner
-def fill_load_columns(work: Work, seen: Seen, load_columns: Array) -> None:
+def fill_load_columns(
+    workspace: Workspace, residual: Residual, load_columns: Array
+) -> None:
     """Compute -X_L N D, whitened: the load is missing in X theta^ = u + r."""
-    rows, spread, columns = seen.rows, seen.spread, work.columns
+    rows, spread, columns = residual.rows, residual.spread, workspace.columns
     n = rows.shape[0]
     m = rows.shape[1] - 1
     for a in range(columns.shape[1]):
@@ -133,27 +140,32 @@ def fill_load_columns(work: Work, seen: Seen, load_columns: Array) -> None:
 
 
 @inner
-def filter_load(state: State, work: Work, white: Array, dt: float) -> float:
+def filter_load(state: State, workspace: Workspace, white: Array, dt: float) -> float:
     """Filter the load from r, which is `white` (n,); return how far r is from what any explains."""
     size = state.load.size
-    fade = min(1.0, dt / _FORGETTING_TIME)
+    gain = min(1.0, dt / _FORGETTING_TIME)
     for a in range(size):
-        state.load[a] -= fade * state.load[a]
-        work.load[a] = state.load[a]
+        state.load[a] -= gain * state.load[a]
+        workspace.load[a] = state.load[a]
         for b in range(size):
             prior = 1.0 if a == b else 0.0
-            state.load_covariance[a, b] += fade * (prior - state.load_covariance[a, b])
-            work.load_covariance[a, b] = state.load_covariance[a, b]
+            state.load_covariance[a, b] += gain * (prior - state.load_covariance[a, b])
+            workspace.load_covariance[a, b] = state.load_covariance[a, b]
     square = absorb(
-        work.columns, white, 1.0, work.load, work.load_covariance, work.gain
+        workspace.columns,
+        white,
+        1.0,
+        workspace.load,
+        workspace.load_covariance,
+        workspace.gain,
     )
     absorb(
-        work.columns,
+        workspace.columns,
         white,
         _CORRELATION_TIME / dt,
         state.load,
         state.load_covariance,
-        work.gain,
+        workspace.gain,
     )
     return sqrt(square)
 
@@ -165,7 +177,7 @@ def is_negative_mass(mass: float, variance: float) -> bool:
 
 
 @inner
-def takes_away_too_much(state: State, load: TipLoad) -> bool:
+def removes_too_much_mass(state: State, load: TipLoad) -> bool:
     """Whether the filtered load takes away more mass than is held."""
     mass = load.mass
     variance = load.deviation * load.deviation
@@ -181,17 +193,17 @@ def takes_away_too_much(state: State, load: TipLoad) -> bool:
 def explain_by_load(
     settings: Settings,
     state: State,
-    work: Work,
-    seen: Seen,
+    workspace: Workspace,
+    residual: Residual,
     load: TipLoad,
     dt: float,
 ) -> float:
     """Return the distance of r from what a load explains, or from zero if none does."""
     if settings.loads == 0:
-        return seen.distance
-    fill_load_columns(work, seen, load.columns)
-    remaining = filter_load(state, work, seen.white, dt)
-    return seen.distance if takes_away_too_much(state, load) else remaining
+        return residual.distance
+    fill_load_columns(workspace, residual, load.columns)
+    remaining = filter_load(state, workspace, residual.white, dt)
+    return residual.distance if removes_too_much_mass(state, load) else remaining
 
 
 @inner
@@ -225,20 +237,20 @@ def next_phase(
 def update(
     settings: Settings,
     state: State,
-    work: Work,
-    seen: Seen,
+    workspace: Workspace,
+    residual: Residual,
     load: TipLoad,
     dt: float,
 ) -> float:
     """Update the phase; return the distance of r from what explains it."""
     phase = state.phase[0]
-    distance = remaining = seen.distance
+    distance = remaining = residual.distance
     if is_small(phase, distance, settings.threshold):
         state.calm[0] += dt
         state.explained[0] = 0.0
     else:
         state.calm[0] = 0.0
-        remaining = explain_by_load(settings, state, work, seen, load, dt)
+        remaining = explain_by_load(settings, state, workspace, residual, load, dt)
         is_explained = phase == TOUCHED and not remaining > settings.threshold
         state.explained[0] = state.explained[0] + dt if is_explained else 0.0
     state.phase[0] = next_phase(

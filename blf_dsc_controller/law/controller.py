@@ -17,7 +17,7 @@ from blf_dsc_controller.law import barrier, external_torque, friction, load_obse
 from blf_dsc_controller.law.check_state import INVALID, checks_of, checks_size
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
-from blf_dsc_controller.law.perception import sense, weigh
+from blf_dsc_controller.law.perception import estimate_payload, sense
 from blf_dsc_controller.law.start import Start, keep
 from blf_dsc_controller.law.state import (
     Settings,
@@ -84,25 +84,25 @@ class Controller:
             self._measurement,
         )
         views = self.settings, self.state, self.signals
-        self.given_law = given = for_kernels(self.law, *views)
-        self._update = direct(for_law(update, given), *self.arguments, 0.0, 0.0)
-        self._advance = direct(for_law(advance, given), *self.arguments_after)
+        self.kernel_law = kernel_law = for_kernels(self.law, *views)
+        self._update = direct(for_law(update, kernel_law), *self.arguments, 0.0, 0.0)
+        self._advance = direct(for_law(advance, kernel_law), *self.arguments_after)
         self._compared = (*self._vectors[:2], self.checks_vector, self._measurement)
         self._compare = direct(compare, *self._compared, 0.0)
-        if self.settings.weighing.size:
-            self._weigh = direct(weigh, *self._vectors[:4], 0.0)
+        if self.settings.payload.size:
+            self._estimate_payload = direct(estimate_payload, *self._vectors[:4], 0.0)
         if self.settings.contact.enabled:
             self._sense = direct(sense, *self._vectors[:5], 0.0)
 
     @property
     def arguments(self) -> tuple[Any, ...]:
         """What the kernel `update` takes before t and dt."""
-        return self.given_law, *self._vectors, self.reference_vector
+        return self.kernel_law, *self._vectors, self.reference_vector
 
     @property
     def arguments_after(self) -> tuple[Any, ...]:
         """What the kernel `advance` takes."""
-        return self.given_law, *self._vectors[:5]
+        return self.kernel_law, *self._vectors[:5]
 
     def bound_at(self, t: float) -> Array:
         """Return the bound k(t) (n,) [rad] at time t [s] since the start."""
@@ -110,8 +110,8 @@ class Controller:
 
     def reference_at(self, t: float) -> Array:
         """Return the reference qr, dqr, ddqr (3, n) at time t [s] since the start."""
-        (now,) = reference.sampled(self.reference_vector, np.array([t]))
-        return np.asarray(now)
+        (sample,) = reference.sampled(self.reference_vector, np.array([t]))
+        return np.asarray(sample)
 
     @property
     def samples(self) -> int:
@@ -173,11 +173,11 @@ class Controller:
 
     def _take(self, measurement: Array) -> None:
         """Copy a measurement to where the kernels read it."""
-        given = np.shape(measurement)
-        if given != self._measurement.shape:
+        kernel_law = np.shape(measurement)
+        if kernel_law != self._measurement.shape:
             n = self.settings.n
             raise BlfDscError(
-                f'measurement: got an array of shape {given}, but {n} joints need ({3 * n},): '
+                f'measurement: got an array of shape {kernel_law}, but {n} joints need ({3 * n},): '
                 'positions, velocities and torques, one after the other'
             )
         self._measurement[:] = measurement
@@ -187,8 +187,8 @@ class Controller:
 
         It was `dt` [s] after the one before.  Returns whether a contact begins.
         """
-        if self.settings.weighing.size:
-            self._weigh(*self._vectors[:4], dt)
+        if self.settings.payload.size:
+            self._estimate_payload(*self._vectors[:4], dt)
         return bool(
             self.settings.contact.enabled and self._sense(*self._vectors[:5], dt)
         )
@@ -232,8 +232,8 @@ class Controller:
 
     def shift_estimate(self, change: Array) -> None:
         """Add an expected `change` (p,) of base parameters to the estimate, with its torque."""
-        for each in (self.state.estimate, self.state.latch.anchor):
-            each[: change.size] += change
+        for parameters in (self.state.estimate, self.state.latch.anchor):
+            parameters[: change.size] += change
         load_observer.expect(self.settings.observer, self.state.observer, change)
 
     def replace_torque(self, torque: Array) -> None:
@@ -256,7 +256,7 @@ class Controller:
     def retune(self, law: Law, settings: Settings) -> None:
         """Replace the gains of the law, and settings that change no size; the state stays."""
         self.law = law
-        self.given_law = with_gains(self.given_law, law)
+        self.kernel_law = with_gains(self.kernel_law, law)
         self.settings_vector[:] = pack(settings)
 
     def save(self) -> Array:

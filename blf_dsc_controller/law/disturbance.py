@@ -23,7 +23,7 @@ class Settings(NamedTuple):
     leakage: float  # eta, rad/(N m s)
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     step: Annotated[Array, 'n']  # by which d^3 falls, N m
@@ -31,12 +31,12 @@ class Work(NamedTuple):
 
 @inner
 def fill_step(
-    settings: Settings, work: Work, estimate: Array, xi2: Array, dt: float
+    settings: Settings, workspace: Workspace, estimate: Array, xi2: Array, dt: float
 ) -> None:
     """Compute the step dt gamma (xi2 + eta d^3); `estimate` (n,) [N m] is d^3."""
     for i in range(xi2.size):
         error = xi2[i] + settings.leakage * estimate[i]
-        work.step[i] = dt * settings.gain[i] * error
+        workspace.step[i] = dt * settings.gain[i] * error
 
 
 @inner

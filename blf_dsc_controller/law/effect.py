@@ -42,7 +42,7 @@ class State(NamedTuple):
     shortfall: Annotated[Array, 'n']
     # N m, of it the error of the model of what the drives add
     shortfall_in_motion: Annotated[Array, 'n']
-    usual_shortfall: Annotated[Array, 'n']  # N m, average of it over _EARLIER_TIME
+    mean_shortfall: Annotated[Array, 'n']  # N m, average of it over _EARLIER_TIME
     short_for: Cell  # s, for which the shortfall has been too large
 
 
@@ -61,19 +61,19 @@ class Sample(NamedTuple):
 @inner
 def average_steps(state: State, sample: Sample) -> None:
     """Update the mean square step of the commands, which coarse encoders make chatter."""
-    share = min(1.0, sample.dt / _CHATTER_TIME)
+    gain = min(1.0, sample.dt / _CHATTER_TIME)
     for i in range(sample.q.size):
         step = 0.0 if sample.begins else sample.command[i] - state.last[i]
-        state.chatter[i] += share * (step * step - state.chatter[i])
+        state.chatter[i] += gain * (step * step - state.chatter[i])
         state.last[i] = sample.command[i]
 
 
 @inner
-def is_elsewhere(readings: sensor.State, now: Array, then: Array) -> bool:
+def is_elsewhere(readings: sensor.State, position: Array, earlier: Array) -> bool:
     """Whether a position (n,) [rad] of one joint differs by more than its sensor explains."""
     moves = False
-    for i in range(now.size):
-        moves = moves or sensor.position_changed(readings, i, now[i] - then[i])
+    for i in range(position.size):
+        moves = moves or sensor.position_changed(readings, i, position[i] - earlier[i])
     return moves
 
 
@@ -108,19 +108,19 @@ def follow_commands(
     has_changed = False
     for i in range(sample.q.size):
         command = sample.command[i]
-        smooth = 1.0 if sample.begins else min(1.0, sample.dt / _RECENT_TIME)
-        state.recent[i] += smooth * (command - state.recent[i])
+        gain = 1.0 if sample.begins else min(1.0, sample.dt / _RECENT_TIME)
+        state.recent[i] += gain * (command - state.recent[i])
         if moves:
             state.q[i] = sample.q[i]
             state.qr[i] = sample.qr[i]
             state.before[i] = state.recent[i]
         else:
-            slow = min(1.0, sample.dt / _EARLIER_TIME)
-            state.before[i] += slow * (command - state.before[i])
+            slow_gain = min(1.0, sample.dt / _EARLIER_TIME)
+            state.before[i] += slow_gain * (command - state.before[i])
         change = abs(state.recent[i] - state.before[i])
-        least = _CHANGED_TORQUE * limits.limit[i]
-        least += _CHATTERED * sqrt(state.chatter[i])
-        has_changed = has_changed or change > least
+        threshold = _CHANGED_TORQUE * limits.limit[i]
+        threshold += _CHATTERED * sqrt(state.chatter[i])
+        has_changed = has_changed or change > threshold
     return has_changed
 
 
@@ -153,12 +153,12 @@ def compare_effort(
             shortfall += sample.added[i]
         if sample.begins:
             state.shortfall[i] = shortfall if is_relative else 0.0
-            state.usual_shortfall[i] = state.shortfall[i]
+            state.mean_shortfall[i] = state.shortfall[i]
         elif isfinite(shortfall):
             change = shortfall - state.shortfall[i]
             state.shortfall[i] += min(1.0, sample.dt / _RECENT_TIME) * change
-            change = shortfall - state.usual_shortfall[i]
-            state.usual_shortfall[i] += min(1.0, sample.dt / _EARLIER_TIME) * change
+            change = shortfall - state.mean_shortfall[i]
+            state.mean_shortfall[i] += min(1.0, sample.dt / _EARLIER_TIME) * change
         if moves:
             state.shortfall_in_motion[i] = state.shortfall[i] if is_relative else 0.0
         excess = abs(state.shortfall[i] - state.shortfall_in_motion[i])

@@ -43,12 +43,12 @@ _LAMBDA_LOST = 0.1  # fraction of the best lambda_min lost per window
 _GATE_RATIO = 4.0  # ratio of mean squares: twice the torque
 # times the smallest residual: the floor, where that is below the configured one
 _QUIET_RATIO = 4.0
-_LEAST_FLOOR = 0.01  # of the configured floor: a tenth of the torque
+_MIN_FLOOR = 0.01  # of the configured floor: a tenth of the torque
 # of the residual since the last split; that of a lasting disturbance does not fall
 _FALLEN_RATIO = 0.5
 _USUAL_RATIO = 1.25  # times the smallest residual, which varies with the motion
 _DOUBT_PULL = 3.0  # pull to the anchor per (N m)^2 above that, 1/(kg m^2)^2
-_LEAST_INERTIA = 0.1  # fraction of the initial estimate's
+_MIN_INERTIA = 0.1  # fraction of the initial estimate's
 
 
 class Settings(NamedTuple):
@@ -72,7 +72,7 @@ class State(NamedTuple):
     best_lambda: Cell  # largest of a full window since the last change, with decay
     columns_checked: Cell  # 1 once the disturbance columns are accepted or rejected
     residual: Cell  # mean square torque residual of the latched window, (N m)^2
-    least_residual: Cell  # smallest residual of any full window, (N m)^2
+    min_residual: Cell  # smallest residual of any full window, (N m)^2
     # of the last first window that its parts contradicted, (N m)^2
     split_residual: Cell
     Phi: Annotated[Array, 'm', 'm']  # latched Phi_e
@@ -84,7 +84,7 @@ class State(NamedTuple):
     active: Annotated[Array, 'm']  # 0 where a disturbance column has been rejected
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of the check for a positive inertia."""
 
     # M^(q) minus its least admissible value, or its factor
@@ -95,16 +95,16 @@ class Work(NamedTuple):
 
 
 @inner
-def explained(settings: Settings, least_residual: float, residual: float) -> float:
+def explained(settings: Settings, min_residual: float, residual: float) -> float:
     """Return the mean square residual that noise and unmodelled torque explain (>= `residual`).
 
     Their configured floor is an upper limit: the best full window, with the
-    `least_residual` or 0 if there is none, shows how little they are.
+    `min_residual` or 0 if there is none, shows how little they are.
     """
     floor = settings.residual_floor
-    if least_residual > 0.0:
-        shown = max(_QUIET_RATIO * least_residual, _LEAST_FLOOR * floor)
-        floor = min(floor, shown)
+    if min_residual > 0.0:
+        observed_floor = max(_QUIET_RATIO * min_residual, _MIN_FLOOR * floor)
+        floor = min(floor, observed_floor)
     return max(residual, floor)
 
 
@@ -123,19 +123,19 @@ def window_residual(running: Array, theta: Array) -> float:
 
 @inner
 def find_spare_inertia(
-    model: ArmModel, work: Work, q: Array, theta: Array, P0: Array
+    model: ArmModel, workspace: Workspace, q: Array, theta: Array, P0: Array
 ) -> None:
-    """Write M(q) of theta (m,), minus a tenth of that of P^(0), to `work.inertia`."""
+    """Write M(q) of theta (m,), minus a tenth of that of P^(0), to `workspace.inertia`."""
     n = q.size
     for k in range(n):
         for i in range(n):
-            work.unit[i] = 1.0 if i == k else 0.0
-        model.momentum_regressor(q, work.unit, work.Yp, work.Yr)
+            workspace.unit[i] = 1.0 if i == k else 0.0
+        model.momentum_regressor(q, workspace.unit, workspace.Yp, workspace.Yr)
         for i in range(k, n):
-            work.inertia[k, i] = 0.0
-            for j in range(work.Yp.shape[1]):
-                parameter = theta[j] - _LEAST_INERTIA * P0[j]
-                work.inertia[k, i] += work.Yp[i, j] * parameter
+            workspace.inertia[k, i] = 0.0
+            for j in range(workspace.Yp.shape[1]):
+                parameter = theta[j] - _MIN_INERTIA * P0[j]
+                workspace.inertia[k, i] += workspace.Yp[i, j] * parameter
 
 
 @inner
@@ -144,7 +144,7 @@ def is_in_question(
 ) -> bool:
     """Whether a full window must be compared with its parts: no other has been accepted yet."""
     is_full = window.is_full(sliding.settings, sliding.state)
-    if not is_full or state.least_residual[0] > 0.0 or sliding.settings.length == 1:
+    if not is_full or state.min_residual[0] > 0.0 or sliding.settings.length == 1:
         return False
     split = state.split_residual[0]
     is_new = split == 0.0 or residual < _FALLEN_RATIO * split
@@ -160,10 +160,10 @@ def part_residual(
     `part` (m + 1, m + 1) is the sum of their [X | u]^T [X | u].  Their equations and
     solution are left in the scratch of the window.
     """
-    work = sliding.work
-    window.fill_equations(sliding.settings, work, prior, part, rows)
-    window.solve(sliding.settings, work, prior.information, active)
-    return window_residual(part, work.solution) / rows
+    workspace = sliding.workspace
+    window.fill_equations(sliding.settings, workspace, prior, part, rows)
+    window.solve(sliding.settings, workspace, prior.information, active)
+    return window_residual(part, workspace.solution) / rows
 
 
 @inner
@@ -172,16 +172,20 @@ def best_part_residual(
 ) -> float:
     """Return the smallest residual of the parts of a full window, each fitted apart.
 
-    `sliding.work.newer` is the sum of its `newer_rows` newer rows.  Phi, b, the factor
+    `sliding.workspace.newer` is the sum of its `newer_rows` newer rows.  Phi, b, the factor
     and the solution of the whole window are in its scratch again afterwards.
     """
-    whole, newer, older = sliding.state.running, sliding.work.newer, sliding.work.part
+    whole, newer, older = (
+        sliding.state.running,
+        sliding.workspace.newer,
+        sliding.workspace.part,
+    )
     length = sliding.settings.length
     sums.add(whole, -1.0, newer, older)
-    of_older = part_residual(sliding, prior, active, older, length - newer_rows)
-    of_newer = part_residual(sliding, prior, active, newer, newer_rows)
+    older_residual = part_residual(sliding, prior, active, older, length - newer_rows)
+    newer_residual = part_residual(sliding, prior, active, newer, newer_rows)
     part_residual(sliding, prior, active, whole, length)  # for its scratch alone
-    return min(of_older, of_newer)
+    return min(older_residual, newer_residual)
 
 
 @inner
@@ -197,10 +201,10 @@ def split_window(
     They do if one of them, fitted apart, explains its rows better than the window with
     its `residual` by more than the gate.
     """
-    newer = sliding.work.newer
+    newer = sliding.workspace.newer
     rows = window.newer_part(sliding.state, newer)
     best = best_part_residual(sliding, prior, state.active, rows)
-    if residual <= _GATE_RATIO * explained(settings, state.least_residual[0], best):
+    if residual <= _GATE_RATIO * explained(settings, state.min_residual[0], best):
         return False
     state.split_residual[0] = residual
     window.keep_newer(sliding.state, newer, rows)
@@ -211,7 +215,7 @@ def split_window(
 def accept_window(
     settings: Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     sliding: Window,
     prior: Prior,
     model: ArmModel,
@@ -223,29 +227,31 @@ def accept_window(
     anchor: Phi + a R, b + a R theta_anchor, in the scratch of the window.  The inertia
     is that at the position q (n,).
     """
-    now = sliding.work
-    for j in range(now.b.size):
-        now.solution[j] = now.b[j]
-    cholesky_solve(now.factor, now.solution)
+    equations = sliding.workspace
+    for j in range(equations.b.size):
+        equations.solution[j] = equations.b[j]
+    cholesky_solve(equations.factor, equations.solution)
     rows = sliding.state.rows[0]
-    residual = window_residual(sliding.state.running, now.solution) / rows
+    residual = window_residual(sliding.state.running, equations.solution) / rows
     missing = 1.0 - rows / sliding.settings.length
     if is_in_question(settings, state, sliding, residual) and split_window(
         settings, state, sliding, prior, residual
     ):
         return False
-    least = state.least_residual[0]
-    if missing <= 0.0 and (least == 0.0 or residual < least):
-        least = state.least_residual[0] = residual
-    if residual > _GATE_RATIO * explained(settings, least, least):
+    min_residual = state.min_residual[0]
+    if missing <= 0.0 and (min_residual == 0.0 or residual < min_residual):
+        min_residual = state.min_residual[0] = residual
+    if residual > _GATE_RATIO * explained(settings, min_residual, min_residual):
         return False
     pull = settings.anchor_weight * missing
-    pull += _DOUBT_PULL * max(0.0, residual - _USUAL_RATIO * least)
+    pull += _DOUBT_PULL * max(0.0, residual - _USUAL_RATIO * min_residual)
     if pull > 0.0:
-        window.pull_to(state.anchor, pull, prior.information, now.Phi, now.b)
-        window.solve(sliding.settings, now, prior.information, state.active)
-    find_spare_inertia(model, work, q, now.solution, prior.estimate)
-    if not cholesky_factor(work.inertia):
+        window.pull_to(
+            state.anchor, pull, prior.information, equations.Phi, equations.b
+        )
+        window.solve(sliding.settings, equations, prior.information, state.active)
+    find_spare_inertia(model, workspace, q, equations.solution, prior.estimate)
+    if not cholesky_factor(workspace.inertia):
         return False
     keep_solution(state, sliding, residual)
     return True
@@ -254,7 +260,7 @@ def accept_window(
 @inner
 def keep_solution(state: State, sliding: Window, residual: float) -> None:
     """Keep the solution of the window; that of a full one becomes the anchor, once per window."""
-    solution = sliding.work.solution
+    solution = sliding.workspace.solution
     is_first = state.latched[0] == 0.0
     is_due = is_first or window.is_at_start(sliding.settings, sliding.state)
     becomes_anchor = is_due and window.is_full(sliding.settings, sliding.state)
@@ -348,18 +354,18 @@ def has_settled(settings: Settings, sliding: Window, t: float, dt: float) -> boo
     """
     if settings.starts_full == 1 and t < settings.learning_start:
         return False
-    of = sliding.settings
-    period = of.row_interval * dt
-    settling_time = settings.learning_start - of.length * period
+    window_settings = sliding.settings
+    period = window_settings.row_interval * dt
+    settling_time = settings.learning_start - window_settings.length * period
     rows = sliding.state.rows[0]
-    return bool(rows == of.length or rows * period >= settling_time)
+    return bool(rows == window_settings.length or rows * period >= settling_time)
 
 
 @inner
 def update_excitation(
     settings: Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     sliding: Window,
     prior: Prior,
     model: ArmModel,
@@ -373,7 +379,7 @@ def update_excitation(
     """
     if sliding.state.rows[0] == 0.0:
         return
-    first = work.Yp.shape[1]
+    first = workspace.Yp.shape[1]
     learning = has_settled(settings, sliding, t, dt)
     if learning and state.columns_checked[0] == 0.0:
         reject_columns(settings, state, sliding, prior, first)
@@ -381,15 +387,15 @@ def update_excitation(
         readmit_columns(settings, state, sliding, prior, first)
     value = window.find_excitation(sliding, prior, state.active, _WARM)
     state.lambda_min[0] = value
-    of = sliding.settings
-    state.best_lambda[0] *= 1.0 - _LAMBDA_LOST * of.interval / (
-        of.length * of.row_interval
+    window_settings = sliding.settings
+    state.best_lambda[0] *= 1.0 - _LAMBDA_LOST * window_settings.interval / (
+        window_settings.length * window_settings.row_interval
     )
     suffices = value >= settings.excitation_threshold
     if not (learning and suffices and is_preferred(settings, state, value)):
         return
     if settings.change_detection == 1 and not accept_window(
-        settings, state, work, sliding, prior, model, q
+        settings, state, workspace, sliding, prior, model, q
     ):
         return
     latch(state, sliding, value, t)
@@ -398,12 +404,12 @@ def update_excitation(
 @inner
 def latch(state: State, sliding: Window, value: float, t: float) -> None:
     """Latch the window, whose lambda_min is the `value`, at time t [s]."""
-    now = sliding.work
-    for i in range(now.b.size):
-        state.b[i] = now.b[i]
-        for j in range(now.b.size):
-            state.Phi[i, j] = now.Phi[i, j]
-            state.factor[i, j] = now.factor[i, j]
+    equations = sliding.workspace
+    for i in range(equations.b.size):
+        state.b[i] = equations.b[i]
+        for j in range(equations.b.size):
+            state.Phi[i, j] = equations.Phi[i, j]
+            state.factor[i, j] = equations.factor[i, j]
     state.latched[0] = 1.0
     if window.is_full(sliding.settings, sliding.state):
         state.best_lambda[0] = max(value, state.best_lambda[0])

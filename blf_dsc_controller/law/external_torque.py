@@ -48,15 +48,15 @@ _RESTING = 0.005  # `learning.coulomb_velocity`, below which it rests
 # 1/L, for which it still counts as reversing, and does not count as resting
 _AFTER = 3.0
 _SETTLED = 6.0  # 1/L, of rest before a tare
-_LEAST_NOISE = 0.01  # of the mean square of the unmodelled torque
+_MIN_NOISE = 0.01  # of the mean square of the unmodelled torque
 _ASSUMED_WINDOWS = (
     0.01,
     0.1,
     0.1,
 )  # of a window, for which the unmodelled torque counts
 _NOISE_WINDOWS = (1.0, 4.0, 4.0)  # windows, over which the mean square is taken
-_LEAST_FRICTION = (0.0, 0.15, 0.05)  # of Coulomb friction, which is never known better
-_MOST_NOISE = 4.0  # times the mean square: r^2 is clipped at this multiple
+_MIN_FRICTION = (0.0, 0.15, 0.05)  # of Coulomb friction, which is never known better
+_MAX_NOISE = 4.0  # times the mean square: r^2 is clipped at this multiple
 
 _NOISE_STEADY, _NOISE_SLOW, _NOISE_REST = range(
     3
@@ -94,12 +94,12 @@ class State(NamedTuple):
     tare_changes: Cell  # changes of the arm that were found before it
     tare: Annotated[Array, 'n * contact.enabled', 'm + 1']  # its row [X_0 | u_0]
     tare_noise: Annotated[Array, 'n * contact.enabled']  # s_0^2, (N m)^2
-    held: Cell  # w
+    at_tare: Cell  # w
     offset: Annotated[Array, 'n * contact.enabled']  # K r_0, N m
     torque: Annotated[Array, 'n * contact.enabled']  # r - K r_0, N m
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of one sample."""
 
     rows: Annotated[Array, 'n * contact.enabled', 'm']  # X_L, whitened
@@ -183,20 +183,20 @@ def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) ->
 
     dqr (n,) is the velocity of the reference.  Returns whether the arm begins to move.
     """
-    lasts = _AFTER / settings.bandwidth
+    duration = _AFTER / settings.bandwidth
     fastest = 0.0
     for i in range(dqr.size):
         speed = abs(dqr[i])
         fastest = max(fastest, speed)
         is_slow = speed < _REVERSING * settings.coulomb_velocity
-        left = state.reversing[i] - dt
-        state.reversing[i] = lasts if is_slow else max(0.0, left)
+        remaining = state.reversing[i] - dt
+        state.reversing[i] = duration if is_slow else max(0.0, remaining)
     if fastest < _RESTING * settings.coulomb_velocity:
         state.resting[0] += dt
         return False
     begins = state.resting[0] > 0.0
     state.resting[0] = 0.0
-    state.held[0] -= filter_gain(1.0 / settings.bandwidth, dt) * state.held[0]
+    state.at_tare[0] -= filter_gain(1.0 / settings.bandwidth, dt) * state.at_tare[0]
     return bool(begins)
 
 
@@ -209,19 +209,21 @@ def regime(settings: Settings, state: State, i: int) -> int:
 
 
 @inner
-def least_variance(settings: Settings, work: Work, k: int, i: int) -> float:
+def min_variance(settings: Settings, workspace: Workspace, k: int, i: int) -> float:
     """Return the least variance of r of joint i in a regime k [(N m)^2]."""
     floor = settings.unmodelled[i]
-    friction = _LEAST_FRICTION[k] * work.coulomb[i]
-    return float(_LEAST_NOISE * floor * floor + friction * friction)
+    friction = _MIN_FRICTION[k] * workspace.coulomb[i]
+    return float(_MIN_NOISE * floor * floor + friction * friction)
 
 
 @inner
-def variance_of(settings: Settings, state: State, work: Work, i: int) -> float:
+def residual_variance(
+    settings: Settings, state: State, workspace: Workspace, i: int
+) -> float:
     """Return the variance of r - K r_0 of joint i [(N m)^2]."""
     k = regime(settings, state, i)
-    least = least_variance(settings, work, k, i)
-    return float(max(least, state.covariance[i, i] + state.noise[k, i]))
+    minimum = min_variance(settings, workspace, k, i)
+    return float(max(minimum, state.covariance[i, i] + state.noise[k, i]))
 
 
 @inner
@@ -229,7 +231,7 @@ def tare(state: State, changes: float) -> None:
     """Take r for that of an arm that rests and that nothing touches, after so many `changes`."""
     state.tared[0] = 1.0
     state.tare_changes[0] = changes
-    state.held[0] = 1.0
+    state.at_tare[0] = 1.0
     for i in range(state.torque.size):
         for j in range(state.tare.shape[1]):
             state.tare[i, j] = state.filtered[i, j]
@@ -254,18 +256,18 @@ def settling_time(settings: Settings) -> float:
 
 @inner
 def update_spread(
-    settings: Settings, state: State, work: Work, estimate: Array
+    settings: Settings, state: State, workspace: Workspace, estimate: Array
 ) -> None:
     """Compute the covariance of r - K r_0 by theta, the factor of S, and K r_0."""
-    whiten_rows(state, state.filtered, work.rows)
-    fill_products(state, work.rows, work.rows, state.covariance)
+    whiten_rows(state, state.filtered, workspace.rows)
+    fill_products(state, workspace.rows, workspace.rows, state.covariance)
     if state.tared[0] == 1.0:
-        condition_on_tare(settings, state, work, estimate)
+        condition_on_tare(settings, state, workspace, estimate)
     n = state.torque.size
     for i in range(n):
-        for other in range(i, n):
-            state.spread[i, other] = state.covariance[i, other]
-        state.spread[i, i] = variance_of(settings, state, work, i)
+        for j in range(i, n):
+            state.spread[i, j] = state.covariance[i, j]
+        state.spread[i, i] = residual_variance(settings, state, workspace, i)
     cholesky_factor(state.spread)
 
 
@@ -293,52 +295,58 @@ def fill_products(state: State, rows: Array, others: Array, target: Array) -> No
 
 @inner
 def condition_on_tare(
-    settings: Settings, state: State, work: Work, estimate: Array
+    settings: Settings, state: State, workspace: Workspace, estimate: Array
 ) -> None:
     """Take what r_0 says of r from its covariance; compute K r_0."""
     n = state.torque.size
-    whiten_rows(state, state.tare, work.tare_rows)
-    fill_products(state, work.tare_rows, work.tare_rows, work.tare_spread)
-    fill_products(state, work.rows, work.tare_rows, work.shared)
+    whiten_rows(state, state.tare, workspace.tare_rows)
+    fill_products(
+        state, workspace.tare_rows, workspace.tare_rows, workspace.tare_spread
+    )
+    fill_products(state, workspace.rows, workspace.tare_rows, workspace.shared)
     for i in range(n):
         noise = state.noise[regime(settings, state, i), i]
-        own = state.tare_noise[i]
-        work.tare_spread[i, i] += own
-        work.shared[i, i] += state.held[0] * sqrt(own * min(own, noise))
-        work.tare_torque[i] = residual(state.tare[i], estimate)
-    cholesky_factor(work.tare_spread)
-    whiten(work.tare_spread, work.tare_torque)
+        tare_noise = state.tare_noise[i]
+        workspace.tare_spread[i, i] += tare_noise
+        workspace.shared[i, i] += state.at_tare[0] * sqrt(
+            tare_noise * min(tare_noise, noise)
+        )
+        workspace.tare_torque[i] = residual(state.tare[i], estimate)
+    cholesky_factor(workspace.tare_spread)
+    whiten(workspace.tare_spread, workspace.tare_torque)
     for i in range(n):
-        whiten(work.tare_spread, work.shared[i])
+        whiten(workspace.tare_spread, workspace.shared[i])
         state.offset[i] = 0.0
         for k in range(n):
-            state.offset[i] += work.shared[i, k] * work.tare_torque[k]
+            state.offset[i] += workspace.shared[i, k] * workspace.tare_torque[k]
     for i in range(n):
-        for other in range(n):
+        for j in range(n):
             for k in range(n):
-                state.covariance[i, other] -= work.shared[i, k] * work.shared[other, k]
+                state.covariance[i, j] -= (
+                    workspace.shared[i, k] * workspace.shared[j, k]
+                )
 
 
 @inner
-def whiten_torque(state: State, work: Work) -> float:
+def whiten_torque(state: State, workspace: Workspace) -> float:
     """Whiten r by the factor of S; return its length, the distance of r from zero."""
     for i in range(state.torque.size):
-        work.white[i] = state.torque[i]
-    return sqrt(whiten(state.spread, work.white))
+        workspace.white[i] = state.torque[i]
+    return sqrt(whiten(state.spread, workspace.white))
 
 
 @inner
 def is_settled(state: State, dt: float) -> bool:
     """Whether theta^ has settled since the first window, from which on s^2 is measured."""
-    seen = 0.0
+    samples = 0.0
     for k in range(3):
-        seen += state.samples[k, 0]
-    return bool(seen * dt >= _FIRST_TIME)
+        samples += state.samples[k, 0]
+    return bool(samples * dt >= _FIRST_TIME)
 
 
 @inner
 def update_noise(
-    settings: Settings, state: State, work: Work, is_touched: bool
+    settings: Settings, state: State, workspace: Workspace, is_touched: bool
 ) -> None:
     """Update s^2 from the first window on, while nothing touches the arm.
 
@@ -355,8 +363,8 @@ def update_noise(
         if k == _NOISE_REST and state.tared[0] == 1.0:
             continue
         first = _ASSUMED_WINDOWS[k] * window
-        least = 1.0 / (_NOISE_WINDOWS[k] * window)
-        share = max(least, 1.0 / (first + state.samples[k, i]))
-        left = state.torque[i] * state.torque[i] - state.covariance[i, i]
-        noise[i] += share * (clip(left, 0.0, _MOST_NOISE * noise[i]) - noise[i])
-        noise[i] = max(noise[i], least_variance(settings, work, k, i))
+        min_gain = 1.0 / (_NOISE_WINDOWS[k] * window)
+        gain = max(min_gain, 1.0 / (first + state.samples[k, i]))
+        unexplained = state.torque[i] * state.torque[i] - state.covariance[i, i]
+        noise[i] += gain * (clip(unexplained, 0.0, _MAX_NOISE * noise[i]) - noise[i])
+        noise[i] = max(noise[i], min_variance(settings, workspace, k, i))

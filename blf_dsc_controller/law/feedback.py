@@ -37,10 +37,10 @@ class State(NamedTuple):
     """What it keeps from one sample to the next."""
 
     # xi2 behind the lags, rad/s; 0 of a joint without one
-    late: Annotated[Array, 'n * feedback.lags']
+    lagged: Annotated[Array, 'n * feedback.lags']
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     restoring: Annotated[Array, 'n']  # tau_c, by the error: -dV/dxi1, N m
@@ -55,39 +55,39 @@ def advance(
     for i in range(xi2.size):
         if settings.damping_lag[i] > 0.0:
             gain = 1.0 if begins else filter_gain(settings.damping_lag[i], dt)
-            state.late[i] += gain * (xi2[i] - state.late[i])
+            state.lagged[i] += gain * (xi2[i] - state.lagged[i])
 
 
 @inner
-def damped(settings: Settings, state: State, xi2: Array, i: int) -> float:
+def damped_velocity(settings: Settings, state: State, xi2: Array, i: int) -> float:
     """Return what K_p damps of joint i [rad/s]: its xi2, behind the lag if there is one."""
-    return float(state.late[i] if settings.damping_lag[i] > 0.0 else xi2[i])
+    return float(state.lagged[i] if settings.damping_lag[i] > 0.0 else xi2[i])
 
 
 @inner
 def joint_torque(
-    settings: Settings, xi1: float, xi2: float, late: float, layer: float, i: int
+    settings: Settings, xi1: float, xi2: float, lagged: float, layer: float, i: int
 ) -> float:
     """Return the damping and the robust term of joint i [N m].
 
-    `late` [rad/s] is what is `damped`, `layer` is b [rad/s].
+    `lagged` [rad/s] is what is `damped_velocity`, `layer` is b [rad/s].
     """
     robust = settings.robust_gain[i] * abs(xi1)
-    torque = settings.gain[i] * late
+    torque = settings.gain[i] * lagged
     torque += robust * clip(xi2 / layer, -1.0, 1.0)
     return float(-torque)
 
 
 @inner
 def fill_acceleration(
-    settings: Settings, work: Work, wanted: Array, xi2: Array, inertia: Array
+    settings: Settings, workspace: Workspace, wanted: Array, xi2: Array, inertia: Array
 ) -> None:
     """Compute a_f by tau_c, the acceleration that is `wanted` (n,) [rad/s^2], and m.
 
     m is the `inertia` (n,) [kg m^2].
     """
-    out = work.acceleration
+    out = workspace.acceleration
     for i in range(xi2.size):
         out[i] = wanted[i] - settings.damping_rate * xi2[i]
         if settings.follows_inertia == 1:
-            out[i] += work.restoring[i] / inertia[i]
+            out[i] += workspace.restoring[i] / inertia[i]

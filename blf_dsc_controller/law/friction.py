@@ -75,7 +75,7 @@ class State(NamedTuple):
     drift_extremes: Annotated[Array, 2, 'n']
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     sign: Annotated[Array, 'n']  # s(v)
@@ -100,48 +100,52 @@ def is_coulomb(settings: Settings, j: int) -> bool:
 
 @inner
 def coulomb_torque(
-    settings: Settings, state: State, work: Work, learned: float, i: int
+    settings: Settings, state: State, workspace: Workspace, learned: float, i: int
 ) -> float:
     """Return the compensation C(v) s(v) of joint i [N m], with c^ `learned` [N m]."""
     low = learned
     high = learned
     if settings.coulomb == 1:
-        band = settings.reversals.unmodelled[i]
-        shown = state.reversals.shown.coulomb
-        for evidence in (
-            beyond(shown[0, i] - learned, band),
-            beyond(shown[1, i] - learned, band),
-            beyond(state.observer_drift[i], band),
-            beyond(state.drift_extremes[0, i], band),
-            beyond(state.drift_extremes[1, i], band),
+        dead_zone = settings.reversals.unmodelled[i]
+        coulomb = state.reversals.evidence.coulomb
+        for offset in (
+            beyond(coulomb[0, i] - learned, dead_zone),
+            beyond(coulomb[1, i] - learned, dead_zone),
+            beyond(state.observer_drift[i], dead_zone),
+            beyond(state.drift_extremes[0, i], dead_zone),
+            beyond(state.drift_extremes[1, i], dead_zone),
         ):
-            low = min(low, learned + evidence)
-            high = max(high, learned + evidence)
-    scale = 1.0 + state.breakaway[i] * work.stribeck[i]
+            low = min(low, learned + offset)
+            high = max(high, learned + offset)
+    scale = 1.0 + state.breakaway[i] * workspace.stribeck[i]
     level = clip(settings.reversals.initial[i], scale * low, scale * high)
-    return float(level * work.sign[i])
+    return float(level * workspace.sign[i])
 
 
 @inner
 def compensate(
     settings: Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     estimate: Array,
     velocity: float,
     i: int,
 ) -> None:
     """Compute C(v) s(v) of joint i, at the `velocity` v [rad/s]; `estimate` (m,) is theta^."""
     if settings.coulomb == 1:
-        work.sign[i] = sliding(velocity, settings.coulomb_velocity)
-        work.stribeck[i] = fading(velocity, STRIBECK_SPEED)
+        workspace.sign[i] = sliding(velocity, settings.coulomb_velocity)
+        workspace.stribeck[i] = fading(velocity, STRIBECK_SPEED)
         learned = estimate[settings.first_coulomb + i]
-        work.torque[i] = coulomb_torque(settings, state, work, learned, i)
+        workspace.torque[i] = coulomb_torque(settings, state, workspace, learned, i)
 
 
 @inner
 def transfer_learned(
-    settings: Settings, state: State, work: Work, estimate: Array, disturbance: Array
+    settings: Settings,
+    state: State,
+    workspace: Workspace,
+    estimate: Array,
+    disturbance: Array,
 ) -> None:
     """Subtract from d^3 (n,) what this sample has changed in the compensation of Coulomb friction.
 
@@ -151,27 +155,27 @@ def transfer_learned(
         return
     for i in range(disturbance.size):
         learned = estimate[settings.first_coulomb + i]
-        torque = coulomb_torque(settings, state, work, learned, i)
-        disturbance[i] -= torque - work.torque[i]
-        work.torque[i] = torque
+        torque = coulomb_torque(settings, state, workspace, learned, i)
+        disturbance[i] -= torque - workspace.torque[i]
+        workspace.torque[i] = torque
 
 
 @inner
-def follow_observer(state: State, work: Work, i: int, step: float) -> None:
+def follow_observer(state: State, workspace: Workspace, i: int, step: float) -> None:
     """Add a step [N m] of d^3 of joint i by the tracking error to delta, until v crosses zero."""
-    if work.sign[i] * state.direction[i] > 0.0:
+    if workspace.sign[i] * state.direction[i] > 0.0:
         state.observer_drift[i] += step * state.direction[i]
 
 
 @inner
-def follow_motion(settings: Settings, state: State, work: Work) -> None:
+def follow_motion(settings: Settings, state: State, workspace: Workspace) -> None:
     """Find the joints that begin to reverse, and those that have reversed: delta is zero again."""
     if settings.coulomb == 0:
         return
     drift = state.observer_drift
     extremes = state.drift_extremes
     for i in range(drift.size):
-        sign = work.sign[i]
+        sign = workspace.sign[i]
         moves = abs(sign) > _MOVING_SIGN
         if moves and sign * state.direction[i] <= 0.0:
             state.direction[i] = 1.0 if sign > 0.0 else -1.0
@@ -194,9 +198,9 @@ def filter_shapes(settings: Settings, state: State, dq: Array, dt: float) -> Non
         s = sliding(dq[i], settings.coulomb_velocity)
         b = s * fading(dq[i], STRIBECK_SPEED)
         for k in range(2):
-            now = s if k == 0 else b
-            mean = 0.5 * (now + lags[k, 0, i])
-            lags[k, 0, i] = now
+            shape = s if k == 0 else b
+            mean = 0.5 * (shape + lags[k, 0, i])
+            lags[k, 0, i] = shape
             lags[k, 1, i] += gain * (mean - lags[k, 1, i])
             lags[k, 2, i] += gain * (lags[k, 1, i] - lags[k, 2, i])
 
@@ -225,30 +229,30 @@ def high_pass(lags: Array, i: int, gain: float, x: float, begins: bool) -> float
 
 
 @inner
-def unexplained(row: Array, estimate: Array, own: int) -> float:
-    """Return e [N m], what theta^ but for its entry `own` leaves of u in [X | u] (m + 1,)."""
+def unexplained(row: Array, estimate: Array, excluded: int) -> float:
+    """Return e [N m], what theta^ but for its entry `excluded` leaves of u in [X | u] (m + 1,)."""
     e = row[estimate.size]
     for j in range(estimate.size):
-        if j != own:
+        if j != excluded:
             e -= row[j] * estimate[j]
     return float(e)
 
 
 @inner
 def measure_reversals(
-    settings: Settings, state: State, work: Work, begins: bool, dt: float
+    settings: Settings, state: State, workspace: Workspace, begins: bool, dt: float
 ) -> None:
     """Add the last row, `dt` [s] after the one before it, to the sums of the present reversal.
 
-    e (n,) [N m] is `work.unexplained`, of the row behind both poles, unweighted.  What the
+    e (n,) [N m] is `workspace.unexplained`, of the row behind both poles, unweighted.  What the
     high pass leaves is zero where it `begins`.
     """
     gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
     lags = state.column_lags
     reversals.keep(state.reversals, dt)
-    for i in range(work.unexplained.size):
-        e = work.unexplained[i]
+    for i in range(workspace.unexplained.size):
+        e = workspace.unexplained[i]
         s_h = high_pass(lags[0], i, gain, state.shape_lags[0, 2, i], begins)
         b_h = high_pass(lags[1], i, gain, state.shape_lags[1, 2, i], begins)
         e_h = high_pass(state.torque_lags, i, gain, e, begins)
@@ -275,49 +279,53 @@ def return_estimate(
     """Set c^, in theta^ (m,), and k^ to what reversals show, if it is learned and `active` (m,)."""
     if settings.coulomb == 0:
         return
-    of = settings.reversals
-    for i in range(of.initial.size):
+    reversal_settings = settings.reversals
+    for i in range(reversal_settings.initial.size):
         j = settings.first_coulomb + i
         if active[j] == 1.0 and settings.gain[i] > 0.0:
             coulomb, state.breakaway[i] = reversals.learned(
-                of, state.reversals, i, state.breakaway[i]
+                reversal_settings, state.reversals, i, state.breakaway[i]
             )
-            estimate[j] = clip(coulomb, of.least[i], of.most[i])
+            estimate[j] = clip(
+                coulomb, reversal_settings.lower[i], reversal_settings.upper[i]
+            )
 
 
 @inner
 def follow_reversals(
     settings: Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     active: Array,
     estimate: Array,
     rate: Array,
 ) -> None:
-    """Write c - c^ to the entries of Coulomb friction in `rate` (m,), k - k^ to `work`.
+    """Write c - c^ to the entries of Coulomb friction in `rate` (m,), k - k^ to `workspace`.
 
     Entries of theta^ that are not `active` stay.
     """
     if settings.coulomb == 0:
         return
-    of = settings.reversals
-    for i in range(of.initial.size):
+    reversal_settings = settings.reversals
+    for i in range(reversal_settings.initial.size):
         j = settings.first_coulomb + i
-        work.breakaway_error[i] = 0.0
+        workspace.breakaway_error[i] = 0.0
         if active[j] == 0.0:
             continue
         coulomb, stribeck = reversals.learned(
-            of, state.reversals, i, state.breakaway[i]
+            reversal_settings, state.reversals, i, state.breakaway[i]
         )
         rate[j] = coulomb - estimate[j]
-        work.breakaway_error[i] = stribeck - state.breakaway[i]
+        workspace.breakaway_error[i] = stribeck - state.breakaway[i]
 
 
 @inner
-def adapt_breakaway(settings: Settings, state: State, work: Work, dt: float) -> None:
+def adapt_breakaway(
+    settings: Settings, state: State, workspace: Workspace, dt: float
+) -> None:
     """Advance k^ by `dt` [s]: k^' = Gamma kappa (k - k^)."""
     if settings.coulomb == 0:
         return
     for i in range(settings.gain.size):
-        rate = settings.gain[i] * work.breakaway_error[i]
+        rate = settings.gain[i] * workspace.breakaway_error[i]
         state.breakaway[i] += dt * rate

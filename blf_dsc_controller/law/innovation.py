@@ -41,15 +41,15 @@ CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
 LASTING = 2.0  # s, in which a floor of s^2 falls to 1 / e
 MEMORY = 0.1  # s of motion, over which the last rows are averaged
-LATE = 0.15  # s, by which a change of the arm is found
+DETECTION_TIME = 0.15  # s, by which a change of the arm is found
 # times s^2: friction is no noise, and reaches what the noise of a sensor never would
 _ALARM_SQUARE = 8.0
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many
 # rows, and ever less until the mean square is of a window
-_ASSUMED_SHARE, _ASSUMED_ROWS = 0.1, 100.0
+_ASSUMED_FRACTION, _ASSUMED_ROWS = 0.1, 100.0
 # times s^2, as which a row counts: those of a change hardly raise it
-_MOST_SQUARE = 3.0
-_LEAST_SQUARE = 0.001  # of that square, which s^2 is at least
+_MAX_SQUARE = 3.0
+_MIN_SQUARE = 0.001  # of that square, which s^2 is at least
 
 
 class Prior(NamedTuple):
@@ -72,7 +72,7 @@ class State(NamedTuple):
 @inner
 def begin(state: State, unmodelled: float) -> None:
     """Begin, with rows in which a mean square of (N m)^2 is `unmodelled`."""
-    state.noise[0] = _ASSUMED_SHARE * unmodelled
+    state.noise[0] = _ASSUMED_FRACTION * unmodelled
     state.mean[0] = 0.0
     state.rows[0] = 0.0
     forget_recent(state)
@@ -132,39 +132,39 @@ def normalized_square(
 def update(
     state: State,
     square: float,
-    share: float,
+    square_weight: float,
     unmodelled: float,
     period: float,
-    most: float,
+    window_rows: float,
 ) -> bool:
     """Add e^T C^-1 e / n of a row with its share w^2; return whether the arm has changed.
 
-    The mean square is of some `most` moving rows, a window.
+    The mean square is of some `window_rows` moving rows, a window.
     """
-    excess = square - share * state.recent[0]
+    excess = square - square_weight * state.recent[0]
     state.recent[0] += min(1.0, period / MEMORY) * excess
-    has_changed = state.recent[0] > alarm(state, period, most)
-    own = noise_of(state.mean[0], state.rows[0], unmodelled, most)
-    state.rows[0] = min(state.rows[0] + share, most)
+    has_changed = state.recent[0] > alarm(state, period, window_rows)
+    noise = noise_estimate(state.mean[0], state.rows[0], unmodelled, window_rows)
+    state.rows[0] = min(state.rows[0] + square_weight, window_rows)
     if state.rows[0] > 0.0:
-        usual = min(square, _MOST_SQUARE * share * own)
-        state.mean[0] += (usual - share * state.mean[0]) / state.rows[0]
+        clipped = min(square, _MAX_SQUARE * square_weight * noise)
+        state.mean[0] += (clipped - square_weight * state.mean[0]) / state.rows[0]
     state.floor[0] *= 1.0 - period / LASTING
-    own = noise_of(state.mean[0], state.rows[0], unmodelled, most)
-    state.noise[0] = max(own, state.floor[0])
+    noise = noise_estimate(state.mean[0], state.rows[0], unmodelled, window_rows)
+    state.noise[0] = max(noise, state.floor[0])
     return bool(has_changed)
 
 
 @inner
-def alarm(state: State, period: float, most: float) -> float:
+def alarm(state: State, period: float, window_rows: float) -> float:
     """Return the mean square [(N m)^2] that is a change although s^2 may be of few rows.
 
-    It is 8 s^2 where s^2 is of a window, of `most` rows, and more where it is of fewer.
+    It is 8 s^2 where s^2 is of a window, of `window_rows` rows, and more where it is of fewer.
     """
-    rows = state.rows[0] + _ASSUMED_ROWS * (1.0 - state.rows[0] / most)
+    rows = state.rows[0] + _ASSUMED_ROWS * (1.0 - state.rows[0] / window_rows)
     excess = _excess(rows * period / CORRELATION)
-    usual = _excess(most * period / CORRELATION)
-    return float(_ALARM_SQUARE * state.noise[0] * max(1.0, excess / usual))
+    window_excess = _excess(window_rows * period / CORRELATION)
+    return float(_ALARM_SQUARE * state.noise[0] * max(1.0, excess / window_excess))
 
 
 @inner
@@ -180,9 +180,11 @@ def _excess(rows: float) -> float:
 
 
 @inner
-def noise_of(mean: float, count: float, unmodelled: float, most: float) -> float:
+def noise_estimate(
+    mean: float, count: float, unmodelled: float, window_rows: float
+) -> float:
     """Return s^2 by the `mean` square of `count` rows, and what is assumed before any."""
-    assumed_rows = _ASSUMED_ROWS * (1.0 - count / most)
-    share = assumed_rows / (assumed_rows + count)
-    noise = mean + share * (_ASSUMED_SHARE * unmodelled - mean)
-    return max(noise, _LEAST_SQUARE * unmodelled)
+    assumed_rows = _ASSUMED_ROWS * (1.0 - count / window_rows)
+    assumed_fraction = assumed_rows / (assumed_rows + count)
+    noise = mean + assumed_fraction * (_ASSUMED_FRACTION * unmodelled - mean)
+    return max(noise, _MIN_SQUARE * unmodelled)

@@ -26,23 +26,30 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 @inner
 def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Let `load_observer` find r by the row of the last interval, before its poles."""
-    of, now, row = settings.observer, state.observer, signals.row.Xu
-    if now.elapsed[0] == 0.0:
-        load_observer.begin(now, state.disturbance)
+    observer_settings, observer, row = settings.observer, state.observer, signals.row.Xu
+    if observer.elapsed[0] == 0.0:
+        load_observer.begin(observer, state.disturbance)
     if load_observer.is_missing(signals.effort):
         return
-    had_settled = load_observer.has_settled(of, now)
+    had_settled = load_observer.has_settled(observer_settings, observer)
     for i in range(settings.n):
-        load_observer.filter_interval(of, now, i, row[i], signals.effort[i], dt)
-    links = Links(state.estimate, of.rotors, state.motors.absorbed)
+        load_observer.filter_interval(
+            observer_settings, observer, i, row[i], signals.effort[i], dt
+        )
+    links = Links(state.estimate, observer_settings.rotors, state.motors.absorbed)
     load_observer.update(
-        of, now, signals.scratch.observer, links, settings.information, dt
+        observer_settings,
+        observer,
+        signals.scratch.observer,
+        links,
+        settings.information,
+        dt,
     )
-    motor_friction.pass_poles(settings.motors, state.motors, now.late, dt)
+    motor_friction.pass_poles(settings.motors, state.motors, observer.lagged, dt)
     torque_sensors.follow_applied(
-        state.sensors, row, settings.m, of.observer_bandwidth, dt
+        state.sensors, row, settings.m, observer_settings.observer_bandwidth, dt
     )
-    if load_observer.has_settled(of, now):
+    if load_observer.has_settled(observer_settings, observer):
         check_sensors(settings, state, signals, not had_settled, dt)
 
 
@@ -51,17 +58,17 @@ def check_sensors(
     settings: Settings, state: State, signals: Signals, begins: bool, dt: float
 ) -> None:
     """Fade r out where it oscillates, or efforts are not those of torque sensors."""
-    of, now, work = state.observer, state.sensors, signals.sensors
+    observer, sensors, workspace = state.observer, state.sensors, signals.sensors
     limit = settings.torque.limit
     for i in range(settings.n):
-        work.differences[i] = of.filtered[i, settings.p] - now.command[i]
+        workspace.differences[i] = observer.filtered[i, settings.p] - sensors.command[i]
     if begins:
-        torque_sensors.begin(now, of.torque)
-    torque_sensors.watch_shaking(now, work, limit, of.torque, dt)
+        torque_sensors.begin(sensors, observer.torque)
+    torque_sensors.watch_oscillation(sensors, workspace, limit, observer.torque, dt)
     is_off = torque_sensors.watch_following(
-        now, work, limit, signals.dq, signals.dqr, dt
+        sensors, workspace, limit, signals.dq, signals.dqr, dt
     )
-    torque_sensors.fade(now, of.faded, is_off, dt)
+    torque_sensors.fade(sensors, observer.faded, is_off, dt)
 
 
 @inner
@@ -77,15 +84,17 @@ def shows_friction(settings: Settings, state: State) -> bool:
 @inner
 def add_friction_row(settings: Settings, state: State, signals: Signals) -> None:
     """Add the row to those that show the friction of the motors, unless a sensor is silent."""
-    of, now, row = settings.motors, state.motors, signals.row.Xu
+    motor_settings, motors, row = settings.motors, state.motors, signals.row.Xu
     if load_observer.is_missing(signals.effort):
         return
-    moving = prediction.moving_share(signals.dqr, settings.row.motion_scale)
-    share = motor_friction.fade(of, now, moving)
+    square_weight = prediction.mean_square_weight(
+        signals.dqr, settings.row.motion_scale
+    )
+    gain = motor_friction.fade(motor_settings, motors, square_weight)
     for i in range(settings.n):
         weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        g = motor_friction.friction_of_row(
-            now,
+        g = motor_friction.row_friction(
+            motors,
             row,
             weight,
             i,
@@ -93,17 +102,21 @@ def add_friction_row(settings: Settings, state: State, signals: Signals) -> None
             settings.initial_estimate,
             state.estimate,
         )
-        motor_friction.add_row(now, row, i, g, share)
+        motor_friction.add_row(motors, row, i, g, gain)
 
 
 @inner
 def transfer_learned(settings: Settings, state: State, H: Array, before: Array) -> None:
     """Let d^3 take what r gives up by the change of theta^ since `before` (m,); H is (n, m)."""
-    of, now, d3 = settings.observer, state.observer, state.disturbance
-    links = Links(state.estimate, of.rotors, state.motors.absorbed)
-    earlier = Links(before, of.rotors, state.motors.absorbed)
-    load_observer.transfer_learned(of, now, d3, links, earlier)
-    load_observer.hand_over(of, now, d3, H, links, earlier)
+    observer_settings, observer, d3 = (
+        settings.observer,
+        state.observer,
+        state.disturbance,
+    )
+    links = Links(state.estimate, observer_settings.rotors, state.motors.absorbed)
+    earlier = Links(before, observer_settings.rotors, state.motors.absorbed)
+    load_observer.transfer_learned(observer_settings, observer, d3, links, earlier)
+    load_observer.hand_over(observer_settings, observer, d3, H, links, earlier)
 
 
 @inner
@@ -111,13 +124,15 @@ def follow_absorbed(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Let P_f follow, as P^ does; d^3 takes what r loses."""
-    now, work = state.motors, signals.scratch.motors
-    of, rotors = settings.adaptation, settings.observer.rotors
-    motor_friction.follow(now, work, of.weight, of.adaptation_gain, dt)
+    motors, workspace = state.motors, signals.scratch.motors
+    adaptation, rotors = settings.adaptation, settings.observer.rotors
+    motor_friction.follow(
+        motors, workspace, adaptation.weight, adaptation.adaptation_gain, dt
+    )
     load_observer.transfer_learned(
         settings.observer,
         state.observer,
         state.disturbance,
-        Links(state.estimate, rotors, now.absorbed),
-        Links(state.estimate, rotors, work.before),
+        Links(state.estimate, rotors, motors.absorbed),
+        Links(state.estimate, rotors, workspace.before),
     )

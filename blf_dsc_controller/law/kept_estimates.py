@@ -22,7 +22,7 @@ class State(NamedTuple):
     moved: Annotated[Array, 'm + n']  # of when a joint last moved
     consistent: Annotated[Array, 'm + n']  # from before the error grew
     # |xi1| / k of the sample that `consistent` is of, relaxed since
-    least_ratio: Cell
+    min_ratio: Cell
 
 
 @inner
@@ -59,11 +59,11 @@ def keep_consistent(
 
     `is_sound`: the arm does not oscillate, and r of `load_observer` is not in doubt.
     """
-    least = state.least_ratio[0] * (1.0 + dt / _RELAXED)
-    least = max(_SMALL, least)
-    if (ratio > least or not is_sound) and not begins:
-        state.least_ratio[0] = least
+    threshold = state.min_ratio[0] * (1.0 + dt / _RELAXED)
+    threshold = max(_SMALL, threshold)
+    if (ratio > threshold or not is_sound) and not begins:
+        state.min_ratio[0] = threshold
         return
-    state.least_ratio[0] = ratio
+    state.min_ratio[0] = ratio
     for j in range(state.kept.size):
         state.consistent[j] = state.kept[j]

@@ -35,19 +35,21 @@ def for_kernels(
     return called(law, settings, state, signals)
 
 
-def with_gains(given: Law | CalledLaw, law: Law) -> Law | CalledLaw:
+def with_gains(kernel_law: Law | CalledLaw, law: Law) -> Law | CalledLaw:
     """Return what kernels get with the gains of a law of the same type."""
-    return given.with_gains(law) if isinstance(given, CalledLaw) else law
+    return kernel_law.with_gains(law) if isinstance(kernel_law, CalledLaw) else law
 
 
-def for_law(compiled: Callable[..., Any], given: Law | CalledLaw) -> Callable[..., Any]:
+def for_law(
+    compiled: Callable[..., Any], kernel_law: Law | CalledLaw
+) -> Callable[..., Any]:
     """Return a kernel for a law of `for_kernels`: the same, or compiled with that law.
 
     Its compilation raises BlfDscError where the law of a file cannot be compiled.
     """
-    if isinstance(given, (BlfDsc, CalledLaw)):
+    if isinstance(kernel_law, (BlfDsc, CalledLaw)):
         return compiled
-    return _compiled_with(compiled, type(given))
+    return _compiled_with(compiled, type(kernel_law))
 
 
 @functools.cache

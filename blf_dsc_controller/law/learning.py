@@ -108,29 +108,29 @@ def fill_columns(settings: Settings, signals: Signals, t: float) -> None:
 
     The row's torque has passed the velocity filter, half of the lag, but positions have not.
     """
-    of = settings.columns
+    column_settings = settings.columns
     for i in range(settings.n):
         q, dq = signals.q[i], signals.dq[i]
         position = q - 0.5 * settings.row.lag * dq
-        sign = sliding(dq, of.coulomb_velocity)
+        sign = sliding(dq, column_settings.coulomb_velocity)
         at = columns.Point(t, position, dq, sign, signals.gear_torque[i])
-        columns.fill(of, columns.ALL, i, at, signals.row.Yr)
+        columns.fill(column_settings, columns.ALL, i, at, signals.row.Yr)
 
 
 @inner
 def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
     """Form the row of the last interval."""
-    of, now, work = settings.row, state.row, signals.row
+    row_settings, row_state, row = settings.row, state.row, signals.row
     if state.samples[0] > 0.0:
         begins = state.samples[0] <= 1.0
-        prediction.delay_torque(of, now, signals.applied, begins, dt)
-        prediction.fill_interval(now, work, dt)
+        prediction.delay_torque(row_settings, row_state, signals.applied, begins, dt)
+        prediction.fill_interval(row_state, row, dt)
         if settings.observer.enabled == 1:
             joint_sensors.observe_load(settings, state, signals, dt)
         if settings.contact.enabled == 1:
             filter_external_torque(settings, state, signals, dt)
-        prediction.pass_poles(of, now, work, signals.dqr, dt)
-    prediction.keep_regressors(now, work)
+        prediction.pass_poles(row_settings, row_state, row, signals.dqr, dt)
+    prediction.keep_regressors(row_state, row)
 
 
 @inner
@@ -170,7 +170,7 @@ def measure_reversals(
         settling_time = settings.excitation.learning_start - length * period
         is_known = (
             settings.excitation.change_detection == 0
-            or latch.least_residual[0] > 0.0
+            or latch.min_residual[0] > 0.0
             or rows >= 0.5 * length
         )
         begins = since_latch <= settling_time or not is_known
@@ -186,13 +186,13 @@ def fill_unexplained(settings: Settings, state: State, signals: Signals) -> None
     senses = joint_sensors.shows_friction(settings, state)
     rotors = settings.observer.rotors
     for i in range(settings.n):
-        row, own = state.row.filter2[i], settings.friction.first_coulomb + i
+        row, excluded = state.row.filter2[i], settings.friction.first_coulomb + i
         if senses:
             e = motor_friction.unexplained(
-                state.motors, row, i, rotors, state.estimate, own
+                state.motors, row, i, rotors, state.estimate, excluded
             )
         else:
-            e = friction.unexplained(row, state.estimate, own)
+            e = friction.unexplained(row, state.estimate, excluded)
         signals.friction.unexplained[i] = e
 
 
@@ -206,7 +206,7 @@ def detect_change(
     window was latched before it was full, the estimate returns to the one before;
     of friction, only what reversals have shown of late is taken back.
     """
-    of, latch, row = settings.excitation, state.latch, signals.row.Xu
+    excitation_settings, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.prior_mean, settings.row_information)
     if change.is_predicted(sliding):
@@ -216,14 +216,14 @@ def detect_change(
             sliding,
             prior,
             row,
-            prediction.moving_share(signals.dqr, settings.row.motion_scale),
-            of.residual_floor / settings.n,
+            prediction.mean_square_weight(signals.dqr, settings.row.motion_scale),
+            excitation_settings.residual_floor / settings.n,
             int(state.samples[0]),
             dt,
         )
     else:
         has_changed = change.compare_with_solution(
-            of, state.change, signals.scratch.change, latch, row, dt
+            excitation_settings, state.change, signals.scratch.change, latch, row, dt
         )
     is_announced = state.change.announced[0] == 1.0
     if not (has_changed or is_announced):
@@ -299,9 +299,9 @@ def adapt_estimate(
     estimate.  While a full window is not excited, as at standstill, H^T xi2 is
     correlated noise and ignored (`change_detection`).
     """
-    of, work = settings.adaptation, signals.scratch.adaptation
+    adaptation_settings, workspace = settings.adaptation, signals.scratch.adaptation
     latch, estimate, H = state.latch, state.estimate, signals.H
-    adaptation.fill_newton_step(work, latch, estimate)
+    adaptation.fill_newton_step(workspace, latch, estimate)
     if latch.latched[0] == 1.0:
         friction.follow_reversals(
             settings.friction,
@@ -309,7 +309,7 @@ def adapt_estimate(
             signals.friction,
             latch.active,
             estimate,
-            work.rate,
+            workspace.rate,
         )
         if joint_sensors.shows_friction(settings, state):
             motor_friction.follow_columns(
@@ -317,7 +317,7 @@ def adapt_estimate(
                 settings.initial_estimate,
                 latch.active,
                 estimate,
-                work.rate,
+                workspace.rate,
             )
     unexcited = (
         settings.excitation.change_detection == 1
@@ -325,11 +325,13 @@ def adapt_estimate(
         and latch.lambda_min[0] < settings.excitation.excitation_threshold
     )
     tracks = not saturated and not unexcited
-    adaptation.adapt(of, work, estimate, H, signals.xi2, settings.p, tracks, dt)
+    adaptation.adapt(
+        adaptation_settings, workspace, estimate, H, signals.xi2, settings.p, tracks, dt
+    )
     if not saturated:
         follow_disturbance(settings, state, signals, dt)
     if latch.latched[0] == 1.0:
-        transfer_learned(settings, state, signals, work.tracked)
+        transfer_learned(settings, state, signals, workspace.tracked)
         if settings.observer.enabled == 1:
             joint_sensors.follow_absorbed(settings, state, signals, dt)
         friction.adapt_breakaway(
@@ -355,15 +357,17 @@ def follow_disturbance(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
     """Advance d^3 by `dt` [s]: (30), with gamma M(q, P^(0)) / m if the feedback acts through it."""
-    work = signals.scratch.disturbance
+    workspace = signals.scratch.disturbance
     disturbance.fill_step(
-        settings.disturbance, work, state.disturbance, signals.xi2, dt
+        settings.disturbance, workspace, state.disturbance, signals.xi2, dt
     )
     if settings.feedback.follows_inertia == 1:
-        scale_by_inertia(settings, signals, work.step)
+        scale_by_inertia(settings, signals, workspace.step)
     for i in range(settings.n):
-        state.disturbance[i] -= work.step[i]
-        friction.follow_observer(state.friction, signals.friction, i, -work.step[i])
+        state.disturbance[i] -= workspace.step[i]
+        friction.follow_observer(
+            state.friction, signals.friction, i, -workspace.step[i]
+        )
 
 
 @inner

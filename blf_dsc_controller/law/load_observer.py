@@ -47,13 +47,13 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 _SETTLING_TIMES = 4.0  # 1/L, until r is that of the arm
 _BIAS_RELEASE = 10.0  # 1/L, in which a plausible bias fades
 _PRIOR_SIGMAS = 3.0  # of what the prior explains
-_MOST_LOAD = 0.5  # of the torque limit
+_MAX_LOAD = 0.5  # of the torque limit
 _STEADY_TIME = 0.02  # s: oscillations have 8 Hz or more
 
 
-def most_load(limit: Array) -> Array:
+def max_load_torque(limit: Array) -> Array:
     """Return the largest |r| (n,) [N m] with a torque limit (n,) [N m]."""
-    return _MOST_LOAD * limit
+    return _MAX_LOAD * limit
 
 
 class Settings(NamedTuple):
@@ -62,7 +62,7 @@ class Settings(NamedTuple):
     enabled: int  # 1: there are joint torque sensors, which are used
     observer_bandwidth: float  # L, rad/s
     sensor_lag: float  # of velocities, which the torque waits for, s
-    most: Annotated[Array, 'n']  # largest |r|, N m
+    max_torque: Annotated[Array, 'n']  # largest |r|, N m
     unmodelled: Annotated[Array, 'n']  # rms torque that no column describes, N m
     # what the assumed rotors add to P^, kg m^2
     rotors: Annotated[Array, 'p * observer.enabled']
@@ -82,7 +82,7 @@ class State(NamedTuple):
     torque: Annotated[Array, 'n * observer.enabled']  # r, N m
     # r without what oscillates, which a stop may hold, N m
     steady: Annotated[Array, 'n * observer.enabled']
-    late: Annotated[Array, 'n * observer.enabled']  # tau_J behind the lag, N m
+    lagged: Annotated[Array, 'n * observer.enabled']  # tau_J behind the lag, N m
     filtered: Annotated[Array, 'n * observer.enabled', 'p + 1']  # [X_L | tau_J,L]
     bias: Annotated[Array, 'n * observer.enabled']  # N m
     # 1: it stays
@@ -95,7 +95,7 @@ class State(NamedTuple):
     handover: Annotated[Array, 'n * observer.enabled']
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of one sample."""
 
     factor: Annotated[Array, 'm * observer.enabled', 'm']  # of R
@@ -123,14 +123,14 @@ def filter_interval(
 ) -> None:
     """Pass X of `row` and the sensed `effort` [N m] of joint i in an interval through L."""
     passes = state.elapsed[0] == 0.0 or settings.sensor_lag == 0.0
-    share = 1.0 if passes else filter_gain(settings.sensor_lag, dt)
-    state.late[i] += share * (effort - state.late[i])
-    gain = filter_gain(1.0 / settings.observer_bandwidth, dt)
+    gain = 1.0 if passes else filter_gain(settings.sensor_lag, dt)
+    state.lagged[i] += gain * (effort - state.lagged[i])
+    pole_gain = filter_gain(1.0 / settings.observer_bandwidth, dt)
     filtered = state.filtered[i]
     p = filtered.size - 1
     for j in range(p):
-        filtered[j] += gain * (row[j] - filtered[j])
-    filtered[p] += gain * (state.late[i] - filtered[p])
+        filtered[j] += pole_gain * (row[j] - filtered[j])
+    filtered[p] += pole_gain * (state.lagged[i] - filtered[p])
 
 
 @inner
@@ -146,26 +146,27 @@ def residual(state: State, i: int, links: Links) -> float:
 
 
 @inner
-def load_torque(settings: Settings, state: State, i: int, shown: float) -> float:
-    """Return r of joint i [N m] for what is `shown` beyond the model and the bias [N m]."""
+def load_torque(settings: Settings, state: State, i: int, observed: float) -> float:
+    """Return r of joint i [N m] for what is `observed` beyond the model and the bias [N m]."""
     if not has_settled(settings, state):
         return 0.0
-    most = settings.most[i] + state.over[i]
-    return float((1.0 - state.faded[0]) * clip(shown, -most, most))
+    max_torque = settings.max_torque[i] + state.over[i]
+    return float((1.0 - state.faded[0]) * clip(observed, -max_torque, max_torque))
 
 
 @inner
 def take_over(
-    settings: Settings, state: State, i: int, shown: float, before: float
+    settings: Settings, state: State, i: int, observed: float, observed_before: float
 ) -> None:
     """Let r go beyond its largest by what is learned no longer.
 
-    Beyond the model and the bias `shown` [N m] are seen, and `before` [N m] with what was learned.
+    `observed` [N m] is the torque beyond the model and the bias, and `observed_before` [N m] the
+    same with the estimate of before.
     """
     takes_over = has_settled(settings, state) and state.faded[0] == 0.0
-    taken = abs(shown) - abs(before)
+    taken = abs(observed) - abs(observed_before)
     if takes_over and taken > 0.0:
-        beyond = abs(shown) - settings.most[i]
+        beyond = abs(observed) - settings.max_torque[i]
         state.over[i] = clip(beyond, 0.0, state.over[i] + taken)
 
 
@@ -173,7 +174,7 @@ def take_over(
 def update(
     settings: Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     links: Links,
     information: Array,
     dt: float,
@@ -186,45 +187,49 @@ def update(
     before = state.elapsed[0]
     state.elapsed[0] = before + dt
     if before < settling <= state.elapsed[0]:
-        find_bias(settings, state, work, links, information)
+        find_bias(settings, state, workspace, links, information)
     release_bias(settings, state, dt)
-    passed = filter_gain(1.0 / settings.observer_bandwidth, dt)
-    steadied = filter_gain(_STEADY_TIME, dt)
+    gain = filter_gain(1.0 / settings.observer_bandwidth, dt)
+    steady_gain = filter_gain(_STEADY_TIME, dt)
     for i in range(state.torque.size):
-        state.handover[i] -= passed * state.handover[i]
-        shown = residual(state, i, links) - state.bias[i]
-        state.over[i] = clip(abs(shown) - settings.most[i], 0.0, state.over[i])
-        r = load_torque(settings, state, i, shown)
+        state.handover[i] -= gain * state.handover[i]
+        observed = residual(state, i, links) - state.bias[i]
+        state.over[i] = clip(abs(observed) - settings.max_torque[i], 0.0, state.over[i])
+        r = load_torque(settings, state, i, observed)
         state.torque[i] = r + state.handover[i]
-        state.steady[i] += steadied * (state.torque[i] - state.steady[i])
+        state.steady[i] += steady_gain * (state.torque[i] - state.steady[i])
 
 
 @inner
 def release_bias(settings: Settings, state: State, dt: float) -> None:
     """Let the bias fade where it is not kept."""
-    share = filter_gain(_BIAS_RELEASE / settings.observer_bandwidth, dt)
+    gain = filter_gain(_BIAS_RELEASE / settings.observer_bandwidth, dt)
     for i in range(state.bias.size):
         if state.keeps_bias[i] == 0.0:
-            state.bias[i] -= share * state.bias[i]
+            state.bias[i] -= gain * state.bias[i]
 
 
 @inner
 def find_bias(
-    settings: Settings, state: State, work: Work, links: Links, information: Array
+    settings: Settings,
+    state: State,
+    workspace: Workspace,
+    links: Links,
+    information: Array,
 ) -> None:
     """Subtract what the sensors show at the start; keep it where the prior does not explain it."""
     m = information.shape[0]
     for j in range(m):
         for k in range(j, m):
-            work.factor[j, k] = information[j, k]
-    cholesky_factor(work.factor)
+            workspace.factor[j, k] = information[j, k]
+    cholesky_factor(workspace.factor)
     p = state.filtered.shape[1] - 1
     for i in range(state.bias.size):
         state.bias[i] = residual(state, i, links)
         for j in range(m):
-            work.row[j] = state.filtered[i, j] if j < p else 0.0
+            workspace.row[j] = state.filtered[i, j] if j < p else 0.0
         f = settings.unmodelled[i]
-        variance = whiten(work.factor, work.row) + f * f
+        variance = whiten(workspace.factor, workspace.row) + f * f
         if abs(state.bias[i]) > _PRIOR_SIGMAS * sqrt(variance):
             state.keeps_bias[i] = 1.0
 
@@ -250,13 +255,13 @@ def transfer_learned(
 ) -> None:
     """Add to d^3, the `disturbance` (n,) [N m], what r has given up since the links `before`."""
     for i in range(state.torque.size):
-        was = residual(state, i, before) - state.bias[i]
-        shown = residual(state, i, links) - state.bias[i]
-        given_up = load_torque(settings, state, i, was)
-        take_over(settings, state, i, shown, was)
-        given_up -= load_torque(settings, state, i, shown)
-        disturbance[i] += given_up
-        state.steady[i] -= given_up
+        observed_before = residual(state, i, before) - state.bias[i]
+        observed = residual(state, i, links) - state.bias[i]
+        transferred = load_torque(settings, state, i, observed_before)
+        take_over(settings, state, i, observed, observed_before)
+        transferred -= load_torque(settings, state, i, observed)
+        disturbance[i] += transferred
+        state.steady[i] -= transferred
 
 
 def expect(settings: Settings, state: State, change: Array) -> None:
@@ -265,8 +270,8 @@ def expect(settings: Settings, state: State, change: Array) -> None:
     It fades with L, as r would catch up, whether or not the load comes.
     """
     if state.torque.size and has_settled(settings, state):
-        given_up = state.filtered[:, : change.size] @ change
-        state.handover[:] += (1.0 - state.faded[0]) * given_up
+        transferred = state.filtered[:, : change.size] @ change
+        state.handover[:] += (1.0 - state.faded[0]) * transferred
 
 
 @inner
@@ -287,11 +292,11 @@ def hand_over(
         return
     p = state.filtered.shape[1] - 1
     for i in range(state.torque.size):
-        late = 0.0
+        lag_error = 0.0
         for j in range(p):
             change = links.estimate[j] - before.estimate[j]
-            late += (H[i, j] - state.filtered[i, j]) * change
-        late *= 1.0 - state.faded[0]
-        disturbance[i] += late
-        state.handover[i] -= late
-        state.steady[i] -= late
+            lag_error += (H[i, j] - state.filtered[i, j]) * change
+        lag_error *= 1.0 - state.faded[0]
+        disturbance[i] += lag_error
+        state.handover[i] -= lag_error
+        state.steady[i] -= lag_error

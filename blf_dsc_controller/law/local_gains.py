@@ -28,7 +28,9 @@ from blf_dsc_controller.law.surface import virtual_slope
 
 
 @inner
-def stiffness_of(settings: Settings, signals: Signals, i: int, damping: float) -> float:
+def joint_stiffness(
+    settings: Settings, signals: Signals, i: int, damping: float
+) -> float:
     """Return the stiffness [N m/rad] of joint i, whose damping is known."""
     wall, surface = settings.barrier, settings.surface
     xi, bound = signals.xi1[i], signals.bound[i]
@@ -49,7 +51,7 @@ def fill_local_gains(
     feedback = settings.feedback
     for i in range(settings.n):
         damping = feedback.gain[i] + feedback.damping_rate * settings.joint_inertia[i]
-        gains[0, i] = stiffness_of(settings, signals, i, damping)
+        gains[0, i] = joint_stiffness(settings, signals, i, damping)
         gains[1, i] = damping
 
 
@@ -85,7 +87,7 @@ class LocalGains:
         )
         self._fill = direct(fill_local_gains, *self._arguments)
 
-    def now(self) -> Array:
+    def evaluate(self) -> Array:
         """Return stiffness [N m/rad] and damping [N m s/rad] (2, n) of the last sample.
 
         The next call overwrites them.

@@ -61,18 +61,18 @@ def mistake_in(law: type, text: str) -> str:
     file = Path(str(sys.modules[law.__module__].__file__))
     source = ast.parse(file.read_bytes())
     places = [
-        each
-        for each in _PLACE.finditer(text)
-        if Path(each['file'] or each['at']).name == file.name
+        place
+        for place in _PLACE.finditer(text)
+        if Path(place['file'] or place['at']).name == file.name
     ]
     inner = text[: places[0].start()] if places else text  # the innermost comes first
-    found = [
+    errors = [
         (match.start(), rule, match)
         for pattern, rule in _RULES.items()
         for match in re.finditer(pattern, inner)
     ]
-    if found:
-        _, rule, match = max(found, key=lambda each: each[0])
+    if errors:
+        _, rule, match = max(errors, key=lambda error: error[0])
         mistake, line = rule(law, source, match)
     else:
         mistake, line = f'it cannot be compiled: {inner.strip().splitlines()[0]}', None

@@ -42,7 +42,7 @@ class Settings(NamedTuple):
     filter_pole: float  # of both poles of a row, rad/s
     length: int  # rows in a window
     period: float  # T, s
-    least_weight: float  # of R, on means over the rows
+    min_weight: float  # of R, on means over the rows
 
 
 class State(NamedTuple):
@@ -60,7 +60,7 @@ class State(NamedTuple):
     absorbed: Annotated[Array, 'p * observer.enabled']  # P_f, which follows it
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of one sample."""
 
     factor: Annotated[Array, 'motors.size * observer.enabled', 'motors.size']
@@ -85,25 +85,25 @@ def forget(state: State) -> None:
 
 
 @inner
-def fade(settings: Settings, state: State, moving: float) -> float:
-    """Let the means fade by one row, whose joints have the mean square weight `moving`.
+def fade(settings: Settings, state: State, square_weight: float) -> float:
+    """Let the means fade by one row, whose joints have the mean square weight `square_weight`.
 
     Return its share of them.
     """
-    most = _MEAN_WINDOWS * settings.length
-    state.rows[0] = min(state.rows[0] + moving, most)
-    share = 1.0 / (_EMPTY_ROWS * most + state.rows[0])
-    kept = 1.0 - moving * share
-    state.square[0] *= kept
+    max_rows = _MEAN_WINDOWS * settings.length
+    state.rows[0] = min(state.rows[0] + square_weight, max_rows)
+    gain = 1.0 / (_EMPTY_ROWS * max_rows + state.rows[0])
+    retained = 1.0 - square_weight * gain
+    state.square[0] *= retained
     for a in range(state.b.size):
-        state.b[a] *= kept
+        state.b[a] *= retained
         for b in range(a, state.b.size):
-            state.Phi[a, b] *= kept
-    return float(share)
+            state.Phi[a, b] *= retained
+    return float(gain)
 
 
 @inner
-def friction_of_row(
+def row_friction(
     state: State,
     row: Array,
     weight: float,
@@ -127,9 +127,9 @@ def friction_of_row(
 
 @inner
 def unexplained(
-    state: State, row: Array, i: int, rotors: Array, estimate: Array, own: int
+    state: State, row: Array, i: int, rotors: Array, estimate: Array, excluded: int
 ) -> float:
-    """Return e of joint i [N m], what P_f and d^, but for entry `own` of theta^, leave of g.
+    """Return e of joint i [N m], what P_f and d^, but for entry `excluded` of theta^, leave of g.
 
     `row` [X | D | u] (m + 1,) is unweighted, theta^ the `estimate` (m,), P_r are `rotors` (p,).
     """
@@ -138,34 +138,36 @@ def unexplained(
     for j in range(rotors.size):
         e -= row[j] * (rotors[j] + state.absorbed[j])
     for j in range(rotors.size, m):
-        if j != own:
+        if j != excluded:
             e -= row[j] * estimate[j]
     return float(e)
 
 
 @inner
-def add_row(state: State, row: Array, i: int, g: float, share: float) -> None:
+def add_row(state: State, row: Array, i: int, g: float, gain: float) -> None:
     """Add the row of joint i with its g - D d_0 [N m] to the means."""
     size = state.b.size
-    state.square[0] += share * g * g
+    state.square[0] += gain * g * g
     for a in range(size):
-        scaled = share * row[i, a]
+        scaled = gain * row[i, a]
         state.b[a] += scaled * g
         for b in range(a, size):
             state.Phi[a, b] += scaled * row[i, b]
 
 
 @inner
-def solve(settings: Settings, state: State, work: Work, information: Array) -> None:
+def solve(
+    settings: Settings, state: State, workspace: Workspace, information: Array
+) -> None:
     """Solve for P_f and d; the `information` (m, m) is R.  s^2 is that of the last solution."""
     duration = max(state.rows[0], 1.0) * settings.period
-    weight = max(settings.least_weight, state.residual[0] * CORRELATION / duration)
+    weight = max(settings.min_weight, state.residual[0] * CORRELATION / duration)
     for a in range(state.b.size):
         state.solution[a] = state.b[a]
         for b in range(a, state.b.size):
-            work.factor[a, b] = state.Phi[a, b] + weight * information[a, b]
-    cholesky_factor(work.factor)
-    cholesky_solve(work.factor, state.solution)
+            workspace.factor[a, b] = state.Phi[a, b] + weight * information[a, b]
+    cholesky_factor(workspace.factor)
+    cholesky_solve(workspace.factor, state.solution)
     state.residual[0] = mean_residual(state)
 
 
@@ -183,15 +185,17 @@ def mean_residual(state: State) -> float:
 
 
 @inner
-def follow(state: State, work: Work, weight: float, gain: Array, dt: float) -> None:
+def follow(
+    state: State, workspace: Workspace, weight: float, gain: Array, dt: float
+) -> None:
     """Let P_f follow its solution for `dt` [s], at the rate of P^: `weight` times `gain` (m,).
 
     What it was before is left in the scratch.
     """
     for j in range(state.absorbed.size):
-        work.before[j] = state.absorbed[j]
-        missing = state.solution[j] - state.absorbed[j]
-        state.absorbed[j] += dt * weight * gain[j] * missing
+        workspace.before[j] = state.absorbed[j]
+        error = state.solution[j] - state.absorbed[j]
+        state.absorbed[j] += dt * weight * gain[j] * error
 
 
 @inner

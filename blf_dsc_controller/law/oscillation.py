@@ -52,7 +52,7 @@ _LOWEST_FREQUENCY = 8.0  # Hz
 _TIME_CONSTANT = 0.5 / (pi * _LOWEST_FREQUENCY)  # s, of the lags
 _LONGEST_HALF_WAVE = 0.5 / _LOWEST_FREQUENCY  # s, half period
 _FAST_FREQUENCY = 20.0  # Hz, from which a velocity may lag far behind its positions
-_LEAST_AMPLITUDE = 0.05  # of the torque limit, amplitude of its torque
+_MIN_AMPLITUDE = 0.05  # of the torque limit, amplitude of its torque
 _TURNED_BACK = 0.25  # of a half wave, by which p turns back at its end
 # a half wave that is longer is one of the arm: standard deviations of the sensor's
 # noise, which the loop makes larger, and steps of the sensor
@@ -92,7 +92,7 @@ class State(NamedTuple):
 
 @inner
 def watch(
-    now: State,
+    state: State,
     limit: Array,
     error: Array,
     torque: Array,
@@ -105,160 +105,166 @@ def watch(
     `limit` (n,) [N m] are those of the torques; `noise` [rad^2] is the mean square of
     the sensor's noise, `resolution` [rad] its step.
     """
-    share = filter_gain(_TIME_CONSTANT, dt)
+    gain = filter_gain(_TIME_CONSTANT, dt)
     for i in range(limit.size):
-        first = error[i] - now.slow[0, i]
-        now.slow[0, i] += share * first
-        p = first - now.slow[1, i]
-        now.slow[1, i] += share * p
-        u = torque[i] - now.torque[i]
-        now.torque[i] += share * u
-        now.square[i] += dt * u * u
-        now.sum[i] += dt * u
-        now.span[i] += dt
-        now.since[i] += dt
-        now.calm[i] += dt
-        if now.since[i] > 1.5 * _LONGEST_HALF_WAVE:  # with the quarter to turn back
-            forget(now, i, p)
-        ahead = now.direction[i] * (p - now.farthest[i])
+        first = error[i] - state.slow[0, i]
+        state.slow[0, i] += gain * first
+        p = first - state.slow[1, i]
+        state.slow[1, i] += gain * p
+        u = torque[i] - state.torque[i]
+        state.torque[i] += gain * u
+        state.square[i] += dt * u * u
+        state.sum[i] += dt * u
+        state.span[i] += dt
+        state.since[i] += dt
+        state.calm[i] += dt
+        if state.since[i] > 1.5 * _LONGEST_HALF_WAVE:  # with the quarter to turn back
+            forget(state, i, p)
+        ahead = state.direction[i] * (p - state.farthest[i])
         if ahead >= 0.0:
-            now.farthest[i] = p
-            now.farthest_at[i] = now.since[i]
-            if now.direction[i] == 0.0:
-                now.direction[i] = 1.0
+            state.farthest[i] = p
+            state.farthest_at[i] = state.since[i]
+            if state.direction[i] == 0.0:
+                state.direction[i] = 1.0
             continue
-        least = max(_NOISE_SIGMAS * sqrt(noise[i]), _SENSOR_STEPS * resolution[i])
-        travel = abs(now.farthest[i] - now.turn[i])
-        if -ahead > max(least, _TURNED_BACK * travel):
-            end_half_wave(now, i, travel, travel > least, _LEAST_AMPLITUDE * limit[i])
-            now.farthest[i] = p
-            now.farthest_at[i] = now.since[i]
+        threshold = max(_NOISE_SIGMAS * sqrt(noise[i]), _SENSOR_STEPS * resolution[i])
+        travel = abs(state.farthest[i] - state.turn[i])
+        if -ahead > max(threshold, _TURNED_BACK * travel):
+            end_half_wave(
+                state, i, travel, travel > threshold, _MIN_AMPLITUDE * limit[i]
+            )
+            state.farthest[i] = p
+            state.farthest_at[i] = state.since[i]
 
 
 @inner
-def begin(now: State, error: Array, torque: Array) -> None:
+def begin(state: State, error: Array, torque: Array) -> None:
     """Begin with an error (n,) [rad] and a torque (n,) [N m], at rest."""
-    now.wait[0] = 0.0
+    state.wait[0] = 0.0
     for i in range(error.size):
-        now.slow[0, i] = error[i]
-        now.slow[1, i] = now.direction[i] = 0.0
-        now.torque[i] = torque[i]
-        now.calm[i] = inf
-        forget(now, i, 0.0)
+        state.slow[0, i] = error[i]
+        state.slow[1, i] = state.direction[i] = 0.0
+        state.torque[i] = torque[i]
+        state.calm[i] = inf
+        forget(state, i, 0.0)
 
 
 @inner
-def oscillates(now: State, i: int) -> bool:
+def oscillates(state: State, i: int) -> bool:
     """Whether joint i oscillates."""
-    return bool(now.waves[i] >= WAVES or grows(now, i))
+    return bool(state.waves[i] >= WAVES or grows(state, i))
 
 
 @inner
-def grows(now: State, i: int) -> bool:
+def grows(state: State, i: int) -> bool:
     """Whether the last half waves of joint i grow."""
-    return bool(now.grown[i] >= _GROWING_WAVES)
+    return bool(state.grown[i] >= _GROWING_WAVES)
 
 
 @inner
-def is_violent(now: State, limit: Array) -> bool:
+def is_violent(state: State, limit: Array) -> bool:
     """Whether a joint oscillates with much of its torque, of a `limit` (n,) [N m]."""
-    found = False
+    is_any = False
     for i in range(limit.size):
-        is_strong = now.amplitude[i] > VIOLENT * limit[i]
-        found = found or (is_strong and oscillates(now, i))
-    return found
+        is_strong = state.amplitude[i] > VIOLENT * limit[i]
+        is_any = is_any or (is_strong and oscillates(state, i))
+    return is_any
 
 
 @inner
-def count_down(now: State, limit: Array, dt: float) -> bool:
+def count_down(state: State, limit: Array, dt: float) -> bool:
     """Count down to the next report; return whether an oscillation is to be reported now.
 
     `dt` [s] is the time since the last call, `limit` (n,) [N m] are those of the
     torques.
     """
-    now.wait[0] = max(0.0, now.wait[0] - dt)
+    state.wait[0] = max(0.0, state.wait[0] - dt)
     is_any = False
     for i in range(limit.size):
-        is_any = is_any or oscillates(now, i)
-    if not is_any or (now.wait[0] > 0.0 and not is_violent(now, limit)):
+        is_any = is_any or oscillates(state, i)
+    if not is_any or (state.wait[0] > 0.0 and not is_violent(state, limit)):
         return False
-    now.wait[0] = PATIENCE
+    state.wait[0] = PATIENCE
     return True
 
 
 @inner
-def forget(now: State, i: int, p: float) -> None:
+def forget(state: State, i: int, p: float) -> None:
     """Wait for the next half wave of joint i, from p [rad] on."""
-    now.waves[i] = now.grown[i] = now.amplitude[i] = 0.0
-    now.square[i] = now.sum[i] = now.span[i] = 0.0
-    now.before[0, i] = now.before[1, i] = 0.0
-    now.since[i] = now.farthest_at[i] = 0.0
-    now.turn[i] = now.farthest[i] = p
+    state.waves[i] = state.grown[i] = state.amplitude[i] = 0.0
+    state.square[i] = state.sum[i] = state.span[i] = 0.0
+    state.before[0, i] = state.before[1, i] = 0.0
+    state.since[i] = state.farthest_at[i] = 0.0
+    state.turn[i] = state.farthest[i] = p
 
 
 @inner
-def forget_all(now: State) -> None:
+def forget_all(state: State) -> None:
     """Wait for the next half waves of all joints, from where they are."""
-    now.wait[0] = 0.0
-    for i in range(now.waves.size):
-        forget(now, i, now.farthest[i])
-        now.calm[i] = inf
+    state.wait[0] = 0.0
+    for i in range(state.waves.size):
+        forget(state, i, state.farthest[i])
+        state.calm[i] = inf
 
 
 @inner
-def end_span(now: State, i: int) -> float:
+def end_span(state: State, i: int) -> float:
     """Return the amplitude of the torque [N m] in the half wave that ends, and begin another.
 
     It is about the mean of two half waves; of a first one, which may be half of a wave
     about nothing, it is about 0.
     """
-    here = now.sum[i] / now.span[i]
+    own_mean = state.sum[i] / state.span[i]
     mean = 0.0
-    if now.before[1, i] > 0.0:
-        mean = (now.before[0, i] + now.sum[i]) / (now.before[1, i] + now.span[i])
-    square = now.square[i] / now.span[i] - mean * (2.0 * here - mean)
-    now.before[0, i], now.before[1, i] = now.sum[i], now.span[i]
-    now.square[i] = now.sum[i] = now.span[i] = 0.0
+    if state.before[1, i] > 0.0:
+        mean = (state.before[0, i] + state.sum[i]) / (
+            state.before[1, i] + state.span[i]
+        )
+    square = state.square[i] / state.span[i] - mean * (2.0 * own_mean - mean)
+    state.before[0, i], state.before[1, i] = state.sum[i], state.span[i]
+    state.square[i] = state.sum[i] = state.span[i] = 0.0
     return sqrt(2.0 * max(0.0, square))
 
 
 @inner
 def end_half_wave(
-    now: State, i: int, travel: float, is_clear: bool, strong: float
+    state: State, i: int, travel: float, is_clear: bool, strong: float
 ) -> None:
     """Count the half wave of joint i that has ended, over `travel` [rad], if it counts.
 
     `strong` [N m] is the least amplitude of its torque.
     """
-    half = now.farthest_at[i]
-    now.amplitude[i] = end_span(now, i)
-    k = int(now.waves[i])
-    counts = is_clear and half < _LONGEST_HALF_WAVE and now.amplitude[i] > strong
-    ratio = half / now.half[i] if k > 0 else 1.0
+    half = state.farthest_at[i]
+    state.amplitude[i] = end_span(state, i)
+    k = int(state.waves[i])
+    counts = is_clear and half < _LONGEST_HALF_WAVE and state.amplitude[i] > strong
+    ratio = half / state.half[i] if k > 0 else 1.0
     is_regular = 1.0 / _REGULAR_RATIO < ratio < _REGULAR_RATIO
     lasts = (
         k < _WAVES_EARLIER
-        or travel > _LASTING_RATIO * now.travel[k % _WAVES_EARLIER, i]
+        or travel > _LASTING_RATIO * state.travel[k % _WAVES_EARLIER, i]
     )
     if not (counts and is_regular and lasts):
         k = 0
-    grows = k > 1 and travel > _GROWING_RATIO * now.travel[(k - 2) % _WAVES_EARLIER, i]
-    now.grown[i] = now.grown[i] + 1.0 if grows else 0.0
-    now.travel[k % _WAVES_EARLIER, i] = travel
-    now.half[i] = (
+    grows = (
+        k > 1 and travel > _GROWING_RATIO * state.travel[(k - 2) % _WAVES_EARLIER, i]
+    )
+    state.grown[i] = state.grown[i] + 1.0 if grows else 0.0
+    state.travel[k % _WAVES_EARLIER, i] = travel
+    state.half[i] = (
         half
         if k == 0
-        else now.half[i] + (half - now.half[i]) / min(k + 1.0, _AVERAGED_WAVES)
+        else state.half[i] + (half - state.half[i]) / min(k + 1.0, _AVERAGED_WAVES)
     )
-    now.waves[i] = k + 1.0 if counts else 0.0
-    if now.waves[i] >= FEW:
-        now.calm[i] = 0.0
-    now.direction[i] = -now.direction[i]
-    now.turn[i] = now.farthest[i]
-    now.since[i] -= half
+    state.waves[i] = k + 1.0 if counts else 0.0
+    if state.waves[i] >= FEW:
+        state.calm[i] = 0.0
+    state.direction[i] = -state.direction[i]
+    state.turn[i] = state.farthest[i]
+    state.since[i] -= half
 
 
 @inner
-def is_fast(now: State, i: int) -> bool:
+def is_fast(state: State, i: int) -> bool:
     """Whether joint i seems to oscillate so fast that a filtered velocity lags far behind."""
-    return bool(now.waves[i] >= SOME and now.half[i] < 0.5 / _FAST_FREQUENCY)
+    return bool(state.waves[i] >= SOME and state.half[i] < 0.5 / _FAST_FREQUENCY)

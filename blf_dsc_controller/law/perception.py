@@ -14,11 +14,11 @@ from blf_dsc_controller.compiled.layout import Array
 from blf_dsc_controller.law import (
     contact,
     external_torque,
+    payload,
     prediction,
-    weighing,
     window,
 )
-from blf_dsc_controller.law.contact import Seen, TipLoad
+from blf_dsc_controller.law.contact import Residual, TipLoad
 from blf_dsc_controller.law.innovation import Prior
 from blf_dsc_controller.law.state import (
     Sample,
@@ -58,11 +58,11 @@ def update_covariance(settings: Settings, state: State) -> None:
 @inner
 def fill_coulomb(settings: Settings, state: State, coulomb: Array) -> None:
     """Write the Coulomb friction of each joint, learned or assumed, to `coulomb` (n,) [N m]."""
-    of = settings.friction
+    friction_settings = settings.friction
     for i in range(coulomb.size):
-        coulomb[i] = of.reversals.initial[i]
-        if of.coulomb == 1:
-            coulomb[i] = state.estimate[of.first_coulomb + i]
+        coulomb[i] = friction_settings.reversals.initial[i]
+        if friction_settings.coulomb == 1:
+            coulomb[i] = state.estimate[friction_settings.first_coulomb + i]
 
 
 @inner
@@ -70,20 +70,28 @@ def update_external_torque(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> float:
     """Find r of the last sample and whether it is a contact; return its distance from none."""
-    part, now, work = settings.external, state.external, signals.scratch.external
+    observer_settings, observer, workspace = (
+        settings.external,
+        state.external,
+        signals.scratch.external,
+    )
     update_covariance(settings, state)
-    fill_coulomb(settings, state, work.coulomb)
-    external_torque.update_torque(now, state.estimate)
-    begins = external_torque.follow_reversals(part, now, signals.dqr, dt)
+    fill_coulomb(settings, state, workspace.coulomb)
+    external_torque.update_torque(observer, state.estimate)
+    begins = external_torque.follow_reversals(
+        observer_settings, observer, signals.dqr, dt
+    )
     samples = int(state.samples[0])
     interval = settings.window.row_interval
     if begins or samples <= 1 or samples % interval == interval // 4:
-        external_torque.update_spread(part, now, work, state.estimate)
-    distance = external_torque.whiten_torque(now, work)
-    if external_torque.is_settled(now, dt):
+        external_torque.update_spread(
+            observer_settings, observer, workspace, state.estimate
+        )
+    distance = external_torque.whiten_torque(observer, workspace)
+    if external_torque.is_settled(observer, dt):
         distance = update_contact(settings, state, signals, distance, dt)
     touched = contact.is_touched(state.contact)
-    external_torque.update_noise(part, now, work, touched)
+    external_torque.update_noise(observer_settings, observer, workspace, touched)
     return distance
 
 
@@ -92,13 +100,13 @@ def update_contact(
     settings: Settings, state: State, signals: Signals, distance: float, dt: float
 ) -> float:
     """Find whether r, at a `distance` from zero, is a contact; return the remaining one."""
-    tip = settings.weighing
-    mass, deviation = weighing.held_mass(state.weighing)
+    tip = settings.payload
+    mass, deviation = payload.held_mass(state.payload)
     load = TipLoad(tip.columns, tip.scale, mass, deviation)
-    r, white = state.external, signals.scratch.external.white
-    seen = Seen(r.filtered, r.spread, white, distance)
+    external, white = state.external, signals.scratch.external.white
+    residual = Residual(external.filtered, external.spread, white, distance)
     return contact.update(
-        settings.contact, state.contact, signals.scratch.contact, seen, load, dt
+        settings.contact, state.contact, signals.scratch.contact, residual, load, dt
     )
 
 
@@ -111,10 +119,12 @@ def fill_sample(
     sample: Sample,
 ) -> None:
     """Write r with its interval, and the contact, to the telemetry sample."""
-    now, work = state.external, signals.scratch.external
-    for i in range(now.torque.size):
-        sample.external[i] = now.torque[i]
-        deviation = sqrt(external_torque.variance_of(settings.external, now, work, i))
+    observer, workspace = state.external, signals.scratch.external
+    for i in range(observer.torque.size):
+        sample.external[i] = observer.torque[i]
+        deviation = sqrt(
+            external_torque.residual_variance(settings.external, observer, workspace, i)
+        )
         sample.external_interval[i] = TWO_SIDED * deviation
     sample.contact[CONTACT] = 1.0 if contact.is_touched(state.contact) else 0.0
     sample.contact[DISTANCE] = distance
@@ -150,11 +160,11 @@ def fill_breakaway(settings: Settings, state: State, signals: Signals) -> None:
     """Compute the shapes of breakaway, filtered and weighted as the row."""
     for i in range(settings.n):
         weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        signals.scratch.weighing.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
+        signals.scratch.payload.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
 
 
 @kernel
-def weigh(
+def estimate_payload(
     model: ArmModel,
     settings_vector: Array,
     state_vector: Array,
@@ -168,14 +178,14 @@ def weigh(
     if state.frozen[0] > 0.0:  # the row is of a contact
         return
     fill_breakaway(settings, state, signals)
-    weighing.add_row(
-        settings.weighing,
-        state.weighing,
-        signals.scratch.weighing,
+    payload.add_row(
+        settings.payload,
+        state.payload,
+        signals.scratch.payload,
         Prior(settings.initial_estimate, settings.row_information),
-        weighing.Sample(
+        payload.Sample(
             signals.row.Xu,
-            signals.scratch.weighing.shapes,
+            signals.scratch.payload.shapes,
             state.friction.shape_lags[0, 2],
             signals.dqr,
             int(state.samples[0]),

@@ -40,12 +40,14 @@ class State(NamedTuple):
 
     Yp: Annotated[Array, 'n', 'p']  # of the last sample
     Yr: Annotated[Array, 'n', 'm']  # [Yr | D] of the last sample
-    late: Annotated[Array, 2, 'n']  # applied torque behind half of `lag`, and all, N m
+    lagged: Annotated[
+        Array, 2, 'n'
+    ]  # applied torque behind half of `lag`, and all, N m
     filter1: Annotated[Array, 'n', 'm + 1']  # first pole
     filter2: Annotated[Array, 'n', 'm + 1']  # second pole
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq
@@ -70,22 +72,22 @@ def delay_torque(
         torque = applied[i]
         for k in range(2):
             if passes:
-                state.late[k, i] = torque
-            torque = state.late[k, i] + gain * (torque - state.late[k, i])
-            state.late[k, i] = torque
+                state.lagged[k, i] = torque
+            torque = state.lagged[k, i] + gain * (torque - state.lagged[k, i])
+            state.lagged[k, i] = torque
 
 
 @inner
-def fill_interval(state: State, work: Work, dt: float) -> None:
+def fill_interval(state: State, workspace: Workspace, dt: float) -> None:
     """Compute [X | u] of the last interval, between the last regressors and these."""
-    Yp, Yr, row = work.Yp, work.Yr, work.Xu
+    Yp, Yr, row = workspace.Yp, workspace.Yr, workspace.Xu
     n, m = Yr.shape
     for i in range(n):
         for j in range(m):
             row[i, j] = 0.5 * (Yr[i, j] + state.Yr[i, j])
         for j in range(Yp.shape[1]):
             row[i, j] += (Yp[i, j] - state.Yp[i, j]) * (1.0 / dt)
-        row[i, m] = state.late[1, i]
+        row[i, m] = state.lagged[1, i]
 
 
 @inner
@@ -102,27 +104,27 @@ def motion_weight(settings: Settings, dqr: float, i: int) -> float:
 
 
 @inner
-def moving_square(speed: float, motion_scale: float) -> float:
+def square_weight(speed: float, motion_scale: float) -> float:
     """Return the squared weight of a joint's row by its speed: 1 in motion, 0 at rest."""
     square = speed**2
     return square / (square + motion_scale**2 + 1e-12)
 
 
 @inner
-def moving_share(dqr: Array, motion_scale: float) -> float:
+def mean_square_weight(dqr: Array, motion_scale: float) -> float:
     """Return the mean square weight of the joints' rows: 1 in motion, 0 at rest."""
-    share = 0.0
+    mean = 0.0
     for i in range(dqr.size):
-        share += moving_square(dqr[i], motion_scale) / dqr.size
-    return share
+        mean += square_weight(dqr[i], motion_scale) / dqr.size
+    return mean
 
 
 @inner
 def pass_poles(
-    settings: Settings, state: State, work: Work, dqr: Array, dt: float
+    settings: Settings, state: State, workspace: Workspace, dqr: Array, dt: float
 ) -> None:
     """Pass [X | u] of the last interval through both poles, and weight it."""
-    row = work.Xu
+    row = workspace.Xu
     gain = filter_gain(1.0 / settings.filter_pole, dt)
     for i in range(dqr.size):
         weight = motion_weight(settings, dqr[i], i)
@@ -140,9 +142,9 @@ def forget(state: State) -> None:
 
 
 @inner
-def keep_regressors(state: State, work: Work) -> None:
+def keep_regressors(state: State, workspace: Workspace) -> None:
     """Keep Yp and [Yr | D] for the next interval."""
-    Yp, Yr = work.Yp, work.Yr
+    Yp, Yr = workspace.Yp, workspace.Yr
     for i in range(Yr.shape[0]):
         for j in range(Yr.shape[1]):
             state.Yr[i, j] = Yr[i, j]

@@ -31,15 +31,17 @@ from typing import Annotated, NamedTuple
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
-from blf_dsc_controller.law.innovation import LATE
+from blf_dsc_controller.law.innovation import DETECTION_TIME
 from blf_dsc_controller.law.lag import filter_gain
 
 _MEMORY_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
-_SHOWN_ENERGY = 0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
+_IDENTIFIED_ENERGY = (
+    0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
+)
 # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _COULOMB_PRIOR = 0.015
 _STRIBECK_PRIOR = 0.1  # pull of c k to zero, over that of c to c_0
-_MOST_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
+_MAX_STRIBECK = 1.0  # k^: breakaway takes at most twice the Coulomb friction
 _NEAR_TIME = 0.1  # s around a reversal in which its torque is compared with friction's
 _QUIET_TIME = 4.0  # s, of what is away from reversals: its noise
 _CHANCE_RATIO = 2.0  # times its mean square
@@ -57,8 +59,8 @@ class Settings(NamedTuple):
     unmodelled: Annotated[Array, 'n']  # f, rms torque that no column describes, N m
     initial: Annotated[Array, 'n']  # c_0, N m
     variance: Annotated[Array, 'n']  # of c_0, (N m)^2
-    least: Annotated[Array, 'n']  # value that c^ can have, N m
-    most: Annotated[Array, 'n']
+    lower: Annotated[Array, 'n']  # value that c^ can have, N m
+    upper: Annotated[Array, 'n']
 
 
 class Row(NamedTuple):
@@ -70,7 +72,7 @@ class Row(NamedTuple):
     weight: float  # p dt
 
 
-class Shown(NamedTuple):
+class Evidence(NamedTuple):
     """What reversals have shown."""
 
     # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
@@ -86,14 +88,14 @@ class Shown(NamedTuple):
 class State(NamedTuple):
     """What it keeps from one row to the next."""
 
-    shown: Shown
-    earlier: Shown  # some `LATE` ago or less
-    earliest: Shown  # one to two times as long ago
+    evidence: Evidence
+    earlier: Evidence  # some `DETECTION_TIME` ago or less
+    earliest: Evidence  # one to two times as long ago
     since_kept: Cell  # s
     # p int of s_h^2, e_h^2 [(N m)^2] and 1 dt, faded by `_NEAR_TIME`
     recent: Annotated[Array, 3, 'n']
     # p int of e_h^2 dt and dt away from reversals, faded by `_QUIET_TIME`
-    usual: Annotated[Array, 2, 'n']
+    noise: Annotated[Array, 2, 'n']
 
 
 @inner
@@ -101,9 +103,9 @@ def begin(settings: Settings, state: State) -> None:
     """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
     for i in range(settings.initial.size):
         for k in range(2):
-            state.shown.coulomb[k, i] = settings.initial[i]
-    copy(state.shown, state.earlier)
-    copy(state.shown, state.earliest)
+            state.evidence.coulomb[k, i] = settings.initial[i]
+    copy(state.evidence, state.earlier)
+    copy(state.evidence, state.earliest)
 
 
 @inner
@@ -125,16 +127,16 @@ def add_row(
 
     Return whether that shows its friction since this row.  k is k^.
     """
-    now = state.shown.present
+    sums = state.evidence.present
     s, b, e, weight = row
-    was_shown = counted(settings, state, i, k) > 0.0
-    now[_SE, i] += weight * s * e
-    now[_BE, i] += weight * b * e
-    now[_SS, i] += weight * s * s
-    now[_SB, i] += weight * s * b
-    now[_BB, i] += weight * b * b
+    was_identified = accepted_weight(settings, state, i, k) > 0.0
+    sums[_SE, i] += weight * s * e
+    sums[_BE, i] += weight * b * e
+    sums[_SS, i] += weight * s * s
+    sums[_SB, i] += weight * s * b
+    sums[_BB, i] += weight * b * b
     add_torque(state, i, row, dt)
-    return find_last(settings, state, i, k, was_shown)
+    return find_last(settings, state, i, k, was_identified)
 
 
 @inner
@@ -146,84 +148,86 @@ def add_torque(state: State, i: int, row: Row, dt: float) -> None:
     weight = row.weight
     ss = row.s * row.s
     ee = row.e * row.e
-    recent, usual, shown = state.recent, state.usual, state.shown
+    recent, noise, evidence = state.recent, state.noise, state.evidence
     reversed_before = recent[0, i] > _TOUCHED
     fade(recent, i, _NEAR_TIME, dt)
     recent[0, i] += weight * ss
     recent[1, i] += weight * ee
     recent[2, i] += weight
     if recent[0, i] <= _TOUCHED:
-        fade(usual, i, _QUIET_TIME, dt)
-        usual[0, i] += weight * ee
-        usual[1, i] += weight
+        fade(noise, i, _QUIET_TIME, dt)
+        noise[0, i] += weight * ee
+        noise[1, i] += weight
     elif reversed_before:
-        shown.torque[i] += weight * ee
-        shown.span[i] += weight
+        evidence.torque[i] += weight * ee
+        evidence.span[i] += weight
     else:
-        shown.torque[i] += recent[1, i]
-        shown.span[i] += recent[2, i]
+        evidence.torque[i] += recent[1, i]
+        evidence.span[i] += recent[2, i]
 
 
 @inner
 def fade(sums: Array, i: int, time_constant: float, dt: float) -> None:
     """Let the sums of joint i fade for `dt` [s]."""
-    kept = 1.0 - filter_gain(time_constant, dt)
+    retained = 1.0 - filter_gain(time_constant, dt)
     for row in range(sums.shape[0]):
-        sums[row, i] *= kept
+        sums[row, i] *= retained
 
 
 @inner
 def find_last(
-    settings: Settings, state: State, i: int, k: float, was_shown: bool
+    settings: Settings, state: State, i: int, k: float, was_identified: bool
 ) -> bool:
     """Compute c_1 of joint i while its reversal shows it; return whether this is the first time.
 
-    `was_shown` is whether it did so a row ago.
+    `was_identified` is whether it did so a row ago.
     """
-    if counted(settings, state, i, k) == 0.0:
+    if accepted_weight(settings, state, i, k) == 0.0:
         return False
-    shown = state.shown
-    is_first = not was_shown
+    evidence = state.evidence
+    is_first = not was_identified
     if is_first:
-        shown.coulomb[1, i] = shown.coulomb[0, i]
-    torque = shown.present[_SE, i] + k * shown.present[_BE, i]
-    shown.coulomb[0, i] = clip(
-        torque / energy(shown, i, k), settings.least[i], settings.most[i]
+        evidence.coulomb[1, i] = evidence.coulomb[0, i]
+    torque = evidence.present[_SE, i] + k * evidence.present[_BE, i]
+    evidence.coulomb[0, i] = clip(
+        torque / energy(evidence, i, k), settings.lower[i], settings.upper[i]
     )
     return is_first
 
 
 @inner
-def energy(shown: Shown, i: int, k: float) -> float:
+def energy(evidence: Evidence, i: int, k: float) -> float:
     """Return p int (g s)_h^2 dt of the present reversal of joint i."""
-    now = shown.present
-    return float(now[_SS, i] + 2.0 * k * now[_SB, i] + k * k * now[_BB, i])
+    sums = evidence.present
+    return float(sums[_SS, i] + 2.0 * k * sums[_SB, i] + k * k * sums[_BB, i])
 
 
 @inner
-def trust(settings: Settings, state: State, i: int, k: float) -> float:
+def robust_weight(settings: Settings, state: State, i: int, k: float) -> float:
     """Return how much the present reversal of joint i counts: 1 where e_h is that of friction."""
-    shown, usual = state.shown, state.usual
-    of_friction = energy(shown, i, k)
-    if of_friction <= 0.0:
+    evidence, noise = state.evidence, state.noise
+    friction_energy = energy(evidence, i, k)
+    if friction_energy <= 0.0:
         return 0.0
-    torque = shown.present[_SE, i] + k * shown.present[_BE, i]
-    misfit = shown.torque[i] - torque * torque / of_friction
-    if usual[1, i] > 0.0:
-        misfit -= _CHANCE_RATIO * shown.span[i] * usual[0, i] / usual[1, i]
+    torque = evidence.present[_SE, i] + k * evidence.present[_BE, i]
+    misfit = evidence.torque[i] - torque * torque / friction_energy
+    if noise[1, i] > 0.0:
+        misfit -= _CHANCE_RATIO * evidence.span[i] * noise[0, i] / noise[1, i]
     f = settings.unmodelled[i]
     pull = _COULOMB_PRIOR * f * f / settings.variance[i]
-    c = shown.past[_SE, i] + pull * settings.initial[i]
-    c /= shown.past[_SS, i] + pull
+    c = evidence.past[_SE, i] + pull * settings.initial[i]
+    c /= evidence.past[_SS, i] + pull
     allowed = (_ALLOWED_F * f) ** 2 + (_ALLOWED_C * c) ** 2
-    return float(allowed * of_friction / (allowed * of_friction + max(0.0, misfit)))
+    return float(
+        allowed * friction_energy / (allowed * friction_energy + max(0.0, misfit))
+    )
 
 
 @inner
-def counted(settings: Settings, state: State, i: int, k: float) -> float:
+def accepted_weight(settings: Settings, state: State, i: int, k: float) -> float:
     """Return how much the present reversal of joint i counts; 0 until it shows its friction."""
-    share = trust(settings, state, i, k)
-    return share if share * energy(state.shown, i, k) > _SHOWN_ENERGY else 0.0
+    weight = robust_weight(settings, state, i, k)
+    return weight if weight * energy(state.evidence, i, k) > _IDENTIFIED_ENERGY else 0.0
 
 
 @inner
@@ -232,19 +236,19 @@ def close(settings: Settings, state: State, i: int, k: float) -> None:
 
     Otherwise they are the beginning of the next.
     """
-    shown = state.shown
-    latest, sums = shown.present, shown.past
-    share = counted(settings, state, i, k)
-    if share == 0.0:
+    evidence = state.evidence
+    latest, sums = evidence.present, evidence.past
+    weight = accepted_weight(settings, state, i, k)
+    if weight == 0.0:
         return
-    excess = sums[_SS, i] + share * latest[_SS, i] - _MEMORY_ENERGY
-    keep = 1.0
+    excess = sums[_SS, i] + weight * latest[_SS, i] - _MEMORY_ENERGY
+    retained = 1.0
     if excess > 0.0:
-        keep = max(0.0, 1.0 - excess / sums[_SS, i])
+        retained = max(0.0, 1.0 - excess / sums[_SS, i])
     for row in range(5):
-        sums[row, i] = keep * sums[row, i] + share * latest[row, i]
+        sums[row, i] = retained * sums[row, i] + weight * latest[row, i]
         latest[row, i] = 0.0
-    shown.torque[i] = shown.span[i] = 0.0
+    evidence.torque[i] = evidence.span[i] = 0.0
     overrule(settings, state, i)
 
 
@@ -252,16 +256,16 @@ def close(settings: Settings, state: State, i: int, k: float) -> None:
 def overrule(settings: Settings, state: State, i: int) -> None:
     """Give the sums of joint i the friction of the last two reversals if both contradict them."""
     coulomb, stribeck = learned(settings, state, i, 0.0)
-    shown = state.shown
-    found = shown.coulomb
-    band = settings.unmodelled[i]
-    last = beyond(found[0, i] - coulomb, band)
-    other = beyond(found[1, i] - coulomb, band)
-    if last * other <= 0.0:
+    evidence = state.evidence
+    coulomb_by_reversal = evidence.coulomb
+    dead_zone = settings.unmodelled[i]
+    last = beyond(coulomb_by_reversal[0, i] - coulomb, dead_zone)
+    before = beyond(coulomb_by_reversal[1, i] - coulomb, dead_zone)
+    if last * before <= 0.0:
         return
-    level = 0.5 * (found[0, i] + found[1, i])
+    level = 0.5 * (coulomb_by_reversal[0, i] + coulomb_by_reversal[1, i])
     extra = level * stribeck
-    sums = shown.past
+    sums = evidence.past
     sums[_SE, i] = level * sums[_SS, i] + extra * sums[_SB, i]
     sums[_BE, i] = level * sums[_SB, i] + extra * sums[_BB, i]
 
@@ -273,33 +277,33 @@ def learned(
     """Return c [N m] and k of joint i by all sums, k within its limits; `k_now` is k^."""
     f = settings.unmodelled[i]
     pull = _COULOMB_PRIOR * f * f / settings.variance[i]
-    sums = state.shown.past
-    latest = state.shown.present
-    share = counted(settings, state, i, k_now)
-    se = sums[_SE, i] + share * latest[_SE, i] + pull * settings.initial[i]
-    be = sums[_BE, i] + share * latest[_BE, i]
-    ss = sums[_SS, i] + share * latest[_SS, i] + pull
-    sb = sums[_SB, i] + share * latest[_SB, i]
-    bb = sums[_BB, i] + share * latest[_BB, i] + _STRIBECK_PRIOR * pull
+    sums = state.evidence.past
+    latest = state.evidence.present
+    weight = accepted_weight(settings, state, i, k_now)
+    se = sums[_SE, i] + weight * latest[_SE, i] + pull * settings.initial[i]
+    be = sums[_BE, i] + weight * latest[_BE, i]
+    ss = sums[_SS, i] + weight * latest[_SS, i] + pull
+    sb = sums[_SB, i] + weight * latest[_SB, i]
+    bb = sums[_BB, i] + weight * latest[_BB, i] + _STRIBECK_PRIOR * pull
     # c and c k, times the determinant of the equations, which the pull keeps positive
     coulomb = se * bb - be * sb
     stribeck = be * ss - se * sb
     k = 0.0
     if coulomb > 0.0:
-        k = clip(stribeck / coulomb, 0.0, _MOST_STRIBECK)
+        k = clip(stribeck / coulomb, 0.0, _MAX_STRIBECK)
     elif stribeck > 0.0:
-        k = _MOST_STRIBECK
+        k = _MAX_STRIBECK
     return (se + k * be) / (ss + 2.0 * k * sb + k * k * bb), k
 
 
 @inner
 def keep(state: State, dt: float) -> None:
-    """Keep what reversals have shown, each `LATE`, and what was kept before; `dt` [s] later."""
+    """Keep the evidence each `DETECTION_TIME`, and what was kept before; `dt` [s] later."""
     state.since_kept[0] += dt
-    if state.since_kept[0] > LATE:
+    if state.since_kept[0] > DETECTION_TIME:
         state.since_kept[0] = 0.0
         copy(state.earlier, state.earliest)
-        copy(state.shown, state.earlier)
+        copy(state.evidence, state.earlier)
 
 
 @inner
@@ -308,19 +312,19 @@ def take_back(state: State, breakaway: Array) -> None:
 
     A reversal that has just begun is forgotten as a whole.  `breakaway` (n,) is k^.
     """
-    shown = state.shown
-    copy(state.earliest, shown)
+    evidence = state.evidence
+    copy(state.earliest, evidence)
     for i in range(breakaway.size):
-        if energy(shown, i, breakaway[i]) <= _SHOWN_ENERGY:
+        if energy(evidence, i, breakaway[i]) <= _IDENTIFIED_ENERGY:
             for row in range(5):
-                shown.present[row, i] = 0.0
-            shown.torque[i] = shown.span[i] = 0.0
-    copy(shown, state.earliest)
-    copy(shown, state.earlier)
+                evidence.present[row, i] = 0.0
+            evidence.torque[i] = evidence.span[i] = 0.0
+    copy(evidence, state.earliest)
+    copy(evidence, state.earlier)
 
 
 @inner
-def copy(source: Shown, out: Shown) -> None:
+def copy(source: Evidence, out: Evidence) -> None:
     """Copy what reversals have shown."""
     for i in range(out.coulomb.shape[1]):
         for row in range(5):

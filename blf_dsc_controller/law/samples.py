@@ -12,4 +12,4 @@ from blf_dsc_controller.law.state import Sample, Settings, sample_of
 def sample_columns(rows: Array, settings: Settings) -> Sample:
     """Split packed samples (N, s) into columns by name, located by unpacking a row of indices."""
     places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
-    return Sample(*(rows[:, part.astype(np.intp)] for part in places))
+    return Sample(*(rows[:, place.astype(np.intp)] for place in places))

@@ -77,17 +77,17 @@ def measure_noise(state: State, dt: float, measurement: Array) -> None:
     """Update noise and resolution by a reading [q, dq, ...], `dt` [s] after the last."""
     n = state.resolution.size
     count = state.readings[0]
-    share = max(min(1.0, dt / _NOISE_TIME), 1.0 / max(1.0, count - 1.0))
+    gain = max(min(1.0, dt / _NOISE_TIME), 1.0 / max(1.0, count - 1.0))
     for i in range(2 * n):
         reading = measurement[i]
         if count >= _SECOND:
             second = reading - 2.0 * state.last_read[i] + state.read_before[i]
-            state.noise[i] += share * (second * second / 6.0 - state.noise[i])
+            state.noise[i] += gain * (second * second / 6.0 - state.noise[i])
         change = abs(reading - state.last_read[i])
         if i < n and count >= 1.0 and change > 0.0:
             is_first = state.resolution[i] == 0.0
-            least = change if is_first else min(change, state.resolution[i])
-            state.resolution[i] = least
+            smallest = change if is_first else min(change, state.resolution[i])
+            state.resolution[i] = smallest
         state.read_before[i] = state.last_read[i]
         state.last_read[i] = reading
 
@@ -95,7 +95,7 @@ def measure_noise(state: State, dt: float, measurement: Array) -> None:
 @inner
 def compare_velocities(
     state: State,
-    shaking: oscillation.State,
+    half_waves: oscillation.State,
     sample_time: float,
     dt: float,
     measurement: Array,
@@ -108,8 +108,8 @@ def compare_velocities(
     measure_noise(state, dt, measurement)
     begins = state.readings[0] == 0.0
     state.readings[0] += 1.0
-    share = min(1.0, dt / FILTER)
-    slow = min(1.0, dt / _SQUARE_TIME)
+    gain = min(1.0, dt / FILTER)
+    square_gain = min(1.0, dt / _SQUARE_TIME)
     is_gap = dt > max(_ROW, LONG_GAP * sample_time)
     is_wrong = False
     for i in range(n):
@@ -122,27 +122,27 @@ def compare_velocities(
             continue
         change = (measurement[i] - state.read_before[i]) / dt
         velocity = 0.5 * (measurement[n + i] + state.read_before[n + i])
-        state.derived[i] += share * (change - state.derived[i])
-        state.measured[i] += share * (velocity - state.measured[i])
+        state.derived[i] += gain * (change - state.derived[i])
+        state.measured[i] += gain * (velocity - state.measured[i])
         difference = state.derived[i] - state.measured[i]
-        state.mismatch[i] += slow * (difference * difference - state.mismatch[i])
+        state.mismatch[i] += square_gain * (difference * difference - state.mismatch[i])
         larger = max(abs(state.derived[i]), abs(state.measured[i]))
-        state.speed[i] += slow * (larger * larger - state.speed[i])
-        is_wrong = is_wrong or is_contradicted(state, shaking, i, share)
+        state.speed[i] += square_gain * (larger * larger - state.speed[i])
+        is_wrong = is_wrong or is_contradicted(state, half_waves, i, gain)
     return is_wrong
 
 
 @inner
 def is_contradicted(
-    state: State, shaking: oscillation.State, i: int, share: float
+    state: State, half_waves: oscillation.State, i: int, gain: float
 ) -> bool:
     """Whether the velocity of joint i contradicts its positions, which no lag explains.
 
-    `share` is that of a reading in a filtered velocity.
+    `gain` is that of a reading in a filtered velocity.
     """
-    least = max(_WRONG_POWER * state.speed[i], unseen(state, i, share))
-    is_lag = oscillation.is_fast(shaking, i) and is_late(state, i)
-    return bool(state.mismatch[i] > least and not is_lag)
+    threshold = max(_WRONG_POWER * state.speed[i], explained_square(state, i, gain))
+    is_lag = oscillation.is_fast(half_waves, i) and is_late(state, i)
+    return bool(state.mismatch[i] > threshold and not is_lag)
 
 
 @inner
@@ -155,11 +155,11 @@ def is_late(state: State, i: int) -> bool:
 
 
 @inner
-def unseen(state: State, i: int, share: float) -> float:
+def explained_square(state: State, i: int, gain: float) -> float:
     """Return the mean square [(rad/s)^2] of the difference that noise and steps explain."""
     n = state.resolution.size
     position = (
         _FILTERED_SIGMAS * _FILTERED_SIGMAS * state.noise[i] + state.resolution[i] ** 2
     )
-    velocity = _FILTERED_SIGMAS * _FILTERED_SIGMAS * state.noise[n + i] * 0.5 * share
+    velocity = _FILTERED_SIGMAS * _FILTERED_SIGMAS * state.noise[n + i] * 0.5 * gain
     return float(SLOW * SLOW + position / (FILTER * FILTER) + velocity)

@@ -31,7 +31,7 @@ _LEARNED = (
     'window',
 )
 _MOTION = ('alpha2', 'torque', 'feedback', 'saturation', 'row', 'observer')
-_AT_THE_TIP = ('frozen', 'external', 'contact', 'weighing')
+_AT_THE_TIP = ('frozen', 'external', 'contact', 'payload')
 
 KEPT: dict[Start, tuple[str, ...]] = {
     Start.FIRST: (),
@@ -54,9 +54,9 @@ def keep(start: Start, before: State, state: State) -> None:
         _copy(getattr(before, name), getattr(state, name))
 
 
-def _copy(before: object, to: object) -> None:
-    if isinstance(before, tuple) and isinstance(to, tuple):
-        for part, own in zip(before, to, strict=True):
-            _copy(part, own)
+def _copy(before: object, target: object) -> None:
+    if isinstance(before, tuple) and isinstance(target, tuple):
+        for source, destination in zip(before, target, strict=True):
+            _copy(source, destination)
     else:
-        to[...] = before  # type: ignore[index]
+        target[...] = before  # type: ignore[index]

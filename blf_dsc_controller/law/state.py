@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of a law, its state between samples, signals within one, telemetry: flat vectors.
 
-Each part of the law has its own `Settings`, `State` and `Work` beside its functions.  Here they
-are put together, with the arrays that a sample passes on from one part to the next.  A `Work`
-that other parts read is among the `Signals`, any other is `Scratch`.
+Each part of the law has its own `Settings`, `State` and `Workspace` beside its functions.  Here
+they are put together, with the arrays that a sample passes on from one part to the next.  A
+`Workspace` that other parts read is among the `Signals`, any other is `Scratch`.
 
 A controller is saved, restored and compared by copying and comparing its state vector:
 the package keeps no other state of the loop.
@@ -29,11 +29,11 @@ from blf_dsc_controller.law import (
     friction,
     load_observer,
     motor_friction,
+    payload,
     prediction,
     surface,
     torque,
     torque_sensors,
-    weighing,
     window,
 )
 
@@ -74,7 +74,7 @@ class Settings(NamedTuple):
     external: external_torque.Settings
     contact: contact.Settings
     friction: friction.Settings
-    weighing: weighing.Settings
+    payload: payload.Settings
 
 
 class State(NamedTuple):
@@ -97,7 +97,7 @@ class State(NamedTuple):
     external: external_torque.State
     contact: contact.State
     friction: friction.State
-    weighing: weighing.State
+    payload: payload.State
     memory: Annotated[Array, 'memory']  # of a law of a file
     window: window.State
 
@@ -113,16 +113,16 @@ class Scratch(NamedTuple):
     """What each part computes for itself: nothing of it outlasts the work of that part."""
 
     momentum: Momentum
-    disturbance: disturbance.Work
-    observer: load_observer.Work
-    motors: motor_friction.Work
-    window: window.Work
-    latch: excitation.Work
-    change: change.Work
-    adaptation: adaptation.Work
-    external: external_torque.Work
-    contact: contact.Work
-    weighing: weighing.Work
+    disturbance: disturbance.Workspace
+    observer: load_observer.Workspace
+    motors: motor_friction.Workspace
+    window: window.Workspace
+    latch: excitation.Workspace
+    change: change.Workspace
+    adaptation: adaptation.Workspace
+    external: external_torque.Workspace
+    contact: contact.Workspace
+    payload: payload.Workspace
 
 
 class Signals(NamedTuple):
@@ -146,13 +146,13 @@ class Signals(NamedTuple):
     demand: Annotated[Array, 'n']  # whole torque (28) before saturation, N m
     torque: Annotated[Array, 'n']  # commanded torque, N m
     H: Annotated[Array, 'n', 'm']  # of what is learned: [H | compensated columns]
-    barrier: barrier.Work
-    surface: surface.Work
-    feedback: feedback.Work
-    saturation: torque.Work
-    row: prediction.Work
-    sensors: torque_sensors.Work
-    friction: friction.Work
+    barrier: barrier.Workspace
+    surface: surface.Workspace
+    feedback: feedback.Workspace
+    saturation: torque.Workspace
+    row: prediction.Workspace
+    sensors: torque_sensors.Workspace
+    friction: friction.Workspace
     scratch: Scratch
 
 

@@ -37,6 +37,7 @@ from blf_dsc_controller.law.checks import (
     watch_oscillation,
 )
 from blf_dsc_controller.law.interface import Law
+from blf_dsc_controller.law.payload import DEVIATION, mass_interval
 from blf_dsc_controller.law.sensor import compare_velocities
 from blf_dsc_controller.law.state import (
     Sample,
@@ -48,7 +49,6 @@ from blf_dsc_controller.law.state import (
     signals_of,
     state_of,
 )
-from blf_dsc_controller.law.weighing import DEVIATION, mass_interval
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.reference import terms as reference
 
@@ -71,7 +71,7 @@ def fill_sample(
     sample.lambda_min[0] = state.latch.lambda_min[0]
     sample.latched[0] = state.latch.latched[0]
     sample.changes[0] = state.change.changes[0]
-    load = state.weighing.load
+    load = state.payload.load
     for k in range(load.size):
         is_known = load[DEVIATION + k % DEVIATION] > 0.0
         factor = 1.0 if k < DEVIATION else TWO_SIDED
@@ -163,7 +163,7 @@ def compute_torque(
 
 
 @inner
-def blame_oscillation(
+def report_oscillation(
     settings: Settings,
     checks: Checks,
     state: State,
@@ -175,16 +175,16 @@ def blame_oscillation(
     The observer, which may be the cause, is left out before the arm is said to oscillate, unless
     that is violent.  `had_fault` is what was wrong with it before this sample.
     """
-    now, sensors = checks.oscillation, state.sensors
-    is_violent = oscillation.is_violent(now, settings.torque.limit)
+    half_waves, sensors = checks.oscillation, state.sensors
+    is_violent = oscillation.is_violent(half_waves, settings.torque.limit)
     if oscillates and not is_violent:
-        torque_sensors.take_blame(sensors, now)
+        torque_sensors.leave_out_oscillating(sensors, half_waves)
     flags = OSCILLATES if oscillates else 0
     if sensors.fault[0] == had_fault:
         return flags
     if is_violent:
         return flags | NOT_SENSORS
-    oscillation.forget_all(now)
+    oscillation.forget_all(half_waves)
     return NOT_SENSORS
 
 
@@ -219,7 +219,7 @@ def step(
     if not are_on(checks):
         return 0
     flags = check_sample(settings, checks, state, signals, sample)
-    return flags | blame_oscillation(settings, checks, state, oscillates, had_fault)
+    return flags | report_oscillation(settings, checks, state, oscillates, had_fault)
 
 
 @kernel

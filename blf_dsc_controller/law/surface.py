@@ -28,7 +28,7 @@ class Settings(NamedTuple):
     lag: float  # of measured velocities and applied torques together, s
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     beta2: Annotated[Array, 'n']  # virtual control, rad/s
@@ -90,8 +90,8 @@ def known_rate(
     i: int,
 ) -> tuple[float, float]:
     """Return f of joint i [rad/s^2], and what dqr^ lacks of dqr [rad/s]."""
-    late = 0.5 * settings.lag * ddqr
+    lag_offset = 0.5 * settings.lag * ddqr
     slope = virtual_slope(xi1, bound, settings.gain[i], settings.mu[i])
     slope -= narrowing
-    rate = dq - dqr + late
-    return ddqr - slope * rate, late
+    rate = dq - dqr + lag_offset
+    return ddqr - slope * rate, lag_offset

@@ -75,7 +75,7 @@ class State(NamedTuple):
     rate_cuts: Annotated[Array, 'n']
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Values of one sample."""
 
     added: Annotated[Array, 'n']  # G_d, torque that the drive adds to the command, N m
@@ -86,27 +86,29 @@ class Work(NamedTuple):
 
 
 @inner
-def find_added(settings: Settings, work: Work, q: Array) -> None:
+def find_added(settings: Settings, workspace: Workspace, q: Array) -> None:
     """Compute what the drives add at the position q (n,) [rad]."""
     if settings.drive == 0:
         return
-    added, zeros = work.added, work.zeros
-    fill_regressor(settings.drive_chain, q, zeros, zeros, zeros, work.columns)
+    added, zeros = workspace.added, workspace.zeros
+    fill_regressor(settings.drive_chain, q, zeros, zeros, zeros, workspace.columns)
     for i in range(q.size):
         added[i] = 0.0
         for j in range(settings.drive):
-            added[i] += work.columns[i, j] * settings.drive_inertias[j]
+            added[i] += workspace.columns[i, j] * settings.drive_inertias[j]
 
 
 @inner
-def find_applied(state: State, work: Work, command: Array, applied: Array) -> None:
+def find_applied(
+    state: State, workspace: Workspace, command: Array, applied: Array
+) -> None:
     """Write the mean whole torque of the last interval to `applied` (n,) [N m].
 
     It is the last `command` (n,) and the mean of G_d at both ends.
     """
     for i in range(applied.size):
-        applied[i] = command[i] + 0.5 * (state.added[i] + work.added[i])
-        state.added[i] = work.added[i]
+        applied[i] = command[i] + 0.5 * (state.added[i] + workspace.added[i])
+        state.added[i] = workspace.added[i]
 
 
 def added_torque(settings: Settings, q: Array) -> Array:
@@ -129,7 +131,7 @@ def slow_down(demand: float, last: float, held: float, step: float) -> float:
 def saturate(
     settings: Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     demand: Array,
     last: Array,
     has_last: bool,
@@ -140,7 +142,7 @@ def saturate(
 
     `last` (n,) [N m] is the last command, `dt` [s] ago, if it `has_last`.
     """
-    added, cuts = work.added, work.cuts
+    added, cuts = workspace.added, workspace.cuts
     for i in range(demand.size):
         top = settings.limit[i]
         low = max(-top, added[i] - top)
@@ -165,9 +167,9 @@ def saturate(
 
 
 @inner
-def is_cut(work: Work) -> bool:
+def is_cut(workspace: Workspace) -> bool:
     """Whether a torque of this sample is cut."""
-    found = False
-    for cut in work.cuts:
-        found = found or cut > 0.0
-    return found
+    is_any = False
+    for cut in workspace.cuts:
+        is_any = is_any or cut > 0.0
+    return is_any

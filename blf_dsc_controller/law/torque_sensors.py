@@ -34,13 +34,13 @@ from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import oscillation
 from blf_dsc_controller.law.lag import filter_gain
 
-NONE, SHAKES, OFF = range(3)
+NONE, OSCILLATING, OFF = range(3)
 """What is wrong with r, for good, if anything."""
 
 # s, with which r is left out or comes back: it may grow threefold in 10 ms
 _FADE = 0.005
 _FADED = 1e-6  # of r
-_SHAKING_TORQUE = 0.0125  # of the torque limit: a quarter of an oscillation of r
+_OSCILLATION_TORQUE = 0.0125  # of the torque limit: a quarter of an oscillation of r
 _OFF_TORQUE = 0.1  # of the torque limit
 _OFF_TIME = 0.05  # s
 _FOLLOWED_SPEED = 0.25  # of the speed of the reference
@@ -54,10 +54,10 @@ class State(NamedTuple):
     # N m, of the last interval behind L: the torque commanded
     command: Annotated[Array, 'n * observer.enabled']
     lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
-    shaking: oscillation.State  # of r
+    oscillation: oscillation.State  # of r
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of one sample."""
 
     # N m, efforts less commands
@@ -69,7 +69,7 @@ class Work(NamedTuple):
 @inner
 def begin(state: State, torque: Array) -> None:
     """Begin with r, a `torque` (n,) [N m]."""
-    oscillation.begin(state.shaking, torque, torque)
+    oscillation.begin(state.oscillation, torque, torque)
 
 
 @inner
@@ -77,9 +77,9 @@ def follow_applied(
     state: State, row: Array, m: int, bandwidth: float, dt: float
 ) -> None:
     """Pass the torque of the last interval, at m of `row`, through L, `bandwidth` [rad/s]."""
-    share = filter_gain(1.0 / bandwidth, dt)
+    gain = filter_gain(1.0 / bandwidth, dt)
     for i in range(state.command.size):
-        state.command[i] += share * (row[i, m] - state.command[i])
+        state.command[i] += gain * (row[i, m] - state.command[i])
 
 
 @inner
@@ -91,45 +91,51 @@ def note_fault(state: State, fault: float, i: int) -> None:
 
 
 @inner
-def watch_shaking(
-    state: State, work: Work, limit: Array, torque: Array, dt: float
+def watch_oscillation(
+    state: State, workspace: Workspace, limit: Array, torque: Array, dt: float
 ) -> None:
     """Find whether r, a `torque` (n,) [N m], oscillates; `limit` (n,) [N m] as configured."""
     for i in range(torque.size):
-        work.clear[i] = _SHAKING_TORQUE * limit[i]
+        workspace.clear[i] = _OSCILLATION_TORQUE * limit[i]
     oscillation.watch(
-        state.shaking, work.zeros, torque, torque, work.zeros, work.clear, dt
+        state.oscillation,
+        workspace.zeros,
+        torque,
+        torque,
+        workspace.zeros,
+        workspace.clear,
+        dt,
     )
     for i in range(torque.size):
-        if oscillation.oscillates(state.shaking, i):
-            note_fault(state, SHAKES, i)
+        if oscillation.oscillates(state.oscillation, i):
+            note_fault(state, OSCILLATING, i)
 
 
 @inner
-def take_blame(state: State, arm: oscillation.State) -> None:
+def leave_out_oscillating(state: State, arm: oscillation.State) -> None:
     """Leave r out if the `arm` oscillates."""
     for i in range(state.lasted.size):
         if oscillation.oscillates(arm, i):
-            note_fault(state, SHAKES, i)
+            note_fault(state, OSCILLATING, i)
 
 
 @inner
 def watch_following(
-    state: State, work: Work, limit: Array, dq: Array, dqr: Array, dt: float
+    state: State, workspace: Workspace, limit: Array, dq: Array, dqr: Array, dt: float
 ) -> bool:
     """Find whether efforts are off, for good; return whether they are now, which may pass.
 
     `limit` (n,) [N m] is that of the torques.  The arm follows its reference where dq and
     dqr (n,) [rad/s] are about equal.
     """
-    late = square = 0.0
+    error_square = speed_square = 0.0
     for i in range(limit.size):
-        late += (dq[i] - dqr[i]) ** 2
-        square += dqr[i] ** 2
-    follows = late < _FOLLOWED_SPEED * _FOLLOWED_SPEED * square
+        error_square += (dq[i] - dqr[i]) ** 2
+        speed_square += dqr[i] ** 2
+    follows = error_square < _FOLLOWED_SPEED * _FOLLOWED_SPEED * speed_square
     is_off = False
     for i in range(limit.size):
-        is_one = abs(work.differences[i]) > _OFF_TORQUE * limit[i]
+        is_one = abs(workspace.differences[i]) > _OFF_TORQUE * limit[i]
         is_off = is_off or is_one
         state.lasted[i] = state.lasted[i] + dt if is_one and follows else 0.0
         if state.lasted[i] > _OFF_TIME:
@@ -146,8 +152,8 @@ def is_fading(faded: Array) -> bool:
 @inner
 def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
     """Leave more of r out where the efforts are in doubt, or less; zero stays zero."""
-    aim = 1.0 if is_off or state.fault[0] != NONE else 0.0
-    if faded[0] != aim:
-        faded[0] += filter_gain(_FADE, dt) * (aim - faded[0])
-        if abs(faded[0] - aim) < _FADED:
-            faded[0] = aim
+    target = 1.0 if is_off or state.fault[0] != NONE else 0.0
+    if faded[0] != target:
+        faded[0] += filter_gain(_FADE, dt) * (target - faded[0])
+        if abs(faded[0] - target) < _FADED:
+            faded[0] = target

@@ -45,7 +45,7 @@ class State(NamedTuple):
     ring: Annotated[Array, 'window.length', 'n', 'm + 1']
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Equations of the current window, and scratch."""
 
     Phi: Annotated[Array, 'm', 'm']
@@ -61,7 +61,7 @@ class Window(NamedTuple):
 
     settings: Settings
     state: State
-    work: Work
+    workspace: Workspace
 
 
 @inner
@@ -84,14 +84,14 @@ def push_row(state: State, row: Array) -> None:
     length = int(state.ring.shape[0])
     old = state.ring[cursor]
     n, size = row.shape
-    keep = 1.0 if state.rows[0] == length else 0.0
+    counts = 1.0 if state.rows[0] == length else 0.0
     for a in range(size):
         for b in range(a, size):
             new_term = 0.0
             old_term = 0.0
             for i in range(n):
                 new_term += row[i, a] * row[i, b]
-                old_term += keep * old[i, a] * old[i, b]
+                old_term += counts * old[i, a] * old[i, b]
             running[a, b] += new_term - old_term
             fresh[a, b] += new_term
     for i in range(n):
@@ -190,7 +190,7 @@ def min_eigenvector(
     information: Array,
     factor: Array,
     direction: Array,
-    work: Array,
+    workspace: Array,
     iterations: int,
 ) -> float:
     """Return lambda_min(Phi) relative to R by inverse iteration, which refines `direction`.
@@ -201,30 +201,37 @@ def min_eigenvector(
     the square of the direction's), at a fixed cost and without the O(m^3) of an
     eigenvalue decomposition.
 
-    `factor` is the Cholesky factor of Phi + rho R, `work` (m,) scratch.
+    `factor` is the Cholesky factor of Phi + rho R, `workspace` (m,) scratch.
     """
     m = direction.size
-    quadratic_form(information, direction, work)
+    quadratic_form(information, direction, workspace)
     for _ in range(iterations):
         for i in range(m):
-            direction[i] = work[i]
+            direction[i] = workspace[i]
         cholesky_solve(factor, direction)
-        shrink = 1.0 / sqrt(quadratic_form(information, direction, work))
+        shrink = 1.0 / sqrt(quadratic_form(information, direction, workspace))
         for i in range(m):
             direction[i] *= shrink
-            work[i] *= shrink
-    return quadratic_form(Phi, direction, work)
+            workspace[i] *= shrink
+    return quadratic_form(Phi, direction, workspace)
 
 
 @inner
-def solve(settings: Settings, work: Work, information: Array, active: Array) -> None:
-    """Factor Phi + rho R, and solve Phi theta = b, with theta in `work.solution`."""
+def solve(
+    settings: Settings, workspace: Workspace, information: Array, active: Array
+) -> None:
+    """Factor Phi + rho R, and solve Phi theta = b, with theta in `workspace.solution`."""
     regularized_factor(
-        active, settings.regularization, information, work.Phi, work.b, work.factor
+        active,
+        settings.regularization,
+        information,
+        workspace.Phi,
+        workspace.b,
+        workspace.factor,
     )
-    for j in range(work.b.size):
-        work.solution[j] = work.b[j]
-    cholesky_solve(work.factor, work.solution)
+    for j in range(workspace.b.size):
+        workspace.solution[j] = workspace.b[j]
+    cholesky_solve(workspace.factor, workspace.solution)
 
 
 @inner
@@ -255,33 +262,42 @@ def reset_direction(state: State) -> None:
 
 @inner
 def fill_equations(
-    settings: Settings, work: Work, prior: Prior, sums: Array, rows: int
+    settings: Settings, workspace: Workspace, prior: Prior, sums: Array, rows: int
 ) -> None:
     """Fill Phi and b of some rows, whose `sums` (m + 1, m + 1) of [X | u]^T [X | u] are given."""
-    average_window(sums, rows, work.Phi, work.b)
+    average_window(sums, rows, workspace.Phi, workspace.b)
     if settings.prior_weight > 0.0:
         pull_to(
-            prior.estimate, settings.prior_weight, prior.information, work.Phi, work.b
+            prior.estimate,
+            settings.prior_weight,
+            prior.information,
+            workspace.Phi,
+            workspace.b,
         )
 
 
 @inner
 def find_excitation(
-    whole: Window, prior: Prior, active: Array, iterations: int
+    sliding: Window, prior: Prior, active: Array, iterations: int
 ) -> float:
     """Return lambda_min of the window's Phi; leave Phi, b and the factor in its scratch.
 
     Columns that are not `active` (m,) are removed.  The inverse iteration begins where
     the last one ended.
     """
-    settings, state, work = whole
+    settings, state, workspace = sliding
     R = prior.information
-    fill_equations(settings, work, prior, state.running, int(state.rows[0]))
+    fill_equations(settings, workspace, prior, state.running, int(state.rows[0]))
     regularized_factor(
-        active, settings.regularization, R, work.Phi, work.b, work.factor
+        active, settings.regularization, R, workspace.Phi, workspace.b, workspace.factor
     )
     return min_eigenvector(
-        work.Phi, R, work.factor, state.min_eigenvector, work.solution, iterations
+        workspace.Phi,
+        R,
+        workspace.factor,
+        state.min_eigenvector,
+        workspace.solution,
+        iterations,
     )
 
 

@@ -27,9 +27,9 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.load_observer import most_load
+from blf_dsc_controller.law.load_observer import max_load_torque
+from blf_dsc_controller.law.payload import DEVIATION, MASS
 from blf_dsc_controller.law.torque import added_torque
-from blf_dsc_controller.law.weighing import DEVIATION, MASS
 from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
@@ -119,8 +119,8 @@ class DriveLoads:
         settings = self._controller.settings
         settings.torque.drive_inertias[:] = self._added()
         is_left_out = not np.allclose(self._base.moments, self._at_start.moments)
-        most = 0.0 if is_left_out else most_load(settings.torque.limit)
-        settings.observer.most[:] = most
+        max_torque = 0.0 if is_left_out else max_load_torque(settings.torque.limit)
+        settings.observer.max_torque[:] = max_torque
 
     def begin_step(self) -> TipLoad | None:
         """Begin the next step: return the load to declare; None if there is none, or too uncertain.
@@ -161,7 +161,7 @@ class DriveLoads:
 
     def _weighed(self) -> Vector | None:
         """Return mass and moments (4,) that the drives should get; None: no change."""
-        load = self._controller.state.weighing.load
+        load = self._controller.state.payload.load
         half = TWO_SIDED * load[DEVIATION]
         narrow = widest_interval(load[MASS])
         if not 0.0 < half < narrow:

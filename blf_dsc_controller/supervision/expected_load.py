@@ -20,7 +20,7 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.estimate import tip_parameters
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.weighing import DEVIATION, MASS
+from blf_dsc_controller.law.payload import DEVIATION, MASS
 from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.supervision.drive_load import widest_interval
@@ -90,7 +90,7 @@ class ExpectedLoad:
 
     def observe(self) -> None:
         """Remember what the law has weighed, once it is sure of it."""
-        found = self._controller.state.weighing.load
+        found = self._controller.state.payload.load
         if not found.size or found[MASS] == self._seen:
             return  # it is solved for ten times a second
         self._seen = mass = float(found[MASS])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.torque_sensors import NONE, OFF, SHAKES
+from blf_dsc_controller.law.torque_sensors import NONE, OFF, OSCILLATING
 
 _ALONE = 'the load observer is off, and the law goes on without it'
 _DRIVER = (
@@ -15,7 +15,7 @@ _DRIVER = (
     'set disturbance.observer_bandwidth to 0'
 )
 _TEXTS = {
-    SHAKES: (
+    OSCILLATING: (
         f'joint {{joint!r}} oscillates with the load observer: {_ALONE}. A gear is softer than is '
         'known, efforts are not those of joint torque sensors, or positions are those of the '
         'motors. If there are no such sensors, set robot.effort to what efforts are '

@@ -181,11 +181,11 @@ class SampleCheck:
         checks = self._controller.checks
         if checks.effect.compares[0] == 0.0 or self._cause.oscillation:
             return None
-        shortfall = checks.effect.shortfall - checks.effect.usual_shortfall
+        shortfall = checks.effect.shortfall - checks.effect.mean_shortfall
         now = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
         if settings.torque.drive > 0 and settings.torque.effort_is_whole == 1:
             now += self._controller.signals.saturation.added
-        now -= checks.effect.usual_shortfall
+        now -= checks.effect.mean_shortfall
         share = np.abs(shortfall) / settings.torque.limit
         share_now = np.abs(now) / settings.torque.limit
         is_short = (

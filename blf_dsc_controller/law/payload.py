@@ -44,7 +44,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law import innovation, sums
 from blf_dsc_controller.law.innovation import Prior
-from blf_dsc_controller.law.prediction import SETTLED, moving_share, moving_square
+from blf_dsc_controller.law.prediction import SETTLED, mean_square_weight, square_weight
 from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
@@ -78,9 +78,9 @@ class Settings(NamedTuple):
     # of the breakaway torques, 1 / variance, 1/(N m)^2
     breakaway: Annotated[Array, 'n']
     # [N D | E], e in standard deviations, and rows of zeros
-    columns: Annotated[Array, 'weighing.size', 'weighing.since']
+    columns: Annotated[Array, 'payload.size', 'payload.since']
     # rows of D: mass [kg] and moments [kg m], and zeros
-    scale: Annotated[Array, 4, 'weighing.since']
+    scale: Annotated[Array, 4, 'payload.since']
 
 
 class State(NamedTuple):
@@ -88,13 +88,13 @@ class State(NamedTuple):
 
     begun: Cell  # 1: the load has been solved for, at first by the prior
     rows: Annotated[Array, 5]  # moving ones in each part
-    sums: Annotated[Array, 5, 'weighing.size', 'weighing.size']  # of [X | u]^T [X | u]
+    sums: Annotated[Array, 5, 'payload.size', 'payload.size']  # of [X | u]^T [X | u]
     complete: Cell  # 1: the rows before are complete
     age: Cell  # s since then
     innovation: innovation.State
-    solution: Annotated[Array, 'weighing.unknowns']  # theta, b, k, z and e
+    solution: Annotated[Array, 'payload.unknowns']  # theta, b, k, z and e
     # of their equations
-    factor: Annotated[Array, 'weighing.unknowns', 'weighing.unknowns']
+    factor: Annotated[Array, 'payload.unknowns', 'payload.unknowns']
     changes: Cell  # number of changes of the arm at the last row
     wait: Cell  # rows until the filters have settled
     # mass [kg] and centre [m] in the tip, their deviations; 0: unknown
@@ -113,25 +113,25 @@ class Sample(NamedTuple):
     dt: float  # s
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch of one row."""
 
     shapes: Annotated[Array, 'n']  # of breakaway, filtered and weighted as the row
-    before: Annotated[Array, 'weighing.size', 'weighing.size']  # sums of all such rows
-    since: Annotated[Array, 'weighing.size', 'weighing.size']
-    row: Annotated[Array, 'n', 'weighing.size']  # [X | u], weighted
-    rows: Annotated[Array, 'n', 'weighing.unknowns']  # [X | X N D | X E]
+    before: Annotated[Array, 'payload.size', 'payload.size']  # sums of all such rows
+    since: Annotated[Array, 'payload.size', 'payload.size']
+    row: Annotated[Array, 'n', 'payload.size']  # [X | u], weighted
+    rows: Annotated[Array, 'n', 'payload.unknowns']  # [X | X N D | X E]
     torque: Annotated[Array, 'n']  # that they do not explain, N m
     covariance: Annotated[Array, 'n', 'n']
-    spread: Annotated[Array, 4, 'weighing.since']  # D U^-1
-    held: Annotated[Array, 'weighing.inertial']  # base parameters with the load
+    spread: Annotated[Array, 4, 'payload.since']  # D U^-1
+    held: Annotated[Array, 'payload.inertial']  # base parameters with the load
 
 
 @inner
 def add_row(
     settings: Settings,
     state: State,
-    work: Work,
+    workspace: Workspace,
     prior: Prior,
     sample: Sample,
 ) -> None:
@@ -144,37 +144,44 @@ def add_row(
     state.changes[0] = sample.changes
     if not is_first(state):
         state.age[0] += period
-    row = work.row
-    find_held(settings, state, work.held)
-    extend_row(sample, work.held, row)
+    row = workspace.row
+    find_held(settings, state, workspace.held)
+    extend_row(sample, workspace.held, row)
     weight_row(row, dqr)
     if state.begun[0] == 0.0:
-        begin(settings, state, work, prior, period)
+        begin(settings, state, workspace, prior, period)
     elif has_changed:
-        end_part(settings, state, work, prior, period)
+        end_part(settings, state, workspace, prior, period)
     elif state.wait[0] > 0.0:
         state.wait[0] -= 1.0
-    elif update_innovation(settings, state, work, row, dqr, period):
-        end_part(settings, state, work, prior, period)
+    elif update_innovation(settings, state, workspace, row, dqr, period):
+        end_part(settings, state, workspace, prior, period)
     else:
         sums.add_products(row, state.sums[LATEST])
-        state.rows[LATEST] += moving_share(dqr, settings.motion_scale)
-        refresh(settings, state, work, prior, samples // settings.row_interval, period)
+        state.rows[LATEST] += mean_square_weight(dqr, settings.motion_scale)
+        refresh(
+            settings, state, workspace, prior, samples // settings.row_interval, period
+        )
 
 
 @inner
 def refresh(
-    settings: Settings, state: State, work: Work, prior: Prior, rows: int, period: float
+    settings: Settings,
+    state: State,
+    workspace: Workspace,
+    prior: Prior,
+    rows: int,
+    period: float,
 ) -> None:
     """Use the rows that are old enough, and solve for the load, each when it is due."""
     if is_first(state) and rows_before(state) >= settings.window:
         state.complete[0] = 1.0
-    if rows % max(1, round(innovation.LATE / period)) == 0:
+    if rows % max(1, round(innovation.DETECTION_TIME / period)) == 0:
         promote(settings, state)
     if rows % max(1, round(innovation.REFRESH / period)) == 0:
-        solve(settings, state, work, prior, period)
+        solve(settings, state, workspace, prior, period)
         if not is_first(state):
-            describe(settings, state, work, period)
+            describe(settings, state, workspace, period)
 
 
 @inner
@@ -191,20 +198,20 @@ def find_held(settings: Settings, state: State, held: Array) -> None:
 @inner
 def extend_row(sample: Sample, held: Array, row: Array) -> None:
     """Write [X | u] (n, m + 1) with columns of b, then of k, to `row`."""
-    given, shapes, signs = sample.Xu, sample.shapes, sample.signs
+    Xu, shapes, signs = sample.Xu, sample.shapes, sample.signs
     n = shapes.size
     m = row.shape[1] - 1 - 2 * n
     for i in range(n):
         for j in range(m):
-            row[i, j] = given[i, j]
+            row[i, j] = Xu[i, j]
         for j in range(m, m + 2 * n):
             row[i, j] = 0.0
         torque = 0.0
         for j in range(held.size):
-            torque += given[i, j] * held[j]
+            torque += Xu[i, j] * held[j]
         row[i, m + i] = shapes[i]
         row[i, m + n + i] = abs(torque) * signs[i]
-        row[i, m + 2 * n] = given[i, m]
+        row[i, m + 2 * n] = Xu[i, m]
 
 
 @inner
@@ -217,18 +224,18 @@ def weight_row(row: Array, dqr: Array) -> None:
 
 
 @inner
-def counted_share(dqr: Array, motion_scale: float) -> float:
+def counted_weight(dqr: Array, motion_scale: float) -> float:
     """Return the mean square weight that the joints' rows have here."""
-    share = 0.0
+    mean = 0.0
     for i in range(dqr.size):
         square = dqr[i] ** 2
-        share += (
-            moving_square(dqr[i], motion_scale)
+        mean += (
+            square_weight(dqr[i], motion_scale)
             * square
             / (square + _SLOW_SPEED**2)
             / dqr.size
         )
-    return share
+    return mean
 
 
 @inner
@@ -269,7 +276,7 @@ def rows_before(state: State) -> float:
 
 @inner
 def begin(
-    settings: Settings, state: State, work: Work, prior: Prior, period: float
+    settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
     """Begin with an arm of which only the prior is known."""
     state.begun[0] = 1.0
@@ -278,7 +285,7 @@ def begin(
     state.complete[0] = 0.0
     state.age[0] = 0.0
     state.wait[0] = SETTLED / (settings.pole * period)
-    solve(settings, state, work, prior, period)
+    solve(settings, state, workspace, prior, period)
 
 
 @inner
@@ -321,7 +328,7 @@ def promote(settings: Settings, state: State) -> None:
 
 @inner
 def end_part(
-    settings: Settings, state: State, work: Work, prior: Prior, period: float
+    settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
     """Something else is held: close the part, without its latest rows, and begin another."""
     clear_part(state, RECENT)
@@ -330,7 +337,7 @@ def end_part(
     if not is_first(state):
         move_rows(state, OLDER, NEWER)
         if state.rows[NEWER] >= fewest:
-            compare_with_nothing(settings, state, work, prior, period)
+            compare_with_nothing(settings, state, workspace, prior, period)
         discard(state, OLDER)
     elif state.rows[BEFORE] >= fewest:
         state.complete[0] = 1.0
@@ -339,16 +346,16 @@ def end_part(
         discard(state, BEFORE)
     innovation.forget_recent(state.innovation)
     state.wait[0] = SETTLED / (settings.pole * period)
-    solve(settings, state, work, prior, period)
+    solve(settings, state, workspace, prior, period)
 
 
 @inner
 def compare_with_nothing(
-    settings: Settings, state: State, work: Work, prior: Prior, period: float
+    settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
     """Take the newer rows for those of an empty hand if it held nothing, or less than before."""
-    solve(settings, state, work, prior, period)
-    describe(settings, state, work, period)
+    solve(settings, state, workspace, prior, period)
+    describe(settings, state, workspace, period)
     mass = state.load[MASS]
     deviation = state.load[DEVIATION]
     is_full = state.rows[BEFORE] >= settings.window
@@ -377,28 +384,38 @@ def fill_rows(settings: Settings, is_held: bool, row: Array, out: Array) -> None
 
 @inner
 def update_innovation(
-    settings: Settings, state: State, work: Work, row: Array, dqr: Array, period: float
+    settings: Settings,
+    state: State,
+    workspace: Workspace,
+    row: Array,
+    dqr: Array,
+    period: float,
 ) -> bool:
     """Compare a row with the solution; return whether the last ones contradict it."""
-    e = work.torque
+    e = workspace.torque
     x = state.solution
-    fill_rows(settings, not is_first(state), row, work.rows)
+    fill_rows(settings, not is_first(state), row, workspace.rows)
     for i in range(e.size):
         e[i] = row[i, row.shape[1] - 1]
         for j in range(x.size):
-            e[i] -= work.rows[i, j] * x[j]
+            e[i] -= workspace.rows[i, j] * x[j]
     square = innovation.normalized_square(
-        work.rows, e, state.factor, period, work.covariance
+        workspace.rows, e, state.factor, period, workspace.covariance
     )
-    share = counted_share(dqr, settings.motion_scale)
+    weight = counted_weight(dqr, settings.motion_scale)
     return innovation.update(
-        state.innovation, square, share, settings.unmodelled, period, settings.window
+        state.innovation, square, weight, settings.unmodelled, period, settings.window
     )
 
 
 @inner
 def fill_equations(
-    settings: Settings, state: State, work: Work, prior: Prior, a: float, grown: float
+    settings: Settings,
+    state: State,
+    workspace: Workspace,
+    prior: Prior,
+    a: float,
+    grown: float,
 ) -> None:
     """Fill the upper triangle and the right-hand side of the normal equations of theta and z.
 
@@ -414,8 +431,8 @@ def fill_equations(
     m = settings.size - 1
     A = state.factor
     x = state.solution
-    before = work.before
-    since = work.since
+    before = workspace.before
+    since = workspace.since
     ND = settings.columns
     for i in range(m):
         x[i] = before[i, m] + since[i, m]
@@ -454,26 +471,28 @@ def add_prior(settings: Settings, prior: Prior, a: float, A: Array, x: Array) ->
 
 @inner
 def solve(
-    settings: Settings, state: State, work: Work, prior: Prior, period: float
+    settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
     """Find theta and z of all rows, one each `period` [s], those kept apart included."""
     parts = state.sums
-    sums.add(parts[OLDER], 1.0, parts[NEWER], work.since)
-    sums.add(parts[BEFORE], 0.0, parts[BEFORE], work.before)
+    sums.add(parts[OLDER], 1.0, parts[NEWER], workspace.since)
+    sums.add(parts[BEFORE], 0.0, parts[BEFORE], workspace.before)
     for part in (RECENT, LATEST):
         if is_first(state):
-            sums.add(work.before, 1.0, parts[part], work.before)
+            sums.add(workspace.before, 1.0, parts[part], workspace.before)
         else:
-            sums.add(work.since, 1.0, parts[part], work.since)
+            sums.add(workspace.since, 1.0, parts[part], workspace.since)
     a = innovation.row_variance(state.innovation, period)
     grown = min(1.0, max(state.age[0], period) / _CHANGING_TIME)
-    fill_equations(settings, state, work, prior, a, grown)
+    fill_equations(settings, state, workspace, prior, a, grown)
     cholesky_factor(state.factor)
     cholesky_solve(state.factor, state.solution)
 
 
 @inner
-def describe(settings: Settings, state: State, work: Work, period: float) -> None:
+def describe(
+    settings: Settings, state: State, workspace: Workspace, period: float
+) -> None:
     """Write mass and centre of the load to `state.load`, and their standard deviations.
 
     The covariance of z is a (U^T U)^-1 with the last rows U of the factor.  The centre
@@ -483,7 +502,7 @@ def describe(settings: Settings, state: State, work: Work, period: float) -> Non
     m = state.solution.size - k
     U = state.factor[m:, m:]
     z = state.solution[m:]
-    v = work.spread
+    v = workspace.spread
     a = innovation.row_variance(state.innovation, period)
     for r in range(4):
         state.load[r] = 0.0
