@@ -36,20 +36,20 @@ def _links(tree: Tree, joints: Sequence[str], tip: str) -> dict[str, bool]:
     moved = {tree.root: False}
     waiting = list(tree.joints.values())
     while waiting:
-        left = []
+        unresolved = []
         for joint in waiting:
             child = _child(joint)
             parent = joint.find('parent')
             above = moved.get('' if parent is None else parent.get('link', ''))
             if above is None:
-                left.append(joint)
+                unresolved.append(joint)
                 continue
             is_moved = above or joint.get('name') in joints
             if is_moved or child in path:
                 moved[child] = is_moved
-        if len(left) == len(waiting):
+        if len(unresolved) == len(waiting):
             break
-        waiting = left
+        waiting = unresolved
     return moved
 
 
@@ -62,8 +62,8 @@ def _strip(link: ET.Element, *, is_moved: bool) -> None:
     """Leave only an inertia that has an effect; others need not be physical."""
     for part in list(link):
         mass = part.find('mass')
-        is_felt = mass is not None and float(mass.get('value', '0')) > 0.0
-        if part.tag != 'inertial' or not (is_moved and is_felt):
+        has_mass = mass is not None and float(mass.get('value', '0')) > 0.0
+        if part.tag != 'inertial' or not (is_moved and has_mass):
             link.remove(part)
 
 

@@ -103,10 +103,10 @@ def _regressor_at_random(full: SerialChain) -> np.ndarray:
     return blocks.reshape(-1, full.p)
 
 
-def _sum(row: np.ndarray, own: int, names: tuple[str, ...]) -> str:
-    text = names[own]
+def _sum(row: np.ndarray, index: int, names: tuple[str, ...]) -> str:
+    text = names[index]
     for k in np.flatnonzero(row):
-        if k != own:
+        if k != index:
             factor = (
                 '' if abs(abs(row[k]) - 1.0) < _DEPENDENT else f'{abs(row[k]):.4g} '
             )
@@ -141,28 +141,28 @@ def payload_inertia(payload: float) -> np.ndarray:
     return payload * np.diag((*(PAYLOAD_SIZE**2,) * 3, 1.0))
 
 
-def deviations(J: np.ndarray, share: float, centre: float) -> np.ndarray:
+def deviations(J: np.ndarray, relative: float, centre: float) -> np.ndarray:
     """Return one standard deviation of the ten along each of ten independent directions (10, 10).
 
-    `share` is that of mass and spread, relative to them, `centre` that of the centre of
+    `relative` is that of mass and spread, relative to them, `centre` that of the centre of
     mass [m].
     """
     if J[3, 3] == 0.0:
         return np.zeros((10, 10))
-    directions = [share * J]
+    directions = [relative * J]
     for k in range(3):
         D = np.zeros((4, 4))
         D[k, 3] = centre
         directions.append(product(D, J) + product(J, D.T))
-    least = J[3, 3] * centre**2
-    L = J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / J[3, 3] + least * np.eye(3)
+    min_spread = J[3, 3] * centre**2
+    L = J[:3, :3] - np.outer(J[:3, 3], J[:3, 3]) / J[3, 3] + min_spread * np.eye(3)
     for a in range(3):  # Cholesky factor of the spread, of at least the extent `centre`
-        L[a:, a] /= np.sqrt(max(L[a, a], least))
+        L[a:, a] /= np.sqrt(max(L[a, a], min_spread))
         L[a + 1 :, a + 1 :] -= np.outer(L[a + 1 :, a], L[a + 1 :, a])
         L[:a, a] = 0.0
     for a in range(3):
         for b in range(a + 1):
             E = np.zeros((4, 4))
             E[:3, :3] = (np.outer(L[:, a], L[:, b]) + np.outer(L[:, b], L[:, a])) / 2.0
-            directions.append(share * E * (1.0 if a == b else np.sqrt(2.0)))
+            directions.append(relative * E * (1.0 if a == b else np.sqrt(2.0)))
     return np.transpose([inertia_of(direction) for direction in directions])

@@ -42,29 +42,29 @@ def fading(velocity: float, scale: float) -> float:
 
 def slidings(velocity: Floats, scale: float) -> Floats:
     """Return s (N, k) at velocities (N, k)."""
-    found = np.empty(velocity.shape)
-    fill_slidings(np.ascontiguousarray(velocity), scale, found)
-    return found
+    values = np.empty(velocity.shape)
+    fill_slidings(np.ascontiguousarray(velocity), scale, values)
+    return values
 
 
 def fadings(velocity: Floats, scale: float) -> Floats:
     """Return g (N, k) at velocities (N, k)."""
-    found = np.empty(velocity.shape)
-    fill_fadings(np.ascontiguousarray(velocity), scale, found)
-    return found
+    values = np.empty(velocity.shape)
+    fill_fadings(np.ascontiguousarray(velocity), scale, values)
+    return values
 
 
 @kernel
-def fill_slidings(velocity: np.ndarray, scale: float, found: np.ndarray) -> None:
+def fill_slidings(velocity: np.ndarray, scale: float, values: np.ndarray) -> None:
     """Fill s (N, k) at velocities (N, k)."""
     for k in range(velocity.shape[0]):
         for i in range(velocity.shape[1]):
-            found[k, i] = sliding(velocity[k, i], scale)
+            values[k, i] = sliding(velocity[k, i], scale)
 
 
 @kernel
-def fill_fadings(velocity: np.ndarray, scale: float, found: np.ndarray) -> None:
+def fill_fadings(velocity: np.ndarray, scale: float, values: np.ndarray) -> None:
     """Fill g (N, k) at velocities (N, k)."""
     for k in range(velocity.shape[0]):
         for i in range(velocity.shape[1]):
-            found[k, i] = fading(velocity[k, i], scale)
+            values[k, i] = fading(velocity[k, i], scale)

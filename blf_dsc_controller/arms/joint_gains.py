@@ -62,7 +62,7 @@ class JointGains(NamedTuple):
     stiffness: Floats  # (n,) N m/rad
     damping: Floats  # (n,) N m s/rad
     damping_lag: float | Floats = 0.0  # s, of all joints or of each (n,)
-    share: float = ALONE  # c of the integral, at most
+    integral_fraction: float = ALONE  # c of the integral, at most
 
     @property
     def rate(self) -> Floats:
@@ -72,7 +72,7 @@ class JointGains(NamedTuple):
     def integral(self, inertia: Floats) -> Floats:
         """Return gamma (n,) [N m/rad] for the largest inertia of each joint (n,) [kg m^2]."""
         damped = _DAMPED * self.damping / (self.rate * inertia)
-        return self.rate * self.damping * np.minimum(damped, self.share)
+        return self.rate * self.damping * np.minimum(damped, self.integral_fraction)
 
     def scaled(self, factor: float | Floats) -> JointGains:
         """Return stiffness and damping times a factor."""
@@ -81,7 +81,7 @@ class JointGains(NamedTuple):
         )
 
 
-def largest_share(*, has_torque_loop: bool) -> float:
+def max_integral_fraction(*, has_torque_loop: bool) -> float:
     """Return the largest share of the integral of an arm."""
     return BESIDE if has_torque_loop else ALONE
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.joint_gains import (
     JointGains,
     damped_arm,
-    largest_share,
     linear,
+    max_integral_fraction,
 )
 from blf_dsc_controller.arms.linear_loop import (
     Feedback,
@@ -106,11 +106,13 @@ class GearedArm(NamedTuple):
 
     def joint_gains(self) -> JointGains:
         """Return the stiffest gains of joints, each on its own, with the margin."""
-        share = largest_share(has_torque_loop=self.gears.has_torque_loop)
+        integral_fraction = max_integral_fraction(
+            has_torque_loop=self.gears.has_torque_loop
+        )
 
         def gains(rate: float) -> JointGains:
             gains = damped_arm(rate * self.gears.motors, self.inertia)
-            return gains._replace(share=share)
+            return gains._replace(integral_fraction=integral_fraction)
 
         def feedback(rate: float) -> Feedback:
             return linear(gains(rate), self.inertia, len(self.links))

@@ -128,12 +128,12 @@ class Loop(NamedTuple):
         G = arm_response(self.links, self.joints, self.timing, s)
         C = law_response(self.feedback, self.timing, s)
         distance = np.eye(len(self.joints.motors)) + G @ C
-        least = np.linalg.svd(distance, compute_uv=False)[..., -1]
-        posture, at = np.unravel_index(int(least.argmin()), least.shape)
-        value = float(least[posture, at]) if self.is_stable() else 0.0
-        _, _, directions = np.linalg.svd(distance[posture, at])
+        smallest = np.linalg.svd(distance, compute_uv=False)[..., -1]
+        posture, index = np.unravel_index(int(smallest.argmin()), smallest.shape)
+        value = float(smallest[posture, index]) if self.is_stable() else 0.0
+        _, _, directions = np.linalg.svd(distance[posture, index])
         joint = int(np.abs(directions[-1]).argmax())
-        return Margin(value, float(frequencies[at]), int(posture), joint)
+        return Margin(value, float(frequencies[index]), int(posture), joint)
 
 
 class Margin(NamedTuple):
@@ -148,24 +148,24 @@ class Margin(NamedTuple):
 def arm_response(links: Floats, joints: Joints, timing: Timing, s: Complex) -> Complex:
     """Return G (k, f, n, n) [rad/(N m)] at s = i omega (f,), from torque to position."""
     T = timing.period
-    held = (1.0 - np.exp(-T * s)) / (T * s) * np.exp(-timing.delay * T * s)
-    held = held / (1.0 + timing.drive_lag * s)
+    hold = (1.0 - np.exp(-T * s)) / (T * s) * np.exp(-timing.delay * T * s)
+    hold = hold / (1.0 + timing.drive_lag * s)
     s = s[:, None]  # (f, n) from here on
     motors = joints.motors * s**2 + joints.viscous * s
     M = links[:, None] * (s**2)[..., None]  # (k, f, n, n)
     if joints.stiffness is None:
-        return np.linalg.inv(M + _diagonals(motors)) * held[:, None, None]
+        return np.linalg.inv(M + _diagonals(motors)) * hold[:, None, None]
     spring = joints.stiffness + _damping(links, joints, joints.stiffness) * s
     loop = joints.torque_loop or TorqueLoop(0.0, 0.0)
     sensed = (loop.gain + loop.damping * s) / (1.0 + loop.lag * s)
     free = np.linalg.inv(M + _diagonals(spring))
-    links_of_motors = free * spring[:, None, :]  # q = ... th
-    back = spring * (1.0 + sensed)
-    motor = _diagonals(motors + back) - back[..., None] * links_of_motors
-    motors_of_torque = np.linalg.inv(motor) * ((1.0 + loop.gain) * held)[:, None, None]
+    link_response = free * spring[:, None, :]  # q = ... th
+    reaction = spring * (1.0 + sensed)
+    motor = _diagonals(motors + reaction) - reaction[..., None] * link_response
+    motor_response = np.linalg.inv(motor) * ((1.0 + loop.gain) * hold)[:, None, None]
     if joints.motor_side:
-        return motors_of_torque
-    return np.asarray(links_of_motors @ motors_of_torque)
+        return motor_response
+    return np.asarray(link_response @ motor_response)
 
 
 def law_response(feedback: Feedback, timing: Timing, s: Complex) -> Complex:
@@ -174,8 +174,8 @@ def law_response(feedback: Feedback, timing: Timing, s: Complex) -> Complex:
     z = np.exp(T * s)[:, None, None]
     decay = _decay(timing.velocity_lag, T)
     velocity = (1.0 - decay) * (1.0 - 1.0 / z) / T / (1.0 - decay / z)
-    of_position, of_velocity = law_responses(feedback, T, s)
-    return np.asarray(of_position + velocity * of_velocity)
+    C_y, C_v = law_responses(feedback, T, s)
+    return np.asarray(C_y + velocity * C_v)
 
 
 def law_responses(feedback: Feedback, T: float, s: Complex) -> tuple[Complex, Complex]:
@@ -191,21 +191,21 @@ def law_responses(feedback: Feedback, T: float, s: Complex) -> tuple[Complex, Co
         -T * feedback.rate / (z - 1.0 + g) if feedback.known_rate else 0.0 * followed
     )
     return (
-        feedback.position[:, None] + _of_alpha2(feedback, T, z, followed, 0.0),
-        _of_alpha2(feedback, T, z, known, 1.0),
+        feedback.position[:, None] + _alpha2_response(feedback, T, z, followed, 0.0),
+        _alpha2_response(feedback, T, z, known, 1.0),
     )
 
 
-def _of_alpha2(
+def _alpha2_response(
     feedback: Feedback, T: float, z: Complex, alpha2: Complex, velocity: float
 ) -> Complex:
     """Return what the law adds for alpha2 (f, n) and the velocity."""
     dalpha2 = (z - 1.0) / T * alpha2
     xi2 = velocity - alpha2
     d3 = -T / (z - 1.0) * xi2
-    late = low_pass(_damping_decay(feedback, T), z) * xi2
+    lagged = low_pass(_damping_decay(feedback, T), z) * xi2
     return np.asarray(
-        feedback.surface[:, None] * late[:, None, :]
+        feedback.surface[:, None] * lagged[:, None, :]
         - feedback.inertia[:, None] * dalpha2[:, None, :]
         - feedback.integral[:, None] * d3[:, None, :]
     )
@@ -249,125 +249,127 @@ def _sampled_arm(
     """
     k, n, _ = links.shape
     arm = _rigid_arm if joints.stiffness is None else _elastic_arm
-    rate, push, sensed = arm(links, joints)
+    A, G, sensed = arm(links, joints)
     drive = slice(-n, None)
     lag = max(timing.drive_lag, _SHORTEST)
-    rate[:, drive, drive] = -np.eye(n) / lag
-    push[:, drive, :n] = np.eye(n) / lag
-    size = rate.shape[1]
-    whole = np.zeros((k, size + 2 * n, size + 2 * n))
-    whole[:, :size, :size] = rate
-    whole[:, :size, size:] = push
+    A[:, drive, drive] = -np.eye(n) / lag
+    G[:, drive, :n] = np.eye(n) / lag
+    size = A.shape[1]
+    augmented = np.zeros((k, size + 2 * n, size + 2 * n))
+    augmented[:, :size, :size] = A
+    augmented[:, :size, size:] = G
     from scipy.linalg import expm  # 0.1 s and a pool of threads: only where it is used
 
-    over = expm(timing.period * whole)[:, :size]
-    return over[..., :size], over[..., size:], sensed
+    sampled = expm(timing.period * augmented)[:, :size]
+    return sampled[..., :size], sampled[..., size:], sensed
 
 
 def _rigid_arm(links: Floats, joints: Joints) -> tuple[Floats, Floats, Floats]:
     """Return x' = A x + G [tau, d], with y = sensed x, but for the drives: x = [q, q', drive]."""
     k, n, _ = links.shape
     q, dq, drive = np.eye(3 * n).reshape(3, n, 3 * n)
-    rate, push = np.zeros((k, 3 * n, 3 * n)), np.zeros((k, 3 * n, 2 * n))
+    A, G = np.zeros((k, 3 * n, 3 * n)), np.zeros((k, 3 * n, 2 * n))
     free = np.linalg.inv(links + np.diag(joints.motors))
-    rate[:, :n] = dq
-    rate[:, n : 2 * n] = free @ (drive - joints.viscous[:, None] * dq)
-    push[:, n : 2 * n, n:] = free
-    return rate, push, q
+    A[:, :n] = dq
+    A[:, n : 2 * n] = free @ (drive - joints.viscous[:, None] * dq)
+    G[:, n : 2 * n, n:] = free
+    return A, G, q
 
 
 def _elastic_arm(links: Floats, joints: Joints) -> tuple[Floats, Floats, Floats]:
     """Return the same for x = [q, q', th, th', s, drive]."""
     k, n, _ = links.shape
-    q, dq, th, dth, behind, drive = np.eye(6 * n).reshape(6, n, 6 * n)
+    q, dq, th, dth, lagged_spring, drive = np.eye(6 * n).reshape(6, n, 6 * n)
     K = np.asarray(joints.stiffness)
     D = _damping(links, joints, K)
     spring = K[:, None] * (th - q) + D[:, None] * (dth - dq)
     loop = joints.torque_loop or TorqueLoop(0.0, 0.0)
-    change = (spring - behind) / loop.lag
-    u = (1.0 + loop.gain) * drive - loop.gain * behind - loop.damping * change
+    change = (spring - lagged_spring) / loop.lag
+    u = (1.0 + loop.gain) * drive - loop.gain * lagged_spring - loop.damping * change
     friction = joints.viscous[:, None] * dth
     free = np.linalg.inv(links)
-    rate, push = np.zeros((k, 6 * n, 6 * n)), np.zeros((k, 6 * n, 2 * n))
-    rate[:, :n] = dq
-    rate[:, n : 2 * n] = free @ spring
-    rate[:, 2 * n : 3 * n] = dth
-    rate[:, 3 * n : 4 * n] = (u - spring - friction) / joints.motors[:, None]
-    rate[:, 4 * n : 5 * n] = change
-    push[:, n : 2 * n, n:] = free
-    return rate, push, th if joints.motor_side else q
+    A, G = np.zeros((k, 6 * n, 6 * n)), np.zeros((k, 6 * n, 2 * n))
+    A[:, :n] = dq
+    A[:, n : 2 * n] = free @ spring
+    A[:, 2 * n : 3 * n] = dth
+    A[:, 3 * n : 4 * n] = (u - spring - friction) / joints.motors[:, None]
+    A[:, 4 * n : 5 * n] = change
+    G[:, n : 2 * n, n:] = free
+    return A, G, th if joints.motor_side else q
 
 
-class _Held(NamedTuple):
+class _Memory(NamedTuple):
     """What the law and the way to the drives keep for the next sample.
 
     Each is a matrix (n, N) or (k, n, N) that takes it from the whole state x (N,).
     """
 
-    under_way: tuple[Floats, ...]  # torques, the oldest first, N m
+    pending: tuple[Floats, ...]  # torques, the oldest first, N m
     y: Floats  # rad
     v: Floats  # rad/s
     alpha2: Floats  # rad/s
     d3: Floats  # N m
-    late: tuple[Floats, ...]  # xi2 behind `damping_lag`, if there is one
+    lagged: tuple[Floats, ...]  # xi2 behind `damping_lag`, if there is one
 
     @property
     def parts(self) -> tuple[Floats, ...]:
         """All of them, in the order of the state."""
-        return (*self.under_way, self.y, self.v, self.alpha2, self.d3, *self.late)
+        return (*self.pending, self.y, self.v, self.alpha2, self.d3, *self.lagged)
 
 
-def _held(size: int, n: int, delay: int, *, lags: bool) -> _Held:
+def _memory_before(size: int, n: int, delay: int, *, lags: bool) -> _Memory:
     """Return what is held before a sample: behind the `size` states of the arm."""
     blocks = delay + 4 + lags
     rows = np.eye(size + blocks * n)[size:].reshape(blocks, n, -1)
     y, v, alpha2, d3 = rows[delay : delay + 4]
-    return _Held(tuple(rows[:delay]), y, v, alpha2, d3, tuple(rows[delay + 4 :]))
+    return _Memory(tuple(rows[:delay]), y, v, alpha2, d3, tuple(rows[delay + 4 :]))
 
 
 def _law_step(
-    held: _Held, y: Floats, T: float, velocity_lag: float, law: Feedback
-) -> tuple[Floats, _Held]:
+    memory: _Memory, y: Floats, T: float, velocity_lag: float, law: Feedback
+) -> tuple[Floats, _Memory]:
     """Return the law's torque at the measured position y, and what is held after it.
 
     Both are matrices, as is y, that take them from the whole state.
     """
-    decay = _decay(velocity_lag, T)
-    v = decay * held.v + (1.0 - decay) * (y - held.y) / T
+    velocity_decay = _decay(velocity_lag, T)
+    v = velocity_decay * memory.v + (1.0 - velocity_decay) * (y - memory.y) / T
     rate = law.rate[:, None]
     g = 1.0 - np.exp(-T / law.time_constant)
-    dalpha2 = g * (-rate * y - held.alpha2) / T
+    dalpha2 = g * (-rate * y - memory.alpha2) / T
     if law.known_rate:
         dalpha2 = dalpha2 - rate * v
-    xi2 = v - held.alpha2
-    left = _damping_decay(law, T)[..., None]
-    late = tuple(left * each + (1.0 - left) * xi2 for each in held.late)
-    damped = late[0] if late else xi2
+    xi2 = v - memory.alpha2
+    damping_decay = _damping_decay(law, T)[..., None]
+    lagged = tuple(
+        damping_decay * each + (1.0 - damping_decay) * xi2 for each in memory.lagged
+    )
+    damped = lagged[0] if lagged else xi2
     tau = law.inertia @ dalpha2 - law.position @ y - law.surface @ damped
-    tau = tau + held.d3
-    alpha2 = held.alpha2 + T * dalpha2
-    d3 = held.d3 - T * (law.integral @ xi2)
-    under_way = (*held.under_way, tau)[1:]
-    return tau, _Held(under_way, y, v, alpha2, d3, late)
+    tau = tau + memory.d3
+    alpha2 = memory.alpha2 + T * dalpha2
+    d3 = memory.d3 - T * (law.integral @ xi2)
+    pending = (*memory.pending, tau)[1:]
+    return tau, _Memory(pending, y, v, alpha2, d3, lagged)
 
 
 def _with_law(
-    arm: Floats, push: Floats, sensed: Floats, timing: Timing, law: Feedback
+    arm: Floats, G: Floats, sensed: Floats, timing: Timing, law: Feedback
 ) -> tuple[Floats, Floats]:
     """Return A and B of arm, torques under way and law together."""
     k, size, _ = arm.shape
     n = len(sensed)
-    before = _held(size, n, timing.delay, lags=bool(np.any(law.damping_lag)))
-    N = before.y.shape[1]
+    memory = _memory_before(size, n, timing.delay, lags=bool(np.any(law.damping_lag)))
+    N = memory.y.shape[1]
     y = np.zeros((n, N))
     y[:, :size] = sensed
-    tau, after = _law_step(before, y, timing.period, timing.velocity_lag, law)
-    acting = before.under_way[0] if timing.delay else tau
+    tau, next_memory = _law_step(memory, y, timing.period, timing.velocity_lag, law)
+    acting = memory.pending[0] if timing.delay else tau
     A = np.zeros((k, N, N))
     A[:, :size, :size] = arm
-    A[:, :size] += push[..., :n] @ acting
-    kept = [np.broadcast_to(part, (k, n, N)) for part in after.parts]
-    A[:, size:] = np.concatenate(kept, axis=1)
+    A[:, :size] += G[..., :n] @ acting
+    rows = [np.broadcast_to(part, (k, n, N)) for part in next_memory.parts]
+    A[:, size:] = np.concatenate(rows, axis=1)
     B = np.zeros((k, N, n))
-    B[:, :size] = push[..., n:]
+    B[:, :size] = G[..., n:]
     return A, B

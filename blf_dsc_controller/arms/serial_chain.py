@@ -133,17 +133,17 @@ def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> 
     motions = bodies.motions
     rotation = bodies.rotation[i]
     c, s = cos(q), sin(q)
-    column0 = turned(rotation, c, s, 0)
-    column1 = turned(rotation, c, s, 1)
-    column2 = turned(rotation, c, s, 2)
+    column0 = rotation_column(rotation, c, s, 0)
+    column1 = rotation_column(rotation, c, s, 1)
+    column2 = rotation_column(rotation, c, s, 2)
     offset, slide = bodies.offset[i], bodies.slide[i]
     origin = (
         offset[0] + q * slide[0],
         offset[1] + q * slide[1],
         offset[2] + q * slide[2],
     )
-    own = AXES + 2 * i
-    for row in range(own):
+    row_of_joint = AXES + 2 * i
+    for row in range(row_of_joint):
         motion = motions[row]
         w, u = angular(motion), linear(motion)
         u = plus(u, cross(w, origin))
@@ -153,7 +153,7 @@ def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> 
         motion[4] = dot(column1, u)
         motion[2] = dot(column2, w)
         motion[5] = dot(column2, u)
-    axis, rate = motions[own], motions[own + 1]
+    axis, rate = motions[row_of_joint], motions[row_of_joint + 1]
     S = bodies.axis[i]
     w = angular(motions[VELOCITY])
     u = linear(motions[VELOCITY])
@@ -171,7 +171,7 @@ def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> 
 
 
 @inner
-def turned(rotation: Array, c: float, s: float, k: int) -> Vector:
+def rotation_column(rotation: Array, c: float, s: float, k: int) -> Vector:
     """Return column k of R0 + c R1 + s R2 (3, 3, 3)."""
     return (
         rotation[0, 0, k] + c * rotation[1, 0, k] + s * rotation[2, 0, k],
@@ -194,7 +194,7 @@ def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
     for j in range(i + 1):
         torque_products(motions[AXES + 2 * j], alpha, A, w, reference, products)
         products[ROTOR] = a if j == i else 0.0
-        choose(bodies, i, j, products, H)
+        fill_columns(bodies, i, j, products, H)
 
 
 @inner
@@ -211,7 +211,7 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> Non
         dS = motions[AXES + 2 * j + 1]
         momentum_products(S, w, u, momenta)
         momenta[ROTOR] = dq if j == i else 0.0
-        choose(bodies, i, j, momenta, Yp)
+        fill_columns(bodies, i, j, momenta, Yp)
         momentum_products(dS, w, u, forces)
         lever = cross(g, angular(S))
         forces[0] += dot(linear(S), g)
@@ -221,11 +221,11 @@ def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> Non
         for entry in range(ROTOR):
             forces[entry] = -forces[entry]
         forces[ROTOR] = 0.0
-        choose(bodies, i, j, forces, Yr)
+        fill_columns(bodies, i, j, forces, Yr)
 
 
 @inner
-def choose(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
+def fill_columns(bodies: Bodies, i: int, j: int, products: Array, Y: Array) -> None:
     """Copy the products that are columns of body i to row j of Y; zero the rows below i."""
     for k in range(int(bodies.first[i]), int(bodies.first[i + 1])):
         Y[j, k] = products[int(bodies.entry[k])]

@@ -129,8 +129,8 @@ class Gains(NamedTuple):
 def gains_of(arm: Design) -> Gains:
     """Return the gains of the law for an arm."""
     if arm.joints is None:
-        return _through_inertia(arm)
-    return _of_joints(arm, arm.joints.scaled(arm.stiffness))
+        return _inertia_feedback(arm)
+    return _joint_feedback(arm, arm.joints.scaled(arm.stiffness))
 
 
 def defaults_of(arm: Design) -> Mapping[str, Value]:
@@ -141,14 +141,14 @@ def defaults_of(arm: Design) -> Mapping[str, Value]:
         bound = (float(f'{_BOUND / arm.stiffness**2:.4g}'),) * n
     else:
         bound = _listed(np.maximum(gains.sag, _BOUND))
-    return _of_arm(arm) | {
+    return _independent_defaults(arm) | {
         'feedback.inertia': 'whole' if arm.joints is None else 'none',
         'barrier.bound': bound,
         'disturbance.gain': gains.integral,
     }
 
 
-def _through_inertia(arm: Design) -> Gains:
+def _inertia_feedback(arm: Design) -> Gains:
     """Return the gains of feedback through the inertia matrix."""
     n = len(arm.chain.joints)
     fastest = _PHASE / loop_delay(arm.sample_time, arm.lag)
@@ -170,26 +170,26 @@ def _through_inertia(arm: Design) -> Gains:
     )
 
 
-def _of_joints(arm: Design, gains: JointGains) -> Gains:
+def _joint_feedback(arm: Design, gains: JointGains) -> Gains:
     """Return the gains of joints, each on its own."""
     postures = arm.over_postures()
-    pushed = postures.gravity + _PUSH * arm.efforts + arm.friction
-    sag = np.minimum(_SAG * pushed / gains.stiffness, WIDEST)
+    disturbance = postures.gravity + _PUSH * arm.efforts + arm.friction
+    sag = np.minimum(_SAG * disturbance / gains.stiffness, WIDEST)
     heaviest = (postures.inertia + arm.unknown_rotors) / _HEAVIEST
     inertia = np.maximum(postures.inertia, heaviest)
-    beside = gains._replace(share=BESIDE).integral(inertia)
-    law = barriers(gains)
+    integral_beside = gains._replace(integral_fraction=BESIDE).integral(inertia)
+    barrier_gains = barriers(gains)
     return Gains(
         sag=tuple(sag.tolist()),
         funnel_rate=float(f'{funnel_rate(gains):.4g}'),
-        weight=_listed(law.weight),
-        slope_limit=_listed(law.slope_limit),
-        surface=_listed(law.surface),
-        mu=_listed(law.mu),
+        weight=_listed(barrier_gains.weight),
+        slope_limit=_listed(barrier_gains.slope_limit),
+        surface=_listed(barrier_gains.surface),
+        mu=_listed(barrier_gains.mu),
         feedback=_listed(gains.damping),
         damping_rate=0.0,
         integral=_listed(gains.integral(inertia)),
-        adaptation=adaptation_gain(beside, postures.gravity),
+        adaptation=adaptation_gain(integral_beside, postures.gravity),
     )
 
 
@@ -224,12 +224,12 @@ def adaptation_gain(integral: np.ndarray, deviation: np.ndarray) -> float:
     return min(_ADAPTATION, float(f'{slow:.4g}'))
 
 
-def _of_arm(arm: Design) -> dict[str, Value]:
+def _independent_defaults(arm: Design) -> dict[str, Value]:
     """Return what does not depend on the feedback: limits, learning, safety."""
-    return {**_limits_of(arm), **_learning_of(arm)}
+    return {**_limits(arm), **_learning(arm)}
 
 
-def _limits_of(arm: Design) -> dict[str, Value]:
+def _limits(arm: Design) -> dict[str, Value]:
     """Return the joints, their limits, a reference that holds within them, and safety."""
     joints = arm.chain.joints
     effort = _finite([joint.effort for joint in joints], UNKNOWN_EFFORT)
@@ -263,7 +263,7 @@ def _limits_of(arm: Design) -> dict[str, Value]:
     }
 
 
-def _learning_of(arm: Design) -> dict[str, Value]:
+def _learning(arm: Design) -> dict[str, Value]:
     """Return what learning needs: where it begins, how far it goes, and its filters."""
     return {
         'learning.window': _WINDOW,

@@ -44,8 +44,8 @@ from blf_dsc_controller.numerics.algebra import product
 from blf_dsc_controller.numerics.elementary import cos, sin
 
 _MOVING = ('revolute', 'continuous', 'prismatic')
-_MOST_KINDS = 5  # that a message names
-_MOST_NAMES = 16  # likewise
+_MAX_KINDS = 5  # that a message names
+_MAX_NAMES = 16  # likewise
 _GRIPPER = re.compile('gripper|finger|jaw', re.IGNORECASE)
 _ACCELERATIONS = ('acceleration', 'deceleration')  # of URDF 1.2
 _MAX_ELEMENTS = 500  # of links, and of joints
@@ -366,7 +366,7 @@ class Tree(NamedTuple):
             )
         trunk = self.trunk()
         if len(trunk) < len(moving):
-            such = ' or '.join(self.limbs()[:_MOST_KINDS])
+            such = ' or '.join(self.limbs()[:_MAX_KINDS])
             raise BlfDscError(
                 'neither a tip nor joints were given, and the moving joints are not one chain: '
                 f'{_shortened(moving)}. Set robot.tip to the last link of the arm, such as {such}'
@@ -378,7 +378,7 @@ class Tree(NamedTuple):
             f'{name!r} is {joint.get("type") or "of no type"}'
             for name, joint in self.joints.items()
         ]
-        return ', '.join(kinds[:_MOST_KINDS]) or 'there is none'
+        return ', '.join(kinds[:_MAX_KINDS]) or 'there is none'
 
     def body(self, link: str, joints: Sequence[str]) -> _Body:
         """Return a link with all that it carries, where no other joint than `joints` moves."""
@@ -408,28 +408,28 @@ def _check_tree(
     """Raise BlfDscError if a link has a `second` joint above it, or is above itself."""
     only = 'only trees are read, such as serial arms: remove a joint without a motor'
     for link, joint in second.items():
-        ways = [_up(each, above) for each in (above[link], joint)]
-        shared = [each for each in ways[0] if each in ways[1]]
-        meet = shared or _link(ways[0][-1], 'parent') == _link(ways[1][-1], 'parent')
-        loop = [each for way in ways for each in way[::-1] if each not in shared]
+        paths = [_ancestors(each, above) for each in (above[link], joint)]
+        shared = [each for each in paths[0] if each in paths[1]]
+        meet = shared or _link(paths[0][-1], 'parent') == _link(paths[1][-1], 'parent')
+        loop = [each for path in paths for each in path[::-1] if each not in shared]
         problem = f'link {link!r} is the child of two joints'
         if meet:
             raise BlfDscError(f'{problem}, in a loop of {_edges(loop)}: {only}')
         raise BlfDscError(f'{problem}, {_edges([above[link], joint])}: {only}')
     for link, joint in above.items():
-        loop = _up(joint, above)
+        loop = _ancestors(joint, above)
         if _link(loop[-1], 'parent') == link:
             raise BlfDscError(f'joints form a loop, {_edges(loop[::-1])}: {only}')
 
 
-def _up(joint: ET.Element, above: Mapping[str, ET.Element]) -> list[ET.Element]:
+def _ancestors(joint: ET.Element, above: Mapping[str, ET.Element]) -> list[ET.Element]:
     """Return a joint and those above it, up to the root, or once around a loop."""
-    way = [joint]
-    while (parent := above.get(_link(way[-1], 'parent'))) is not None:
-        if parent in way:
+    path = [joint]
+    while (parent := above.get(_link(path[-1], 'parent'))) is not None:
+        if parent in path:
             break
-        way.append(parent)
-    return way
+        path.append(parent)
+    return path
 
 
 def _edges(joints: Sequence[ET.Element]) -> str:
@@ -653,12 +653,12 @@ def _numbers(
     if len(numbers) != count or not all(abs(number) <= largest for number in numbers):
         raise BlfDscError(
             f'<{element.tag} {key}="{text}">: expected {count} finite number(s) of at most '
-            f'{largest:g} in magnitude{_of_comma(text)}'
+            f'{largest:g} in magnitude{_comma_hint(text)}'
         )
     return np.array(numbers)
 
 
-def _of_comma(text: str) -> str:
+def _comma_hint(text: str) -> str:
     """Return what to write instead of numbers with a comma; or empty."""
     is_between = re.search(r'\d,\d', text)
     return ': write decimal points, and spaces between numbers' if is_between else ''
@@ -670,5 +670,5 @@ def _listed(names: Iterable[object]) -> str:
 
 def _shortened(names: Sequence[str]) -> str:
     """Return the first of many names, and how many follow."""
-    more = len(names) - _MOST_NAMES
-    return _listed(names[:_MOST_NAMES]) + (f' and {more} more' if more > 0 else '')
+    more = len(names) - _MAX_NAMES
+    return _listed(names[:_MAX_NAMES]) + (f' and {more} more' if more > 0 else '')

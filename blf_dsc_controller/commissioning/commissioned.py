@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from blf_dsc_controller.arms.joint_gains import (
     JointGains,
     damped_arm,
-    largest_share,
+    max_integral_fraction,
 )
 from blf_dsc_controller.arms.known_gears import MARGIN
 from blf_dsc_controller.arms.model import inertia_matrices
@@ -259,12 +259,12 @@ def _gains_by_factors(
     from the damping and the inertia (n,) [kg m^2].
     """
     follows_damping = not config.feedback.joint_stiffness
-    share = largest_share(has_torque_loop=config.robot.torque_loop)
+    integral_fraction = max_integral_fraction(has_torque_loop=config.robot.torque_loop)
 
     def gains(factors: Floats) -> JointGains:
         scaled = start.scaled(factors)
         found = damped_arm(scaled.damping, inertia) if follows_damping else scaled
-        return found._replace(share=share)
+        return found._replace(integral_fraction=integral_fraction)
 
     return gains
 

@@ -130,7 +130,9 @@ def measuring_gains(config: ControllerConfig) -> JointGains:
     arm, _ = design_of(config)
     gains = arm.joints or unknown_arm(arm.rotors)
     lag = np.array(config.feedback.lags(len(config.joints)))
-    return gains.scaled(arm.stiffness)._replace(damping_lag=lag, share=BESIDE)
+    return gains.scaled(arm.stiffness)._replace(
+        damping_lag=lag, integral_fraction=BESIDE
+    )
 
 
 def _check_posture(config: ControllerConfig, posture: Floats) -> None:

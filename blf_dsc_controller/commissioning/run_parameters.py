@@ -64,6 +64,6 @@ def _slow_integral(config: ControllerConfig) -> Floats:
     arm, _ = design_of(config)
     if arm.joints is None:
         return usual
-    beside = arm._replace(joints=arm.joints._replace(share=BESIDE))
+    beside = arm._replace(joints=arm.joints._replace(integral_fraction=BESIDE))
     slow = np.array(gains_of(beside).integral)
     return np.asarray(np.minimum(usual, slow))

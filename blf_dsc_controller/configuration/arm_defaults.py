@@ -13,7 +13,7 @@ from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.joint_gains import (
     GIVEN,
     JointGains,
-    largest_share,
+    max_integral_fraction,
     unknown_arm,
 )
 from blf_dsc_controller.arms.known_gears import Gears
@@ -73,7 +73,7 @@ def stated_design(
     usual = 'none' if is_own else 'whole'
     is_whole = given.get('feedback.inertia', usual) != 'none'
     gains = _given_gains(given, len(motors)) or unknown_arm(motors)
-    share = largest_share(has_torque_loop=robot.torque_loop)
+    integral_fraction = max_integral_fraction(has_torque_loop=robot.torque_loop)
     arm = tuning.Design(
         chain,
         base,
@@ -83,7 +83,7 @@ def stated_design(
         robot.unknown_friction(chain),
         robot.payload,
         robot.lag,
-        None if is_whole else gains._replace(share=share),
+        None if is_whole else gains._replace(integral_fraction=integral_fraction),
         given.get('feedback.stiffness', Feedback().stiffness),
         given.get('sample_time', ArmConfig.sample_time),
     )

@@ -151,7 +151,7 @@ def _unusual(guard: Guard) -> str:
     samples = guard.samples
     if samples.outside:
         return 'the error has left its bound'
-    if guard.oscillation.is_due(guard.reference.time):
+    if guard.oscillation.is_ongoing(guard.reference.time):
         return guard.oscillation.text
     if guard.findings.untrusted:
         return guard.findings.untrusted

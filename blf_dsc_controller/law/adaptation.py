@@ -138,9 +138,10 @@ def adapt(
     tracks: bool,
     dt: float,
 ) -> None:
-    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20), with eps or W eps in `workspace.rate`.
+    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20).
 
-    H is (n, m); the tracking error acts on the p parameters, where it `tracks`.
+    `workspace.rate` has eps or W eps.  H is (n, m); the tracking error acts on the p
+    parameters, where it `tracks`.
     """
     gain = settings.adaptation_gain
     # all rates before any estimate: the projection takes them together

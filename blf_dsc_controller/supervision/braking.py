@@ -33,7 +33,7 @@ def braking_matrix(
     M = _inertia(settings, q)
     if M is None:
         return np.diag(damping)
-    rate = _least_rate(damping / np.diagonal(M), gap)
+    rate = _limited_rate(damping / np.diagonal(M), gap)
     return _without_reversal(np.minimum.outer(rate, rate) * M, M, gap)
 
 
@@ -50,8 +50,8 @@ def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Arra
     if M is None:
         return damping
     inertia = np.diagonal(M)
-    borne = np.diag(_least_rate(damping / inertia, gap) * inertia)
-    return np.diagonal(_without_reversal(borne, M, gap))
+    tolerated = np.diag(_limited_rate(damping / inertia, gap) * inertia)
+    return np.diagonal(_without_reversal(tolerated, M, gap))
 
 
 def _inertia(settings: Settings, q: Array) -> Array | None:
@@ -63,7 +63,7 @@ def _inertia(settings: Settings, q: Array) -> Array | None:
     return M if is_known else None
 
 
-def _least_rate(rate: Array, gap: float) -> Array:
+def _limited_rate(rate: Array, gap: float) -> Array:
     """Return the rates (n,) that low pass and gap bear: 1/tau makes a joint half critical."""
     return np.minimum(rate, 1.0 / max(gap, FILTER))
 

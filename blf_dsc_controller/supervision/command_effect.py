@@ -40,8 +40,8 @@ class CommandEffect:
         self._elapsed += dt
         if self._elapsed < _SETTLING_TIME:
             return
-        share = min(1.0, dt / _SPEED_TIME)
-        self._average += share * (accelerating - self._average)
+        gain = min(1.0, dt / _SPEED_TIME)
+        self._average += gain * (accelerating - self._average)
         largest = float((np.abs(self._average) / limit).max())
         self.is_proven = self.is_proven or largest > _NOTICED_TORQUE
 

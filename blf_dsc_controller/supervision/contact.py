@@ -56,15 +56,15 @@ class Contacts:
 
 
 def untarable(
-    controller: Controller, config: ControllerConfig, stamp: int, *, rests: bool
+    controller: Controller, config: ControllerConfig, stamp: int, *, is_at_rest: bool
 ) -> str:
     """Return why the external torque of a law in command cannot be tared; empty if it can.
 
-    `stamp` [ns] is that of the last sample, `rests` whether reference and arm rest.
+    `stamp` [ns] is that of the last sample, `is_at_rest` whether reference and arm rest.
     """
     if is_touched(controller.state.contact):
         return f'{contact_of(controller, config, stamp).text}: clear it first'
-    if not (rests and controller.can_tare):
+    if not (is_at_rest and controller.can_tare):
         rest = f'{controller.tare_rest:.2g} s'
         return f'the arm moves, or has just come to rest: hold it still for {rest}'
     return ''

@@ -36,14 +36,14 @@ from blf_dsc_controller.numerics.intervals import TWO_SIDED
 Vector = NDArray[np.float64]
 
 _NARROW = 0.05  # kg, half of the interval of a mass that is declared
-_SHARE = 0.05  # or this part of the mass
+_FRACTION = 0.05  # or this part of the mass
 _CENTRE = 0.03  # m, likewise of its centre
 _STEP = 0.005  # of the torque limit
 
 
 def widest_interval(mass: ArrayLike) -> Vector:
     """Return half of the widest 95 % intervals [kg] with which masses [kg] are declared."""
-    return np.maximum(_NARROW, _SHARE * np.abs(mass))
+    return np.maximum(_NARROW, _FRACTION * np.abs(mass))
 
 
 class DriveLoads:
@@ -62,11 +62,11 @@ class DriveLoads:
         self.in_force = self._at_start
         # when the law began to learn: at the start, or at a reset
         self._base = self._at_start
-        self._wanted: TipLoad | None = None  # by hand, whatever is weighed
+        self._requested: TipLoad | None = None  # by hand, whatever is weighed
         self._controller = controller
         self._robot, self._joints = robot, config.joints
         self._is_used = config.load.tell_drive
-        self._goes_on = False  # a load has been declared in part
+        self._has_begun = False  # a load has been declared in part
 
     def declare(self, load: TipLoad) -> None:
         """Let the steps lead to this load, whatever is weighed.
@@ -75,7 +75,7 @@ class DriveLoads:
             BlfDscError: the drives add no weight.
         """
         self._begin_use()
-        self._wanted = load
+        self._requested = load
 
     def _begin_use(self) -> None:
         if self._robot.drive_compensates == 'none':
@@ -115,7 +115,7 @@ class DriveLoads:
         if not self._is_used:
             return
         self._base = self.in_force
-        self._goes_on = False
+        self._has_begun = False
         settings = self._controller.settings
         settings.torque.drive_inertias[:] = self._added()
         is_left_out = not np.allclose(self._base.moments, self._at_start.moments)
@@ -130,7 +130,11 @@ class DriveLoads:
         if not self._is_used:
             return None
         controller = self._controller
-        target = self._weighed() if self._wanted is None else self._left()
+        target = (
+            self._estimated_target()
+            if self._requested is None
+            else self._requested_target()
+        )
         if target is None or is_touched(controller.state.contact):
             return None
         settings = controller.settings
@@ -141,48 +145,48 @@ class DriveLoads:
         (H,) = regressors_at(chain, q, *np.zeros((3, 1, settings.n)))
         change = H @ (self._columns(TipLoad.of(target)) - self._columns(self.in_force))
         largest = float((np.abs(change) / (_STEP * settings.torque.limit)).max())
-        part = min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
+        fraction = min(1.0, 1.0 / largest) if largest > 0.0 else 1.0
         moments = self.in_force.moments
-        self._goes_on = part < 1.0
-        return TipLoad.of(moments + part * (target - moments))
+        self._has_begun = fraction < 1.0
+        return TipLoad.of(moments + fraction * (target - moments))
 
-    def _left(self) -> Vector | None:
+    def _requested_target(self) -> Vector | None:
         """Return mass and moments (4,) that a user declares; None: the drives have them."""
-        if self._wanted is None or np.allclose(
-            self.in_force.moments, self._wanted.moments
+        if self._requested is None or np.allclose(
+            self.in_force.moments, self._requested.moments
         ):
             return None
-        return self._wanted.moments
+        return self._requested.moments
 
     @property
     def is_declared(self) -> bool:
         """Whether the drives have what a user declares, if anything."""
-        return self._left() is None
+        return self._requested_target() is None
 
-    def _weighed(self) -> Vector | None:
+    def _estimated_target(self) -> Vector | None:
         """Return mass and moments (4,) that the drives should get; None: no change."""
         load = self._controller.state.payload.load
-        half = TWO_SIDED * load[DEVIATION]
+        interval = TWO_SIDED * load[DEVIATION]
         narrow = widest_interval(load[MASS])
-        if not 0.0 < half < narrow:
+        if not 0.0 < interval < narrow:
             return None
         picked_up = np.zeros(4)
         if abs(load[MASS]) > narrow:
-            spread = TWO_SIDED * load[DEVIATION + 1 :]
-            if not ((spread > 0.0) & (spread < _CENTRE)).all():
+            centre_interval = TWO_SIDED * load[DEVIATION + 1 :]
+            if not ((centre_interval > 0.0) & (centre_interval < _CENTRE)).all():
                 return None
             picked_up[:] = load[MASS] * np.array((1.0, *load[MASS + 1 : DEVIATION]))
         target = self._base.moments + picked_up
         target = np.asarray(TipLoad.of(target).moments)
         is_new = abs(target[0] - self.in_force.mass) > narrow
-        return target if is_new or self._goes_on else None
+        return target if is_new or self._has_begun else None
 
     def _added(self) -> Vector:
         """Return the factors of the columns of the drives' gravity, for the law."""
         if self._base is self._at_start:
             return self._columns(self.in_force)
-        since = self._columns(self.in_force) - self._columns(self._base)
-        return self._columns(self._at_start) + since
+        change = self._columns(self.in_force) - self._columns(self._base)
+        return self._columns(self._at_start) + change
 
     def _columns(self, load: TipLoad) -> Vector:
         """Return the factors of the columns of the drives' gravity, with this load."""

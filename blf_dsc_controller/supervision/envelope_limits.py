@@ -20,7 +20,7 @@ _BRAKED_SPEED = 0.9  # of the velocity limit: braked from below it
 _LOOP_DELAYS = 4.0  # of the loop, in T_v
 _APPROACH = 2.0  # T_v, in T_q
 _REACH_TIME = 0.06  # s, at the velocity limit, of the largest error without a barrier
-_LEFT_TORQUE = 0.2  # of the torque limit, at least, besides gravity ...
+_MIN_AVAILABLE = 0.2  # of the torque limit, at least, besides gravity ...
 _USED_TORQUE = 0.5  # ... and of what is left, to stop at the end of the range
 
 
@@ -52,7 +52,7 @@ def limits_of(config: ControllerConfig, settings: Settings) -> tuple[Limits, Bod
     gravity = np.abs((regressors_at(model, q, rest, rest, rest) * P).sum(axis=-1))
     torque, rate = np.array((config.torque.limit, config.torque.rate_limit))
     rate = np.where(rate > 0.0, rate, np.inf)
-    left = np.maximum(torque - gravity.max(axis=0), _LEFT_TORQUE * torque)
+    available = np.maximum(torque - gravity.max(axis=0), _MIN_AVAILABLE * torque)
     delay = _LOOP_DELAYS * loop_delay(config.sample_time, config.robot.lag)
     k_position, k_velocity = _soft_limits(config)
     braking_time = np.maximum(delay, inertia / k_velocity)
@@ -69,7 +69,7 @@ def limits_of(config: ControllerConfig, settings: Settings) -> tuple[Limits, Bod
         error=np.full(settings.n, np.inf) if any_error else error,
         braking_time=braking_time,
         approach_time=np.maximum(_APPROACH * braking_time, 1.0 / k_position),
-        deceleration=_USED_TORQUE * left / inertia,
+        deceleration=_USED_TORQUE * available / inertia,
         jerk=rate / inertia,
     )
     return limits, Body(model, P, is_known and settings.has_barrier != 1)

@@ -43,13 +43,13 @@ class ExpectedLoad:
 
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:
         self.load = NOTHING
-        self.weighed: TipLoad | None = None
+        self.estimated: TipLoad | None = None
         self._config, self._controller = config, controller
         # P^ (p,) when the tip last held nothing that was expected
         self._empty = np.zeros(0)
         self._step = np.zeros(0)  # of P^, in a sample
         self._steps = 0  # that are left
-        self._seen = 0.0  # kg, the mass that was weighed last, sure or not
+        self._last_mass = 0.0  # kg, the mass that was weighed last, sure or not
 
     def expect(self, load: TipLoad | None, interval: float, q: Vector) -> TipLoad:
         """Expect this load, which the tip takes up within an `interval` [s], at q (n,) [rad].
@@ -63,7 +63,7 @@ class ExpectedLoad:
             raise BlfDscError(
                 'expected load: this arm has no tip that could hold it: give robot.tip'
             )
-        load = self.weighed if load is None else load
+        load = self.estimated if load is None else load
         if load is None:
             raise BlfDscError(
                 'expected load: none has been weighed yet, so there is none to remember: give its '
@@ -90,14 +90,14 @@ class ExpectedLoad:
 
     def observe(self) -> None:
         """Remember what the law has weighed, once it is sure of it."""
-        found = self._controller.state.payload.load
-        if not found.size or found[MASS] == self._seen:
+        load = self._controller.state.payload.load
+        if not load.size or load[MASS] == self._last_mass:
             return  # it is solved for ten times a second
-        self._seen = mass = float(found[MASS])
-        half = TWO_SIDED * found[DEVIATION]
-        if 0.0 < half < widest_interval(mass) < mass:
-            centre = found[MASS + 1 : DEVIATION].tolist()
-            self.weighed = TipLoad(mass, tuple(centre))
+        self._last_mass = mass = float(load[MASS])
+        interval = TWO_SIDED * load[DEVIATION]
+        if 0.0 < interval < widest_interval(mass) < mass:
+            centre = load[MASS + 1 : DEVIATION].tolist()
+            self.estimated = TipLoad(mass, tuple(centre))
 
     def apply_again(self) -> None:
         """Expect the same load after the settings were replaced."""
@@ -127,7 +127,7 @@ class ExpectedLoad:
                 f'{LONGEST:g} are needed'
             )
         rated = config.robot.payload
-        carried = 0.0 if self.weighed is None else self.weighed.mass
+        carried = 0.0 if self.estimated is None else self.estimated.mass
         if load.mass > max(rated, carried):
             raise BlfDscError(
                 f'expected load: got {load.mass:g} kg, but robot.payload, which the arm is rated '

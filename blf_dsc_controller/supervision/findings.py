@@ -14,7 +14,7 @@ from blf_dsc_controller.supervision import not_sensors
 from blf_dsc_controller.supervision.contact import Contacts, contact_of, untarable
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.reading import Reading
-from blf_dsc_controller.supervision.state_check import late_velocities
+from blf_dsc_controller.supervision.state_check import velocity_lag_remedy
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 
 Vector = NDArray[np.float64]
@@ -105,7 +105,7 @@ class Findings:
             why = supervisor.text or supervisor.phase
             return f'the law is not in command ({why})'
         stamp = command.reference.last_stamp
-        return untarable(law, command.config, stamp, rests=command.is_at_rest)
+        return untarable(law, command.config, stamp, is_at_rest=command.is_at_rest)
 
     def stop_at_invalid(self, reading: Reading) -> None:
         """Stop because of a state that the law has not used."""
@@ -137,8 +137,10 @@ class Findings:
         cause = command.oscillation.cause if command.supervisor.running else ''
         if cause and is_late(sensor, worst):
             lag = lags[worst]
-            late = '' if lag is None else late_velocities(lag)
-            fault = Fault(Reason.OSCILLATION, '; '.join(filter(None, (late, cause))))
+            lag_text = '' if lag is None else velocity_lag_remedy(lag)
+            fault = Fault(
+                Reason.OSCILLATION, '; '.join(filter(None, (lag_text, cause)))
+            )
         if command.supervisor.uses_states:
             command.stop(*fault)
         else:

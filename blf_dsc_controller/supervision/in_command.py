@@ -164,7 +164,7 @@ class InCommand:
 
     def stop(self, reason: Reason, text: str) -> None:
         """Enter the safe stop, unless the law is not in command or about to be."""
-        missed = self.states.missed_for_each
+        missed = self.states.missed_per_state
         if missed > _MANY and reason is not Reason.OVERRUN:
             T = self.config.sample_time
             text += f'; {rate_mismatch((1.0 + missed) * T, T)}'

@@ -37,12 +37,14 @@ def friction_torque(
 
     It is that at dq (n,) [rad/s], of gears that carry tau (n,) [N m].
     """
-    of, n = settings.columns, settings.n
+    column_settings, n = settings.columns, settings.n
     torque = np.zeros(n)
     for i in range(n):
-        sign = sliding(dq[i], of.coulomb_velocity)
+        sign = sliding(dq[i], column_settings.coulomb_velocity)
         at = columns.Point(0.0, 0.0, dq[i], sign, tau[i])
-        torque[i] = columns.torque_of(of, columns.FRICTION, i, at, estimate, n)
+        torque[i] = columns.torque_of(
+            column_settings, columns.FRICTION, i, at, estimate, n
+        )
     return torque
 
 

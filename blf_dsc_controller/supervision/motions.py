@@ -36,7 +36,7 @@ class Plan(NamedTuple):
     motion: PlannedMotion
     content: dict[str, Any]  # of its event
 
-    def check(self, reference_vector: np.ndarray, now: float) -> None:
+    def check(self, reference_vector: np.ndarray, t: float) -> None:
         """Check that a loop with this packed reference can still adopt it now [s].
 
         Raises:
@@ -47,9 +47,9 @@ class Plan(NamedTuple):
             raise TrajectoryError(
                 ['the reference was replaced while it was planned: send it again']
             )
-        if self.at < now:
+        if self.at < t:
             due = f'it should begin at {self.at:.6g} s'
-            raise LatePlanError([f'{due}, but was planned only at {now:.6g} s'])
+            raise LatePlanError([f'{due}, but was planned only at {t:.6g} s'])
 
 
 def plan_motion(
@@ -69,8 +69,8 @@ def plan_motion(
     if isinstance(command, Trajectory):
         motion = plan_trajectory(command, before, at, config)
         joints, points, begin = command
-        given = [point._asdict() for point in points]
-        content: dict[str, Any] = trajectory_content(joints, given, begin, at)
+        contents = [point._asdict() for point in points]
+        content: dict[str, Any] = trajectory_content(joints, contents, begin, at)
     else:
         motion = plan_target(command, before, at, config)
         content = {**command._asdict(), 'at': at}

@@ -40,10 +40,10 @@ class ObservedLoad:
         """Begin with a load (n,) [N m]."""
         self.load[:] = self._residual[:] = load
 
-    def update(self, lacking: Vector, limit: Vector, dt: float) -> None:
+    def update(self, unmodelled: Vector, limit: Vector, dt: float) -> None:
         """Take what the model lacked (n,) [N m] in the last `dt` [s], of torques up to `limit`."""
         first, second = (min(1.0, rate * dt) for rate in self._rates)
-        self._residual += first * np.clip(lacking - self._residual, -limit, limit)
+        self._residual += first * np.clip(unmodelled - self._residual, -limit, limit)
         self.load += second * (self._residual - self.load)
         largest = _LARGEST_LOAD * limit
         np.clip(self.load, -largest, largest, out=self.load)

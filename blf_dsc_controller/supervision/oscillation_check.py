@@ -22,7 +22,7 @@ from blf_dsc_controller.supervision.not_sensors import fault_of
 
 # of the torque limit, as amplitude: the tones of a commissioning, which calm arms follow, have
 # looked like an oscillation of up to 0.16
-_BORNE = 0.2
+_TOLERATED = 0.2
 
 LOWER = 0.5
 """Part of the present gains that is advised after an oscillation."""
@@ -33,7 +33,7 @@ OSCILLATES = ' oscillates at '
 _LATELY = 0.1  # s
 
 
-class Shaking(NamedTuple):
+class JointOscillation(NamedTuple):
     """The oscillation of the joint that shows it most."""
 
     joint: str
@@ -61,7 +61,7 @@ class OscillationCheck:
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:
         self._controller = controller
         self._state = controller.checks.oscillation
-        self.last: Shaking | None = None
+        self.last: JointOscillation | None = None
         self.count = 0
         self.configure(config)
 
@@ -86,33 +86,35 @@ class OscillationCheck:
         """
         reaction = self._config.safety.oscillation
         joints = range(self._state.waves.size)
-        shakes = np.array([oscillates(self._state, i) for i in joints])
-        found = self._find(shakes)
-        if found is None or reaction == 'ignore':
+        oscillating = np.array([oscillates(self._state, i) for i in joints])
+        oscillation = self._worst(oscillating)
+        if oscillation is None or reaction == 'ignore':
             return False
-        part = self._state.amplitude / self._controller.settings.torque.limit
-        if reaction == 'stop' or part[shakes].max() > _BORNE:
+        fraction = self._state.amplitude / self._controller.settings.torque.limit
+        if reaction == 'stop' or fraction[oscillating].max() > _TOLERATED:
             return True
-        if not self.is_due(t):
-            self.last = found
+        if not self.is_ongoing(t):
+            self.last = oscillation
             self.count += 1
         self._reported = t
         return False
 
-    def _find(self, shakes: NDArray[np.bool_]) -> Shaking | None:
+    def _worst(self, oscillating: NDArray[np.bool_]) -> JointOscillation | None:
         """Return the oscillation of the worst of the joints that do (n,); None: none does."""
-        now = self._state
+        state = self._state
         limit = self._controller.settings.torque.limit
-        torque = now.amplitude
-        if not shakes.any() or not np.isfinite(torque).all():
+        torque = state.amplitude
+        if not oscillating.any() or not np.isfinite(torque).all():
             return None
-        worst = int(np.argmax(np.where(shakes, torque / limit, -1.0)))
-        frequency = 0.5 / float(now.half[worst])
+        worst = int(np.argmax(np.where(oscillating, torque / limit, -1.0)))
+        frequency = 0.5 / float(state.half[worst])
         config = self._config
         unit = config.units[worst].torque
-        return Shaking(config.joints[worst], frequency, float(torque[worst]), unit)
+        return JointOscillation(
+            config.joints[worst], frequency, float(torque[worst]), unit
+        )
 
-    def is_due(self, t: float) -> bool:
+    def is_ongoing(self, t: float) -> bool:
         """Whether the arm oscillates at t [s], which has been warned of."""
         return t - self._reported < 2.0 * PATIENCE
 
@@ -125,10 +127,10 @@ class OscillationCheck:
     def cause(self) -> str:
         """What an arm that stops now was doing, and the remedy; empty if not oscillating."""
         state = self._state
-        found = self._find((state.calm < _LATELY) & (state.half > 0.0))
-        if found is None:
+        oscillation = self._worst((state.calm < _LATELY) & (state.half > 0.0))
+        if oscillation is None:
             return ''
-        return f'{found.text}: {self._remedy}'
+        return f'{oscillation.text}: {self._remedy}'
 
     @property
     def _remedy(self) -> str:

@@ -75,7 +75,9 @@ class _Change(NamedTuple):
 def problems(controller: Controller, config: ControllerConfig, t: float) -> list[str]:
     """Return why a running law cannot accept a valid configuration at t [s]."""
     case = _Change(controller, config, settings_in_loop(config), t)
-    return [str(each) for each in findings(RULES, case, When.NOW, Severity.REFUSE)]
+    return [
+        str(finding) for finding in findings(RULES, case, When.NOW, Severity.REFUSE)
+    ]
 
 
 def _outside_bound(change: _Change) -> Iterator[str]:
@@ -112,20 +114,20 @@ def _diverging_update(change: _Change) -> Iterator[str]:
     """Yield how much each step of the learned estimates overshoots, if they diverge."""
     config, adaptation = change.config, change.settings.adaptation
     latch = change.controller.state.latch
-    step, stretch = 'Newton step', 1.0
+    step, curvature = 'Newton step', 1.0
     if config.law == PAPER:
-        step, stretch = 'gradient step', float(np.linalg.norm(latch.Phi, 2))
-    share = (
+        step, curvature = 'gradient step', float(np.linalg.norm(latch.Phi, 2))
+    step_gain = (
         adaptation.weight
         * float(adaptation.adaptation_gain.max())
-        * stretch
+        * curvature
         * config.sample_time
     )
-    if latch.latched[0] and share >= _STABLE:
+    if latch.latched[0] and step_gain >= _STABLE:
         yield (
             f'two_link.learning_weight: the {step} of each sample would correct the '
-            f'estimates by {share:.3g} times their error, which diverges at {_STABLE:g} or more: '
-            'lower it or two_link.adaptation_gain'
+            f'estimates by {step_gain:.3g} times their error, which diverges at {_STABLE:g} or '
+            'more: lower it or two_link.adaptation_gain'
         )
 
 

@@ -88,8 +88,8 @@ class SampleCheck:
     def relax(self, duration: float = inf) -> None:
         """Account for some time without saturation [s]."""
         # Whole nanoseconds: many samples at once leave what they leave one by one.
-        left = self._saturation - round(duration * 1e9) if duration < inf else 0
-        self._saturation = max(0, left)
+        remaining = self._saturation - round(duration * 1e9) if duration < inf else 0
+        self._saturation = max(0, remaining)
 
     @property
     def tool_errors(self) -> Vector | None:
@@ -140,8 +140,8 @@ class SampleCheck:
         checks = self._controller.checks
         limit = self._controller.settings.torque.limit
         self._estimates.return_to_moved()
-        if shaking := self._cause.shaking:
-            return Fault(Reason.OSCILLATION, shaking)
+        if vibration := self._cause.vibration:
+            return Fault(Reason.OSCILLATION, vibration)
         if saturation := self._cause.saturation(self.saturated_time):
             return Fault(Reason.SATURATED, f'{saturation}; no joint moves any more')
         if checks.effect.short_for[0] > 0.0:
@@ -182,22 +182,22 @@ class SampleCheck:
         if checks.effect.compares[0] == 0.0 or self._cause.oscillation:
             return None
         shortfall = checks.effect.shortfall - checks.effect.mean_shortfall
-        now = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
+        present = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
         if settings.torque.drive > 0 and settings.torque.effort_is_whole == 1:
-            now += self._controller.signals.saturation.added
-        now -= checks.effect.mean_shortfall
-        share = np.abs(shortfall) / settings.torque.limit
-        share_now = np.abs(now) / settings.torque.limit
+            present += self._controller.signals.saturation.added
+        present -= checks.effect.mean_shortfall
+        mean_ratio = np.abs(shortfall) / settings.torque.limit
+        present_ratio = np.abs(present) / settings.torque.limit
         is_short = (
-            (share > _SHORT_TORQUE)
-            & (share_now > _SHORT_TORQUE_NOW)
-            & (shortfall * now > 0.0)
+            (mean_ratio > _SHORT_TORQUE)
+            & (present_ratio > _SHORT_TORQUE_NOW)
+            & (shortfall * present > 0.0)
         )
         if not is_short.any():
             return None
         self._estimates.return_to_consistent()
         return self._falling_short(
-            int(np.argmax(np.where(is_short, share, 0.0))), shortfall
+            int(np.argmax(np.where(is_short, mean_ratio, 0.0))), shortfall
         )
 
     def _check_error(self) -> Fault | None:
@@ -213,17 +213,17 @@ class SampleCheck:
         if (unreached := self._check_reach()) is not None:
             return unreached
         unit = self._units[worst].position
-        share = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
+        factor = '' if safety.error_ratio == 1.0 else f'{safety.error_ratio:g} times '
         text = (
             f'joint {self._joints[worst]!r} is {xi1[worst]:+.6g} {unit} from its reference: '
-            f'past {share}its bound of {bound[worst]:.6g} {unit}'
+            f'past {factor}its bound of {bound[worst]:.6g} {unit}'
         )
         if (at_tool := self.tool_errors) is not None:
             text += f'; {in_words(at_tool)}'
-        given = self._with_cause(text)
-        if given == text:
-            given += self._imbalance(worst)
-        return Fault(Reason.OUTSIDE_BOUND, given)
+        full_text = self._with_cause(text)
+        if full_text == text:
+            full_text += self._imbalance(worst)
+        return Fault(Reason.OUTSIDE_BOUND, full_text)
 
     def _with_cause(self, text: str) -> str:
         """Return a text after what the arm suffers from, if it is known."""
@@ -243,9 +243,9 @@ class SampleCheck:
             controller.settings, self._estimates.estimate, q, rest, rest
         )[joint]
         sent, unit = sample.torque[joint], self._units[joint].torque
-        least = _AGAINST_TORQUE * controller.settings.torque.limit[joint]
-        is_against = -np.sign(sample.xi1[joint]) * (sent - model) > least
-        if not is_against or (sent - model) * model < -least * abs(model):
+        threshold = _AGAINST_TORQUE * controller.settings.torque.limit[joint]
+        is_against = -np.sign(sample.xi1[joint]) * (sent - model) > threshold
+        if not is_against or (sent - model) * model < -threshold * abs(model):
             return ''
         drive = (
             ''
@@ -278,5 +278,5 @@ class SampleCheck:
             'of the time below it)'
         )
         return Fault(
-            Reason.SATURATED, '; '.join(filter(None, (self._cause.shaking, text)))
+            Reason.SATURATED, '; '.join(filter(None, (self._cause.vibration, text)))
         )

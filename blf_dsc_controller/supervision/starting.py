@@ -50,7 +50,7 @@ class Starting:
         self._expected = expected
         self._acting: Vector | None = None  # N m, by which another node holds the arm
         self._load: Vector | None = None  # N m, load of a reset, which goes on
-        self._left_at: Vector | None = None  # rad, where the law left command
+        self._last_position: Vector | None = None  # rad, where the law left command
 
     def activate(self) -> None:
         """Take command with the next state, and what was learned before a fault.
@@ -62,11 +62,11 @@ class Starting:
         load = None
         law = command.controller
         if law.samples:
-            self._left_at = law.signals.q.copy()
+            self._last_position = law.signals.q.copy()
         if command.clean:
             law.begin(Start.AGAIN)
         else:
-            load = self._held(command.estimates.estimate)
+            load = self._safe_torque_load(command.estimates.estimate)
             command.estimates.restore()
         self._start_over()
         self._load = load
@@ -107,10 +107,10 @@ class Starting:
             return command.held.load_before_learning()
         if command.supervisor.phase is Phase.STARTING:
             return self._load  # of a reset just before
-        load = self._held(command.controller.settings.initial_estimate)
+        load = self._safe_torque_load(command.controller.settings.initial_estimate)
         return None if load is None else load - forgotten
 
-    def _held(self, estimate: Vector) -> Vector | None:
+    def _safe_torque_load(self, estimate: Vector) -> Vector | None:
         """Return the load (n,) [N m] of the safe torque besides an estimate (m,), if it has one."""
         command = self._command
         if not command.commanding or command.silenced:
@@ -230,9 +230,12 @@ class Starting:
 
         That is farther away than the bound on its error.
         """
-        left_at, self._left_at = self._left_at, None
+        last_position, self._last_position = self._last_position, None
         law = self._command.controller
-        if left_at is not None and (np.abs(q - left_at) > law.bound_at(0.0)).any():
+        if (
+            last_position is not None
+            and (np.abs(q - last_position) > law.bound_at(0.0)).any()
+        ):
             law.begin(Start.ELSEWHERE)
 
     def _begin_at_acting(self, q: Vector) -> None:

@@ -36,22 +36,22 @@ _NO_VELOCITY = 'if the hardware measures none, set safety.velocity to estimated'
 
 def rate_mismatch(period: float, sample_time: float) -> str:
     """Return what to do about joint states that come every `period` [s]."""
-    found = f'joint states come every {period:.3g} s, but sample_time is {sample_time:g} s: '
+    received = f'joint states come every {period:.3g} s, but sample_time is {sample_time:g} s: '
     if period > _PUBLISHER_PERIOD and sample_time < _PUBLISHER_PERIOD:
         return (
-            f'{found}this is the rate of a joint_state_publisher, not of an arm: subscribe to the '
-            'topic of the joint_state_broadcaster itself (of franka_ros2: '
+            f'{received}this is the rate of a joint_state_publisher, not of an arm: subscribe to '
+            'the topic of the joint_state_broadcaster itself (of franka_ros2: '
             '-r joint_states:=franka/joint_states), whose rate is update_rate of '
             'controller_manager'
         )
     return (
-        f'{found}set update_rate of controller_manager (100 Hz by default) to '
+        f'{received}set update_rate of controller_manager (100 Hz by default) to '
         f'{1.0 / sample_time:.6g}, or '
         'sample_time to the period of the topic'
     )
 
 
-def late_velocities(lag: float) -> str:
+def velocity_lag_remedy(lag: float) -> str:
     """Return what to do about velocities that come some time [s] after the positions."""
     return (
         f'velocities come about {1e3 * lag:.2g} ms after the positions: let the driver filter them '
@@ -122,7 +122,7 @@ class StateCheck:
         return self._count_missed(safety, max(1, round(step / self._sample_time)) - 1)
 
     @property
-    def missed_for_each(self) -> float:
+    def missed_per_state(self) -> float:
         """States missing between two that came, on average since the start."""
         return self.missed / max(self._taken - 1, 1)
 
@@ -145,11 +145,11 @@ class StateCheck:
         return Fault(Reason.STAMP_REPEATED, text)
 
     def _count_missed(self, safety: Safety, missed: int) -> Fault | None:
-        keep = 1.0 - min(1.0, self._sample_time / _MISSED_TIME)
+        retained = 1.0 - min(1.0, self._sample_time / _MISSED_TIME)
         self.missed += missed
-        self.missed_fraction *= keep
+        self.missed_fraction *= retained
         if missed:
-            self.missed_fraction = 1.0 - (1.0 - self.missed_fraction) * keep**missed
+            self.missed_fraction = 1.0 - (1.0 - self.missed_fraction) * retained**missed
         missing = self.missed_fraction * _MISSED_TIME
         tolerated = max(_MISSING, safety.state_timeout)
         if missing <= tolerated:
@@ -206,7 +206,7 @@ class StateCheck:
         """
         worst = int(np.argmax(np.abs(derived - measured)))
         lag = lags[worst]
-        why = _WRONG if lag is None else late_velocities(lag)
+        why = _WRONG if lag is None else velocity_lag_remedy(lag)
         unit = self._units[worst].of('rad/s')
         text = (
             f'the velocity of joint {self._joints[worst]!r} is {measured[worst]:+.3g} {unit}, but '
@@ -241,7 +241,7 @@ class StateCheck:
         )
         return Fault(Reason.STAMP_JUMP, text)
 
-    def braked(self, asked: float, joint: int, now: Motion, speeds: Vector) -> Fault:
+    def braked(self, asked: float, joint: int, motion: Motion, speeds: Vector) -> Fault:
         """Return the fault of a law that has asked for too much for so long [s].
 
         `joint` was braked most; `speeds` (2, n) [rad/s] are the highest that are allowed
@@ -250,8 +250,8 @@ class StateCheck:
         unit = self._units[joint].of('rad/s')
         down, up = speeds[:, joint]
         text = (
-            f'joint {self._joints[joint]!r} moves at {now.dq[joint]:+.3g} {unit}, '
-            f'{now.error[joint]:+.3g} {self._units[joint].position} from its reference, where '
+            f'joint {self._joints[joint]!r} moves at {motion.dq[joint]:+.3g} {unit}, '
+            f'{motion.error[joint]:+.3g} {self._units[joint].position} from its reference, where '
             f'{-down:+.3g} to {up:+.3g} {unit} are allowed by safety.velocity_limit, the end of '
             'its range and, without a barrier, safety.error_ratio; for '
             f'{asked:.2g} s the law has asked for torques that make it faster: correct the law '

@@ -68,7 +68,7 @@ class StopCause:
         return self._oscillation.cause
 
     @property
-    def shaking(self) -> str:
+    def vibration(self) -> str:
         """What oscillates or chatters, and the remedy; empty if nothing does."""
         return self.oscillation or chatter_of(self._controller, self._config)
 
@@ -77,7 +77,7 @@ class StopCause:
 
         A torque has been at its limit for `saturated_time` [s].
         """
-        return self.shaking or self.saturation(saturated_time)
+        return self.vibration or self.saturation(saturated_time)
 
     def saturation(self, time: float) -> str:
         """Return which joint has lacked torque for long, `time` [s]; empty if none has."""

@@ -70,7 +70,7 @@ class TorqueWatchdog:
         self._limit = settings.torque.limit
         self.stamp = -1
         self._commanded_stamp = -1  # of the last state before the last torque
-        self._seen_at = -inf
+        self._state_at = -inf
         self._polled_at = -inf
         self._commanded_at = inf  # no takeover before the first torque
         self._knows_torque = False
@@ -144,10 +144,10 @@ class TorqueWatchdog:
             return  # `poll` counts the time without a state
         self._sensor.take(reading)
         self._readings.follow(reading)
-        if now - self._seen_at > LONG_SILENCE:
+        if now - self._state_at > LONG_SILENCE:
             self._forget_controller()
         if stamp > self.stamp:
-            self._seen_at = now
+            self._state_at = now
         self.stamp = stamp
         if self._armed:
             self._armed = False
@@ -172,12 +172,12 @@ class TorqueWatchdog:
         self._polled_at = now
         safety = self.config.safety
         last = self._readings.last
-        if now - self._seen_at > self.config.sample_time + safety.state_timeout:
+        if now - self._state_at > self.config.sample_time + safety.state_timeout:
             last.miss(dt)
         if not self.active:
             if self._knows_torque:
                 self._hold.observe(dt)
-            self._begin_if_due(now)
+            self._take_over_if_silent(now)
         if not self.active:
             return None
         torque = self._hold.advance(safety, dt)
@@ -200,10 +200,10 @@ class TorqueWatchdog:
         self.active = False
         self._commanded_at = inf
 
-    def _begin_if_due(self, now: float) -> None:
+    def _take_over_if_silent(self, now: float) -> None:
         silence = now - self._commanded_at
-        gone_on = (self.stamp - self._commanded_stamp) * 1e-9
-        is_silent = silence > self._timeout and gone_on > 0.5 * self._timeout
+        state_progress = (self.stamp - self._commanded_stamp) * 1e-9
+        is_silent = silence > self._timeout and state_progress > 0.5 * self._timeout
         if self.stands_down or not is_silent:
             return
         self.active = True
