@@ -44,7 +44,7 @@ class Settings(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Values of one sample."""
+    """Values of one sample that the update computes."""
 
     rate: Annotated[Array, 'm']  # eps or W eps, then theta^' [1/s]
     tracked: Annotated[Array, 'm']  # theta^ after the tracking error alone
@@ -52,10 +52,17 @@ class Workspace(NamedTuple):
 
 @inner
 def project(estimate: Array, rate: Array, gain: Array, radius: float) -> None:
-    """Remove the outward part from `rate` v (p,):  v - Gamma w w^T v / (w^T Gamma w).
+    """Remove the outward part of a rate v (p,), as (4) does, in the metric of Gamma.
 
-    `estimate` P^ (p,) is the direction w, `rate` is modified in place, `gain` (p,) is
-    the diagonal of Gamma and `radius` omega_a.
+        v - Gamma w w^T v / (w^T Gamma w)
+
+    It is removed on and outside the sphere |w| = omega_a, if v points outwards.
+
+    Arguments:
+        estimate: P^ (p,), which is w.
+        rate: v = P^' (p,) [1/s times the units of P], modified in place.
+        gain: diagonal of Gamma (p,).
+        radius: omega_a.
     """
     square = 0.0
     outward = 0.0
@@ -73,9 +80,14 @@ def project(estimate: Array, rate: Array, gain: Array, radius: float) -> None:
 def retract(estimate: Array, gain: Array, radius: float) -> None:
     """Replace a P^ (p,) outside the ball by the nearest point in it, in the metric of Gamma.
 
-    That is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a,
-    found by Newton's method on 1 / length: exact after one step for equal gains,
-    monotone otherwise.
+    That point is P^_j / (1 + nu Gamma_j) with the nu > 0 that gives it the length omega_a.
+    Newton's method on 1 / length finds nu: exact after one step for equal gains, monotone
+    otherwise.
+
+    Arguments:
+        estimate: P^ (p,), modified in place; unchanged inside the ball, or if not finite.
+        gain: diagonal of Gamma (p,).
+        radius: omega_a.
     """
     square = 0.0
     for j in range(gain.size):
@@ -105,7 +117,10 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
 def fill_prediction_error(
     workspace: Workspace, latch: excitation.State, estimate: Array
 ) -> None:
-    """Write eps (m,) to `workspace.rate`; zero while no window is latched."""
+    """Write eps = b_e - Phi_e theta^ (m,) of (26) to `workspace.rate`.
+
+    It is zero while no window is latched.  `estimate` is theta^ (m,).
+    """
     m = estimate.size
     for i in range(m):
         workspace.rate[i] = 0.0
@@ -121,7 +136,10 @@ def fill_prediction_error(
 def fill_newton_step(
     workspace: Workspace, latch: excitation.State, estimate: Array
 ) -> None:
-    """Write W eps (m,) to `workspace.rate`; zero while no window is latched."""
+    """Write the Newton step W eps (m,), W = (Phi_e + rho R)^-1, to `workspace.rate`.
+
+    It is zero while no window is latched.  `estimate` is theta^ (m,).
+    """
     fill_prediction_error(workspace, latch, estimate)
     if latch.latched[0] == 1.0:
         cholesky_solve(latch.factor, workspace.rate)
@@ -138,10 +156,17 @@ def adapt(
     tracks: bool,
     dt: float,
 ) -> None:
-    """Advance theta^, the `estimate` (m,), by `dt` [s]: (20).
+    """Advance theta^ by `dt` [s], by the update law (20) and its projection.
 
-    `workspace.rate` has eps or W eps.  H is (n, m); the tracking error acts on the p
-    parameters, where it `tracks`.
+    `workspace.rate` has eps or W eps (m,), and afterwards theta^'.  `workspace.tracked` is left
+    with theta^ as the tracking error alone would have advanced it.
+
+    Arguments:
+        estimate: theta^ (m,), modified in place and kept in its range [lower, upper].
+        H: regressor (n, m) of what is learned.
+        xi2: velocity error (n,) [rad/s].
+        p: number of parameters P, which alone H^T xi2 adapts.
+        tracks: whether the tracking error adapts at all.
     """
     gain = settings.adaptation_gain
     # all rates before any estimate: the projection takes them together

@@ -55,14 +55,17 @@ class Workspace(NamedTuple):
 
 @inner
 def angle(xi: float, bound: float) -> float:
-    """Return s = pi xi^2 / (2 k_c^2) [rad] of the error [rad] and its bound [rad]."""
+    """Return s = pi xi^2 / (2 k^2) [rad] of an error xi [rad] and its bound k [rad]."""
     ratio = xi / bound
     return 0.5 * pi * (ratio * ratio)
 
 
 @inner
 def slope(xi: float, bound: float, weight: float) -> float:
-    """Return the stiffness w (1 + 4 s tan s) / cos^2 s [N m/rad] at |xi| < bound [rad]."""
+    """Return d^2V/dxi^2 = w (1 + 4 s tan s) / cos^2 s [N m/rad], the stiffness of the barrier.
+
+    The error |xi| [rad] is below its bound [rad]; `weight` is w [N m/rad].
+    """
     s = angle(xi, bound)
     c = cos(s)
     return weight * (1.0 + 4.0 * s * sin(s) / c) / (c * c)
@@ -70,7 +73,11 @@ def slope(xi: float, bound: float, weight: float) -> float:
 
 @inner
 def knee(bound: float, weight: float, slope_limit: float) -> float:
-    """Return the error [rad] at which the stiffness reaches `slope_limit` [N m/rad] (>= weight)."""
+    """Return the error [rad] at which the stiffness reaches `slope_limit` [N m/rad] (>= weight).
+
+    The barrier is that of a bound [rad] and a weight w [N m/rad].  Found by bisection, since
+    `slope` grows with the error.
+    """
     low = 0.0
     high = bound
     for _ in range(_BISECTIONS):
@@ -86,7 +93,11 @@ def knee(bound: float, weight: float, slope_limit: float) -> float:
 def gradient(
     xi: float, bound: float, weight: float, slope_limit: float, knee: float
 ) -> float:
-    """Return dV/dxi [N m]; its negative is the barrier torque tau_c of (16), (28)."""
+    """Return dV/dxi [N m] at an error xi [rad]; its negative is tau_c of (16), (28).
+
+    Up to the `knee` [rad] it is w xi / cos^2 s; beyond, a straight line of the slope `slope_limit`
+    [N m/rad].  `bound` is k(t) [rad], `weight` is w [N m/rad].
+    """
     edge = min(abs(xi), knee)
     c = cos(angle(edge, bound))
     torque = weight * edge / (c * c) + slope_limit * (abs(xi) - edge)
@@ -97,7 +108,10 @@ def gradient(
 def potential(
     xi: float, bound: float, weight: float, slope_limit: float, knee: float
 ) -> float:
-    """Return V [J]: (3) up to the knee, a parabola past it."""
+    """Return V [J] of (3) at an error xi [rad]: w (k^2 / pi) tan s up to the `knee` [rad].
+
+    Beyond, it is the parabola whose slope is `gradient`, with the same arguments.
+    """
     edge = min(abs(xi), knee)
     past = abs(xi) - edge
     s = angle(edge, bound)
@@ -113,7 +127,7 @@ def potential(
 def update_bound(
     settings: Settings, workspace: Workspace, t: float, bound: Array
 ) -> None:
-    """Write k(t) [rad] at time t [s] to `bound` (n,); find the knee of its barrier and k'/k."""
+    """Write k(t) (n,) [rad] at time t [s] to `bound`, and its knee and k'/k to `workspace`."""
     for i in range(settings.bound.size):
         final = settings.bound[i]
         above = (settings.initial_bound[i] - final) * exp(-settings.funnel_rate * t)
@@ -123,25 +137,16 @@ def update_bound(
 
 
 def bound_at(settings: Settings, t: float) -> Array:
-    """Return k(t) (n,) [rad] at time t [s], as `update_bound` computes it."""
+    """Return k(t) (n,) [rad] at time t [s] since the start, as `update_bound` computes it."""
     above = (settings.initial_bound - settings.bound) * exp(-settings.funnel_rate * t)
     bound: Array = settings.bound + above
     return bound
 
 
 @inner
-def joint_gradient(
-    settings: Settings, workspace: Workspace, xi: float, bound: float, i: int
-) -> float:
-    """Return dV/dxi [N m] of joint i with an error and its bound k(t) [rad]."""
-    weight, limit = settings.weight[i], settings.slope_limit[i]
-    return gradient(xi, bound, weight, limit, workspace.knee[i])
-
-
-@inner
 def joint_potential(
     settings: Settings, workspace: Workspace, xi: float, bound: float, i: int
 ) -> float:
-    """Return V [J] of joint i with an error and its bound k(t) [rad]."""
+    """Return V [J] of (3) of joint i with an error xi [rad] and its bound k(t) [rad]."""
     weight, limit = settings.weight[i], settings.slope_limit[i]
     return potential(xi, bound, weight, limit, workspace.knee[i])

@@ -34,7 +34,7 @@ from blf_dsc_controller.law.surface import known_rate, virtual_control
 
 
 class BlfDsc(NamedTuple):
-    """The law (28)."""
+    """The law (28): `compute_demand` is its torque, `finish` the updates (13), (20) and (30)."""
 
     layer: float = 0.01  # b, rad/s: xi2 at which the robust term saturates
 
@@ -46,7 +46,11 @@ class BlfDsc(NamedTuple):
     def compute_demand(
         self, settings: Settings, state: State, signals: Signals, t: float, dt: float
     ) -> None:
-        """Compute the torque (28)."""
+        """Compute the torque (28) before saturation, `signals.demand` (n,) [N m].
+
+        The order: surface (13) to (18), regressors and row of the learning, lag of the damping,
+        then per joint the feedback and what compensates the model.
+        """
         compute_surface(settings, state, signals, dt)
         learning.observe(settings, state, signals, t, dt)
         begins = state.samples[0] == 0.0
@@ -63,7 +67,10 @@ class BlfDsc(NamedTuple):
         dt: float,
         saturated: bool,
     ) -> None:
-        """Adapt theta^ and d^3; advance alpha2."""
+        """Advance theta^ by (20), d^3 by (30), and alpha2 by (13), each by `dt` [s].
+
+        `saturated`: the torque was cut, so the tracking error says nothing about the parameters.
+        """
         learning.adapt(settings, state, signals, dt, saturated)
         advance_surface(settings, state, signals, dt)
 
@@ -72,7 +79,12 @@ class BlfDsc(NamedTuple):
 def compute_surface(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Compute beta2 of (15) and (18), alpha2' of the filter (13), xi2, and -dV/dxi1."""
+    """Compute beta2 of (15), (18), alpha2' of the filter (13), xi2 = dq - alpha2, and -dV/dxi1.
+
+    Reads q, dq, reference, error and bound of `signals`; `dt` [s] is the sample time.  Writes
+    beta2 and its known rate f to `signals.surface`, alpha2' (mean over the sample), xi2, and the
+    torque of the barrier to `signals.feedback.restoring`.
+    """
     gains, surface = settings.surface, signals.surface
     gain = filter_gain(gains.time_constant, dt)
     for i in range(settings.n):
@@ -92,8 +104,12 @@ def compute_surface(
         signals.dalpha2[i] = gain * (surface.beta2[i] - state.alpha2[i]) / dt
         signals.dalpha2[i] += surface.rate[i]
         signals.xi2[i] = signals.dq[i] - state.alpha2[i]
-        signals.feedback.restoring[i] = -barrier.joint_gradient(
-            settings.barrier, signals.barrier, xi1, bound, i
+        signals.feedback.restoring[i] = -barrier.gradient(
+            xi1,
+            bound,
+            settings.barrier.weight[i],
+            settings.barrier.slope_limit[i],
+            signals.barrier.knee[i],
         )
 
 
@@ -101,7 +117,7 @@ def compute_surface(
 def advance_surface(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Advance alpha2 of the filter (13) by `dt` [s], exactly for the held beta2."""
+    """Advance alpha2 by `dt` [s] with the filter (13), exactly for a beta2 that is held."""
     surface = signals.surface
     gain = filter_gain(settings.surface.time_constant, dt)
     for i in range(settings.n):
@@ -120,11 +136,15 @@ def shift_surface(state: State, change: Array) -> None:
 def joint_feedback(
     settings: Settings, state: State, signals: Signals, layer: float, i: int
 ) -> float:
-    """Return the feedback of joint i [N m]: barrier, robust term and damping of (28)."""
+    """Return the feedback of joint i in (28) [N m]: barrier, robust term and damping.
+
+    `layer` is b [rad/s].  Where the barrier acts through the inertia matrix, it is in
+    `signals.model_torque` instead.
+    """
     gains = settings.feedback
-    xi1, xi2 = signals.xi1[i], signals.xi2[i]
-    lagged_xi2 = feedback.damped_velocity(gains, state.feedback, signals.xi2, i)
-    torque = feedback.joint_torque(gains, xi1, xi2, lagged_xi2, layer, i)
+    torque = feedback.joint_torque(
+        gains, state.feedback, signals.xi1[i], signals.xi2[i], layer, i
+    )
     if gains.follows_inertia == 1:  # the barrier is in `model_torque`
         return torque
     return torque + float(signals.feedback.restoring[i])

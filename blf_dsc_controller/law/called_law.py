@@ -26,7 +26,7 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 
 
 class CalledLaw(NamedTuple):
-    """The methods of a law, and its gains: kernels call it as a law."""
+    """A law that kernels call by address: its two methods, and its gains as a vector."""
 
     computes: Entry
     finishes: Entry
@@ -35,7 +35,7 @@ class CalledLaw(NamedTuple):
     def compute_demand(
         self, settings: Settings, state: State, signals: Signals, t: float, dt: float
     ) -> None:
-        """Call the law's own method."""
+        """Call `Law.compute_demand` of the law with its gains."""
         invoke(self.computes, self.gains, settings, state, signals, t, dt)
 
     def finish(
@@ -46,7 +46,7 @@ class CalledLaw(NamedTuple):
         dt: float,
         saturated: bool,
     ) -> None:
-        """Call the law's own method."""
+        """Call `Law.finish` of the law with its gains."""
         invoke(self.finishes, self.gains, settings, state, signals, dt, saturated)
 
     def with_gains(self, law: Law) -> CalledLaw:
@@ -63,7 +63,8 @@ def is_callable(law: Law) -> bool:
 def called(law: Law, settings: Settings, state: State, signals: Signals) -> CalledLaw:
     """Return a law as kernels call it, compiled for arguments of the types of these.
 
-    Raises BlfDscError where the law of a file cannot be compiled.
+    Raises:
+        BlfDscError: the law of a file cannot be compiled; the text says where and why.
     """
     computes, finishes = _methods(type(law), _source(law))
     arguments = _vector(law), *map(referred, (settings, state, signals))

@@ -2,15 +2,15 @@
 """Whether the arm has changed: rows contradict those before them, or the latched solution.
 
 With a prior, each row is compared with what the rows of the window so far and the prior
-predict (see `innovation`).  The solution of a window says nothing about postures that
-it has not seen, and its residual, if it has rested, nothing about motion: both would
-look like changes.
+predict (see `innovation`).  The solution of a window says nothing about postures
+outside of it, and its residual, if it has rested, nothing about motion: both would look
+like changes.
 
 Planar arms have no prior.  There the mean square error of the latched solution over the
 last 0.1 s is compared with the residual that it had.
 
 If the arm has changed, window, filters and latch are cleared, and learning restarts.
-What a window has taught before it was full is taken back: it did not predict what it
+What was learned from a window before it was full is taken back: it did not predict what it
 was not fitted to (`learning.detect_change`).
 
 Something may push the arm for seconds, with a torque that no parameters explain.  Rows
@@ -29,17 +29,17 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 
 # ratio of mean squares; larger than the gate's, since a solution extrapolates
 _ALARM_RATIO = 8.0
-# s from one change to the next. A load that comes on may be found twice so soon; the third time,
-# there is no arm that the rows are of
+# s from one change to the next.  A load that comes on may be detected twice so soon; rows that
+# change a third time are of no arm
 _SOON_TIME, _HASTY_TIME = 0.3, 2.0
 
 
 class State(NamedTuple):
-    """What it keeps from one row to the next."""
+    """What is kept from one row to the next."""
 
-    changes: Cell  # number of times that the arm was found to have changed
+    changes: Cell  # number of changes of the arm that were detected
     hasty: Cell  # the last changes that came soon after the one before
-    announced: Cell  # 1: the arm changes now, as somebody has said
+    announced: Cell  # 1: a change of the arm is announced for now
     contradiction: Cell  # `recent_residual` at the last change, (N m)^2
     recent_residual: Cell  # of the last rows against the solution, (N m)^2
     # with a prior: theta of the rows so far, and the factor of its equations
@@ -58,21 +58,13 @@ class Workspace(NamedTuple):
 
 
 @inner
-def is_predicted(sliding: Window) -> bool:
-    """Whether rows are compared with those before them.
-
-    Without a prior, as of planar arms, these predict too little.
-    """
-    return bool(sliding.settings.prior_weight > 0.0)
-
-
-@inner
 def compare_row(
     state: State, row: Array, theta: Array, period: float, error: Array
 ) -> None:
-    """Write e = u - X theta of a `row` (n, m + 1) to `error` (n,); average its square.
+    """Write the residual e = u - X theta (n,) [N m] of a row to `error`; average its square.
 
-    `period` [s] is the time from one row to the next.
+    `row` is [X | u] (n, m + 1), `theta` (m,), `period` [s] the time from one row to the next.  The
+    average over 0.1 s is `state.recent_residual`.
     """
     m = theta.size
     square = 0.0
@@ -96,7 +88,11 @@ def compare_with_solution(
     row: Array,
     dt: float,
 ) -> bool:
-    """Compare this row with the latched solution; return whether the last ones contradict it."""
+    """Return whether the last rows contradict the latched solution: the arm has changed.
+
+    `row` is [X | u] (n, m + 1) of the last interval, `dt` [s] long.  They contradict it where
+    their mean square residual exceeds 8 times what noise and unmodelled torque explain.
+    """
     if latch.latched[0] == 0.0:
         return False
     compare_row(state, row, latch.solution, dt, workspace.innovation)
@@ -119,16 +115,23 @@ def compare_with_rows(
     samples: int,
     dt: float,
 ) -> bool:
-    """Compare this row with those before it; return whether the last ones contradict them.
+    """Return whether the last rows contradict those of the window before them: the arm has changed.
 
-    `square_weight` is the mean square weight of its joints, `unmodelled` the mean square torque
-    that no column describes [(N m)^2], `samples` the number of samples of `dt` [s].
+    Rows come each `row_interval` samples, else this returns False.  theta of the rows so far is
+    solved for anew ten times a second.
+
+    Arguments:
+        row: [X | u] (n, m + 1).
+        square_weight: mean square weight of the row's joints, w^2 of `innovation`.
+        unmodelled: mean square torque of a joint that no column describes [(N m)^2].
+        samples: number of samples so far.
+        dt: sample time [s].
     """
     window_settings = sliding.settings
     if samples % window_settings.row_interval != 0:
         return False
     period = window_settings.row_interval * dt
-    if not innovation.has_begun(state.innovation):
+    if state.innovation.noise[0] == 0.0:
         innovation.begin(state.innovation, unmodelled)
         fit_rows(state, sliding, prior, period)
     compare_row(state, row, state.rows_fit, period, workspace.innovation)
@@ -157,7 +160,10 @@ def compare_with_rows(
 
 @inner
 def fit_rows(state: State, sliding: Window, prior: Prior, period: float) -> None:
-    """Solve for theta of the rows so far, one each `period` [s], and of the prior."""
+    """Solve for theta of the rows so far, one each `period` [s], with the prior: A theta = b.
+
+    A and b are those of `innovation`.  theta and the factor of A are left in `state`.
+    """
     a = innovation.row_variance(state.innovation, period)
     factor = state.rows_factor
     theta = state.rows_fit
@@ -176,9 +182,10 @@ def count_change(
     estimate: Array,
     dt: float,
 ) -> None:
-    """Count a change, and forget window and latch; the `estimate` (m,) becomes the anchor.
+    """Count a change of the arm; forget window and latch.  The `estimate` (m,) becomes the anchor.
 
-    The third of three that come soon after one another is of a torque that lasts.
+    The third change that soon follows another is attributed to a torque that lasts: the rows'
+    noise is raised, so that learning goes on.  `dt` [s] is the sample time.
     """
     window_settings = sliding.settings
     age = sliding.state.rows[0] * window_settings.row_interval * dt

@@ -32,7 +32,7 @@ NOT_SENSORS = 64
 
 
 class Checks(NamedTuple):
-    """Limits of the checks, and the values that they keep from past samples."""
+    """Limits of the checks, and the values that these keep from past samples."""
 
     velocity_limit: Annotated[Array, 'n']  # rad/s; 0 disables all checks
     error_ratio: Cell  # |xi1| / k from which an error is suspect; 0: never

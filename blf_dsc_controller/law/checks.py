@@ -28,7 +28,7 @@ from blf_dsc_controller.law.state import Sample, Settings, Signals, State
 
 @inner
 def is_valid_state(checks: Checks, measurement: Array) -> bool:
-    """Whether the used values of [q, dq, applied torque] (3 n,) are finite and not too fast."""
+    """Whether q and dq of [q, dq, effort] (3 n,) are finite, and dq within the velocity limit."""
     n = measurement.size // 3
     for i in range(n):
         if not (
@@ -43,7 +43,11 @@ def is_valid_state(checks: Checks, measurement: Array) -> bool:
 def watch_oscillation(
     settings: Settings, checks: Checks, signals: Signals, begins: bool, dt: float
 ) -> bool:
-    """Follow the half waves of the joints, if checked; return whether to report an oscillation."""
+    """Update the half waves of the joints; return whether an oscillation is to be reported now.
+
+    It is False while nothing is checked, and at the first sample, which `begins`.  `dt` [s] is
+    the time since the last sample.
+    """
     if not are_on(checks) or checks.sample_time[0] <= 0.0:
         return False
     half_waves = checks.oscillation
@@ -67,7 +71,11 @@ def watch_oscillation(
 def check_error(
     checks: Checks, has_barrier: bool, xi1: Array, bound: Array
 ) -> tuple[int, float]:
-    """Return the flags for the errors (n,) [rad], and the largest |xi1| / k; update `ratio`."""
+    """Return the flags for the errors xi1 (n,) [rad] and their bound (n,) [rad], and max |xi1| / k.
+
+    Updates `checks.ratio`.  OUTSIDE: an error is at its bound or beyond.  SUSPECT: one is at
+    `error_ratio` times its bound or beyond, if the law has a barrier.
+    """
     flags = 0
     largest = 0.0
     error_ratio = checks.error_ratio[0] if has_barrier else 0.0
@@ -85,7 +93,7 @@ def check_error(
 
 @inner
 def may_oscillate(checks: Checks) -> bool:
-    """Whether what a joint shows may be an oscillation."""
+    """Whether a joint may oscillate: it has shown two half waves in a row or more."""
     is_any = False
     for i in range(checks.oscillation.waves.size):
         is_any = is_any or checks.oscillation.waves[i] >= oscillation.SOME
@@ -96,7 +104,7 @@ def may_oscillate(checks: Checks) -> bool:
 def is_valid_sample(
     settings: Settings, state: State, signals: Signals, sample: Sample
 ) -> bool:
-    """Whether what the law computed is finite, and its demand within the limits.
+    """Whether torque and estimates are finite, and the demand is within the torque limit.
 
     The estimate of a rejected column is finite in the state but NaN in the sample.
     """
@@ -116,7 +124,11 @@ def is_valid_sample(
 def check_sample(
     settings: Settings, checks: Checks, state: State, signals: Signals, sample: Sample
 ) -> int:
-    """Return the flags for what the law computed in a sample; update the kept values."""
+    """Return the flags for what the law computed in a sample; keep the estimates of a valid one.
+
+    SUSPECT and OUTSIDE are those of `check_error`; a value that is not finite is SUSPECT as well.
+    NO_EFFECT: commands do not reach the arm (`effect`).
+    """
     flags, ratio = check_error(
         checks, settings.has_barrier == 1, sample.xi1, sample.bound
     )

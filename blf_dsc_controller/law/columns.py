@@ -20,9 +20,10 @@ instead subtract the estimate d^3 from the torque, which hides the parameter err
 N times in each turn of it.
 
 *Friction that grows with the load.*  The teeth of a gear rub the more, the more torque it carries:
-of the torque tau_L that the learned model has along the reference, a share is lost.  The measured
-torque in place of tau_L would explain itself.  Of Coulomb friction, reversals show the sum of both
-where they happen to be.  What varies with posture and load along the motion is left to this column.
+a fraction of the torque tau_L, which the learned model has along the reference, is lost.  The
+measured torque in place of tau_L would explain itself.  Reversals identify the sum of this and of
+Coulomb friction where they happen to be.  What varies with posture and load along the motion is
+left to this column.
 """
 
 from typing import Annotated, NamedTuple
@@ -57,7 +58,7 @@ class Settings(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Where and when the entries of one joint are taken."""
+    """Where and when the entries of one joint are evaluated."""
 
     t: float  # s
     q: float  # rad
@@ -68,28 +69,30 @@ class Point(NamedTuple):
 
 @inner
 def entry(kind: int, rate: float, at: Point) -> float:
-    """Return the entry of a joint in its column of a block."""
-    if kind >= VISCOUS:
-        return friction_entry(kind, at)
+    """Return the entry a_k of a joint in its column of a block, by the `kind` of the block.
+
+    `rate` is w [rad/s] of a sine or cosine over time, N [1/turn] of one over position.
+    """
     if kind == BIAS:
         return 1.0
-    angle = rate * (at.t if kind <= COSINE else at.q)
-    return sin(angle) if kind in (SINE, RIPPLE_SINE) else cos(angle)
-
-
-@inner
-def friction_entry(kind: int, at: Point) -> float:
-    """Return `entry` of a kind of friction."""
     if kind == VISCOUS:
         return at.dq
-    return at.sign if kind == COULOMB else abs(at.load) * at.sign
+    if kind == LOAD_FRICTION:
+        return abs(at.load) * at.sign
+    if kind == COULOMB:
+        return at.sign
+    angle = rate * (at.t if kind <= COSINE else at.q)
+    return sin(angle) if kind in (SINE, RIPPLE_SINE) else cos(angle)
 
 
 @inner
 def fill(
     settings: Settings, kinds: tuple[int, int], i: int, at: Point, H: Array
 ) -> None:
-    """Fill row i of the blocks of some kinds, in a regressor H (n, m)."""
+    """Fill row i of the blocks of some kinds in a regressor H (n, m).
+
+    `kinds` are the first and the last kind, `at` is where the joint is.
+    """
     n = H.shape[0]
     for k in range(settings.blocks):
         kind = int(settings.kinds[k])
@@ -124,7 +127,10 @@ def torque_of(
     estimate: Array,
     n: int,
 ) -> float:
-    """Return the torque of joint i by its columns of some kinds, with theta (m,) [N m]."""
+    """Return the torque of joint i by its columns of some kinds, sum_k d_k a_k [N m].
+
+    `kinds` are the first and the last kind, `estimate` is theta (m,), n the number of joints.
+    """
     torque = 0.0
     for k in range(settings.blocks):
         kind = int(settings.kinds[k])

@@ -33,7 +33,11 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 
 @inner
 def fill_model(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute H, Yp and Yr at the state, and H P^(0) with the feedback as `model_torque` [N m]."""
+    """Compute H, Yp and Yr at the state, and H P^(0) as `signals.model_torque` (n,) [N m].
+
+    v and a of H(q, dq, v, a) are alpha2 and a_f of `feedback`; with `decoupled` joints dqr and
+    ddqr, so that no feedback passes the inertia.  Yp and Yr are for the row (`prediction`).
+    """
     gains, row = settings.feedback, signals.row
     H, a_f = signals.H, signals.feedback.acceleration
     v, a = state.alpha2, signals.dalpha2
@@ -51,7 +55,10 @@ def fill_model(settings: Settings, state: State, signals: Signals) -> None:
 
 @inner
 def compute_regressors(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute H P^(0) of the feedback, H of what is learned, and Yp and Yr of the row."""
+    """Compute H P^(0) of the feedback, Yp and Yr of the row, and H of what is learned.
+
+    The last is H(qr, dqr, dqr, ddqr), along the reference (Sadegh and Horowitz 1990).
+    """
     fill_model(settings, state, signals)
     dqr, ddqr = signals.dqr, signals.ddqr
     settings.model.regressor(signals.qr, dqr, dqr, ddqr, signals.H)
@@ -61,7 +68,7 @@ def compute_regressors(settings: Settings, state: State, signals: Signals) -> No
 def compute_regressors_at_state(
     settings: Settings, state: State, signals: Signals
 ) -> None:
-    """Compute the same with H of what is learned at the state, as in the paper."""
+    """Compute the same with H(q, dq, alpha2, alpha2') of what is learned: (28) as printed."""
     fill_model(settings, state, signals)
     gains = settings.feedback
     if gains.damping_rate > 0.0 or gains.follows_inertia == 1:
@@ -103,7 +110,11 @@ def fill_learned(settings: Settings, state: State, signals: Signals, dt: float) 
 def fill_known_torque(
     settings: Settings, state: State, signals: Signals, v: Array, a: Array, dt: float
 ) -> None:
-    """Write H(q, dq, v, a) P^(0) and the known friction at dqr to `signals.model_torque` [N m]."""
+    """Write H(q, dq, v, a) P^(0) and the known friction to `signals.model_torque` (n,) [N m].
+
+    v (n,) [rad/s] and a (n,) [rad/s^2] are what a computed-torque law asks for.  The friction is
+    that at dqr; `dt` [s] is the sample time.
+    """
     H = signals.H
     settings.model.regressor(signals.q, signals.dq, v, a, H)
     fill_learned(settings, state, signals, dt)
@@ -117,7 +128,12 @@ def fill_known_torque(
 def compensated(
     settings: Settings, state: State, signals: Signals, i: int, feedback: float
 ) -> float:
-    """Return the demand of joint i [N m]: feedback, model, d^3, r, and what is learned."""
+    """Return the demand of joint i [N m]: feedback, model, d^3, friction and what is learned.
+
+        tau = tau_f + H P^(0) + d^3 + friction + r + H (theta^ - [P^(0); 0])
+
+    `feedback` is tau_f [N m].  r of the `load_observer` is zero without joint torque sensors.
+    """
     torque = feedback + signals.model_torque[i]
     torque += state.disturbance[i] + signals.friction.torque[i]
     if settings.observer.enabled == 1:

@@ -37,7 +37,7 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one sample to the next."""
+    """What is kept from one sample to the next."""
 
     phase: Cell  # QUIET, EXPLAINED or TOUCHED
     calm: Cell  # s, since r has been small
@@ -56,7 +56,7 @@ class Workspace(NamedTuple):
 
 
 class Residual(NamedTuple):
-    """What `external_torque` sees."""
+    """The external torque r of a sample, with its covariance."""
 
     rows: Array  # [X_L | u_L] (n, m + 1)
     spread: Array  # factor of S (n, n)
@@ -65,7 +65,7 @@ class Residual(NamedTuple):
 
 
 class TipLoad(NamedTuple):
-    """How a load in the tip acts, and what is known to be held."""
+    """How a load in the tip acts, and what the tip is known to hold."""
 
     columns: Array  # of `payload`: those of N D are first
     scale: Array  # rows of D, likewise: mass [kg] and moments [kg m]
@@ -88,9 +88,10 @@ def absorb(
     covariance: Array,
     workspace: Array,
 ) -> float:
-    """Update z and its covariance by e = columns z + white noise of variance `noise`.
+    """Update z (k,) and its covariance (k, k) by e = columns z + white noise of variance `noise`.
 
-    Returns the sum of the squared innovations, each over its variance.
+    A Kalman filter whose entries of e (n,) come one after the other.  `columns` is (n, k), `work`
+    (k,) scratch.  Returns the sum of the squared innovations, each over its variance.
     """
     size = z.size
     square = 0.0
@@ -124,7 +125,11 @@ def forget_load(state: State) -> None:
 def fill_load_columns(
     workspace: Workspace, residual: Residual, load_columns: Array
 ) -> None:
-    """Compute -X_L N D, whitened: the load is missing in X theta^ = u + r."""
+    """Compute -X_L N D (n, 10), whitened by the factor of S, as `workspace.columns`.
+
+    The sign is that of a load which X theta^ = u + r lacks.  `load_columns` (m, 10 or more) are
+    N D first.
+    """
     rows, spread, columns = residual.rows, residual.spread, workspace.columns
     n = rows.shape[0]
     m = rows.shape[1] - 1
@@ -141,7 +146,11 @@ def fill_load_columns(
 
 @inner
 def filter_load(state: State, workspace: Workspace, white: Array, dt: float) -> float:
-    """Filter the load from r, which is `white` (n,); return how far r is from what any explains."""
+    """Filter z of the load from r, which is `white` (n,); return the distance of r from any load.
+
+    That distance is by this sample alone, with the filtered z as prior.  `dt` [s] is the sample
+    time.
+    """
     size = state.load.size
     gain = min(1.0, dt / _FORGETTING_TIME)
     for a in range(size):
@@ -171,14 +180,8 @@ def filter_load(state: State, workspace: Workspace, white: Array, dt: float) -> 
 
 
 @inner
-def is_negative_mass(mass: float, variance: float) -> bool:
-    """Whether a mass [kg] is below zero beyond doubt, with its variance [kg^2]."""
-    return bool(mass < -_NEGATIVE_SIGMAS * sqrt(variance))
-
-
-@inner
 def removes_too_much_mass(state: State, load: TipLoad) -> bool:
-    """Whether the filtered load takes away more mass than is held."""
+    """Whether the filtered load removes more mass than the tip holds, by three deviations."""
     mass = load.mass
     variance = load.deviation * load.deviation
     for a in range(state.load.size):
@@ -186,29 +189,12 @@ def removes_too_much_mass(state: State, load: TipLoad) -> bool:
         for b in range(state.load.size):
             scale = load.scale[0, a] * load.scale[0, b]
             variance += scale * state.load_covariance[a, b]
-    return is_negative_mass(mass, variance)
-
-
-@inner
-def explain_by_load(
-    settings: Settings,
-    state: State,
-    workspace: Workspace,
-    residual: Residual,
-    load: TipLoad,
-    dt: float,
-) -> float:
-    """Return the distance of r from what a load explains, or from zero if none does."""
-    if settings.loads == 0:
-        return residual.distance
-    fill_load_columns(workspace, residual, load.columns)
-    remaining = filter_load(state, workspace, residual.white, dt)
-    return residual.distance if removes_too_much_mass(state, load) else remaining
+    return bool(mass < -_NEGATIVE_SIGMAS * sqrt(variance))
 
 
 @inner
 def is_small(phase: float, distance: float, threshold: float) -> bool:
-    """Whether r is too small for a contact, or for one that lasts."""
+    """Whether a `distance` of r is within the threshold h, or h / 2 of a contact that lasts."""
     return bool(distance <= (0.5 if phase == TOUCHED else 1.0) * threshold)
 
 
@@ -221,10 +207,15 @@ def next_phase(
     explained: float,
     threshold: float,
 ) -> int:
-    """Return the phase that follows.
+    """Return the phase that follows: QUIET, EXPLAINED or TOUCHED.
 
-    r is at a `distance`, which a load leaves `remaining`.  It has been small for `calm`
-    [s]; a load has explained a contact for `explained` [s].
+    Arguments:
+        phase: the phase so far.
+        distance: of r from zero, in standard deviations.
+        remaining: of r from what a load explains.
+        calm: time for which r has been small [s].
+        explained: time for which a load has explained a contact [s].
+        threshold: h.
     """
     if is_small(phase, distance, threshold):
         return TOUCHED if phase == TOUCHED and calm < _CALM_TIME else QUIET
@@ -242,7 +233,10 @@ def update(
     load: TipLoad,
     dt: float,
 ) -> float:
-    """Update the phase; return the distance of r from what explains it."""
+    """Update the phase by r of a sample, `dt` [s] long; return the distance that is unexplained.
+
+    A load in the tip explains r if `settings.loads`, unless its mass would be negative.
+    """
     phase = state.phase[0]
     distance = remaining = residual.distance
     if is_small(phase, distance, settings.threshold):
@@ -250,7 +244,11 @@ def update(
         state.explained[0] = 0.0
     else:
         state.calm[0] = 0.0
-        remaining = explain_by_load(settings, state, workspace, residual, load, dt)
+        if settings.loads == 1:
+            fill_load_columns(workspace, residual, load.columns)
+            unexplained = filter_load(state, workspace, residual.white, dt)
+            if not removes_too_much_mass(state, load):
+                remaining = unexplained
         is_explained = phase == TOUCHED and not remaining > settings.threshold
         state.explained[0] = state.explained[0] + dt if is_explained else 0.0
     state.phase[0] = next_phase(

@@ -13,7 +13,7 @@ import numpy as np
 from blf_dsc_controller.compiled.jit import direct
 from blf_dsc_controller.compiled.layout import Array, pack
 from blf_dsc_controller.errors import BlfDscError
-from blf_dsc_controller.law import barrier, external_torque, friction, load_observer
+from blf_dsc_controller.law import barrier, external_torque, load_observer, reversals
 from blf_dsc_controller.law.check_state import INVALID, checks_of, checks_size
 from blf_dsc_controller.law.interface import Law
 from blf_dsc_controller.law.laws import for_kernels, for_law, with_gains
@@ -125,7 +125,7 @@ class Controller:
         self.state.latch.anchor[:] = self.settings.initial_estimate
         self.state.window.min_eigenvector.fill(1.0 / np.sqrt(self.settings.m))
         self.state.latch.active.fill(1.0)
-        friction.begin(self.settings.friction, self.state.friction)
+        reversals.begin(self.settings.friction.reversals, self.state.friction.reversals)
 
     def begin(self, start: Start) -> None:
         """Begin with the next update; of the state, what `KEPT` names for this start goes on."""

@@ -33,7 +33,10 @@ class Workspace(NamedTuple):
 def fill_step(
     settings: Settings, workspace: Workspace, estimate: Array, xi2: Array, dt: float
 ) -> None:
-    """Compute the step dt gamma (xi2 + eta d^3); `estimate` (n,) [N m] is d^3."""
+    """Compute dt gamma (xi2 + eta d^3) (n,) [N m] of (30), by which d^3 falls, as `workspace.step`.
+
+    `estimate` is d^3 (n,) [N m], xi2 (n,) [rad/s].
+    """
     for i in range(xi2.size):
         error = xi2[i] + settings.leakage * estimate[i]
         workspace.step[i] = dt * settings.gain[i] * error
@@ -41,7 +44,10 @@ def fill_step(
 
 @inner
 def transfer_learned(estimate: Array, H: Array, theta: Array, before: Array) -> None:
-    """Subtract H (theta - `before`) from d^3, the `estimate` (n,) [N m]; H is (n, m)."""
+    """Subtract H (theta - before) from d^3: the torque H theta + d^3 does not change by learning.
+
+    `estimate` is d^3 (n,) [N m], modified in place; H is (n, m), `theta` and `before` are (m,).
+    """
     for j in range(theta.size):
         for i in range(estimate.size):
             estimate[i] -= H[i, j] * (theta[j] - before[j])

@@ -27,7 +27,7 @@ _SHORTFALL_TIME = 0.1  # s, for which the efforts have to differ from the comman
 
 
 class State(NamedTuple):
-    """What it keeps from past samples."""
+    """What is kept from past samples."""
 
     last: Annotated[Array, 'n']  # N m, command of the last sample
     # (N m)^2, mean square step of the commands over _CHATTER_TIME
@@ -60,7 +60,7 @@ class Sample(NamedTuple):
 
 @inner
 def average_steps(state: State, sample: Sample) -> None:
-    """Update the mean square step of the commands, which coarse encoders make chatter."""
+    """Update the mean square step of the commands [(N m)^2], which coarse encoders make chatter."""
     gain = min(1.0, sample.dt / _CHATTER_TIME)
     for i in range(sample.q.size):
         step = 0.0 if sample.begins else sample.command[i] - state.last[i]
@@ -70,7 +70,7 @@ def average_steps(state: State, sample: Sample) -> None:
 
 @inner
 def is_elsewhere(readings: sensor.State, position: Array, earlier: Array) -> bool:
-    """Whether a position (n,) [rad] of one joint differs by more than its sensor explains."""
+    """Whether a joint is farther from an `earlier` position (n,) [rad] than its sensor explains."""
     moves = False
     for i in range(position.size):
         moves = moves or sensor.position_changed(readings, i, position[i] - earlier[i])
@@ -83,12 +83,13 @@ def check_effect(
 ) -> tuple[bool, bool]:
     """Update; return whether commands have no effect, and whether a joint moves as it should.
 
-    The reference has moved on, the commands have changed by more than what overcomes
-    stiction, and still no joint has moved: brakes hold the arm, or its effort
-    controller is not active, and the law learns what its own commands say.  While the
-    reference rests, commands may change without a motion that the sensors resolve: a
-    stiff loop takes up a load so.  Slower drifts show in efforts that are torques; an
-    effort that follows the commands shows that they have an effect.
+    Commands have no effect where the reference has moved on, they have changed by more than
+    what overcomes stiction, and still no joint has moved: brakes hold the arm, or its effort
+    controller is not active, and the law would learn from its own commands.
+
+    While the reference rests, commands may change without a motion that the sensors resolve:
+    a stiff loop takes up a load so.  Slower drifts are found by efforts that are torques.  An
+    effort that follows the commands proves their effect.
     """
     moves = sample.begins or is_elsewhere(readings, sample.q, state.q)
     falls_short = compare_effort(limits, state, sample, moves)
@@ -104,7 +105,11 @@ def check_effect(
 def follow_commands(
     limits: torque.Settings, state: State, sample: Sample, moves: bool
 ) -> bool:
-    """Average the commands; return whether they have changed since a joint has moved."""
+    """Average the commands; return whether they have changed since a joint last moved.
+
+    They have if their average over 50 ms differs from that over a second, or of when a joint
+    moved, by a tenth of the torque limit and half of their chatter.
+    """
     has_changed = False
     for i in range(sample.q.size):
         command = sample.command[i]
@@ -126,7 +131,7 @@ def follow_commands(
 
 @inner
 def effort_follows(state: State, effort: Array) -> bool:
-    """Whether measured efforts (n,) are torques and do what is commanded."""
+    """Whether measured efforts (n,) are torques, and equal to the commands so far."""
     follows = bool(state.compares[0] == 1.0) and bool(state.short_for[0] == 0.0)
     for i in range(effort.size):
         follows = follows and isfinite(effort[i])
@@ -137,11 +142,11 @@ def effort_follows(state: State, effort: Array) -> bool:
 def compare_effort(
     limits: torque.Settings, state: State, sample: Sample, moves: bool
 ) -> bool:
-    """Average commands less efforts; return whether the difference has lasted too long.
+    """Average commands less efforts; return whether the difference has been too large for too long.
 
-    The drives' own model of what they add may differ from the law's: then the
-    difference must not change while no joint moves.  In motion, its excess over
-    the usual value explains an error past the bound.
+    The drives' own model of what they add may differ from the law's: then the difference must
+    not change while no joint moves.  In motion, its excess over the mean explains an error past
+    the bound.
     """
     if state.compares[0] == 0.0:
         return False

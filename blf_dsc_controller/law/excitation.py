@@ -13,8 +13,8 @@ the solution,
 
 and a window is latched only if r^2 is at most four times the smallest of any full
 window, or what unmodelled torque explains (configured, but no more than the smallest
-residual shows), and if its solution gives the arm a positive inertia, which the
-residual does not show.  The first full window has only its own parts as a measure:
+residual suggests), and if its solution gives the arm a positive inertia, which the
+residual does not imply.  The first full window has only its own parts as a measure:
 fitted apart, neither may explain its rows better than by that factor, else the older
 part is removed from the window; again only if the residual has halved since, since
 parts of a period never agree about a lasting disturbance.
@@ -64,7 +64,7 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """The latched window, and what earlier ones have shown."""
+    """The latched window, and measures of earlier ones."""
 
     latched: Cell  # 1 while a window (Phi_e, b_e) is latched
     latch_time: Cell  # T_e, s
@@ -96,10 +96,10 @@ class Workspace(NamedTuple):
 
 @inner
 def explained(settings: Settings, min_residual: float, residual: float) -> float:
-    """Return the mean square residual that noise and unmodelled torque explain (>= `residual`).
+    """Return the mean square residual [(N m)^2] that noise and unmodelled torque explain.
 
-    Their configured floor is an upper limit: the best full window, with the
-    `min_residual` or 0 if there is none, shows how little they are.
+    It is at least the `residual` of the window.  The configured floor is an upper limit: the
+    smallest residual of any full window, `min_residual` (0 before the first), lowers it.
     """
     floor = settings.residual_floor
     if min_residual > 0.0:
@@ -110,7 +110,10 @@ def explained(settings: Settings, min_residual: float, residual: float) -> float
 
 @inner
 def window_residual(running: Array, theta: Array) -> float:
-    """Return the sum of |u - X theta|^2 over the window, from its sums of [X | u]^T [X | u]."""
+    """Return the sum of |u - X theta|^2 over the window [(N m)^2], >= 0.
+
+    `running` (m + 1, m + 1) is its sum of [X | u]^T [X | u], `theta` is (m,).
+    """
     m = theta.size
     total = running[m, m]
     for i in range(m):
@@ -125,7 +128,10 @@ def window_residual(running: Array, theta: Array) -> float:
 def find_spare_inertia(
     model: ArmModel, workspace: Workspace, q: Array, theta: Array, P0: Array
 ) -> None:
-    """Write M(q) of theta (m,), minus a tenth of that of P^(0), to `workspace.inertia`."""
+    """Write M(q; theta - 0.1 P^(0)) (n, n) to `workspace.inertia`, lower triangle.
+
+    theta (m,) is physical there if that is positive definite.  q (n,) [rad], P0 (p,).
+    """
     n = q.size
     for k in range(n):
         for i in range(n):
@@ -142,7 +148,10 @@ def find_spare_inertia(
 def is_in_question(
     settings: Settings, state: State, sliding: Window, residual: float
 ) -> bool:
-    """Whether a full window must be compared with its parts: no other has been accepted yet."""
+    """Whether a full window must be compared with its parts: no other has been accepted yet.
+
+    Its mean square `residual` [(N m)^2] is above the gate, and has halved since the last split.
+    """
     is_full = window.is_full(sliding.settings, sliding.state)
     if not is_full or state.min_residual[0] > 0.0 or sliding.settings.length == 1:
         return False
@@ -155,10 +164,10 @@ def is_in_question(
 def part_residual(
     sliding: Window, prior: Prior, active: Array, part: Array, rows: int
 ) -> float:
-    """Return the mean square residual of some rows of the window, fitted apart.
+    """Return the mean square residual [(N m)^2] of some `rows` of the window, fitted apart.
 
-    `part` (m + 1, m + 1) is the sum of their [X | u]^T [X | u].  Their equations and
-    solution are left in the scratch of the window.
+    `part` (m + 1, m + 1) is the sum of their [X | u]^T [X | u].  Their equations and solution
+    are left in the workspace of the window.
     """
     workspace = sliding.workspace
     window.fill_equations(sliding.settings, workspace, prior, part, rows)
@@ -170,10 +179,10 @@ def part_residual(
 def best_part_residual(
     sliding: Window, prior: Prior, active: Array, newer_rows: int
 ) -> float:
-    """Return the smallest residual of the parts of a full window, each fitted apart.
+    """Return the smaller mean square residual of the two parts of a full window, each fitted apart.
 
-    `sliding.workspace.newer` is the sum of its `newer_rows` newer rows.  Phi, b, the factor
-    and the solution of the whole window are in its scratch again afterwards.
+    `sliding.workspace.newer` is the sum of its `newer_rows` newer rows.  Phi, b, the factor and
+    the solution of the whole window are in its workspace again afterwards.
     """
     whole, newer, older = (
         sliding.state.running,
@@ -198,8 +207,8 @@ def split_window(
 ) -> bool:
     """Remove the older part of a full window if the parts contradict each other; return whether.
 
-    They do if one of them, fitted apart, explains its rows better than the window with
-    its `residual` by more than the gate.
+    They do if one of them, fitted apart, explains its rows better than the window with its mean
+    square `residual` by more than the gate.
     """
     newer = sliding.workspace.newer
     rows = window.newer_part(sliding.state, newer)
@@ -223,9 +232,13 @@ def accept_window(
 ) -> bool:
     """Keep the solution of the window if it is consistent and physical; return whether.
 
-    A window that is not full, or has an unusually large residual, is pulled to the
-    anchor: Phi + a R, b + a R theta_anchor, in the scratch of the window.  The inertia
-    is that at the position q (n,).
+    A window that is not full, or has an unusually large residual, is pulled to the anchor:
+    Phi + a R, b + a R theta_anchor, in the workspace of the window.
+
+    Arguments:
+        sliding: the window, whose workspace has Phi, b and their factor.
+        prior: P^(0) and R.
+        q: position (n,) [rad] at which the inertia must be positive definite.
     """
     equations = sliding.workspace
     for j in range(equations.b.size):
@@ -259,11 +272,14 @@ def accept_window(
 
 @inner
 def keep_solution(state: State, sliding: Window, residual: float) -> None:
-    """Keep the solution of the window; that of a full one becomes the anchor, once per window."""
+    """Keep the solution of the window, and that of a full one as the anchor, once per window.
+
+    `residual` is its mean square [(N m)^2].
+    """
     solution = sliding.workspace.solution
     is_first = state.latched[0] == 0.0
-    is_due = is_first or window.is_at_start(sliding.settings, sliding.state)
-    becomes_anchor = is_due and window.is_full(sliding.settings, sliding.state)
+    is_new = is_first or window.is_at_start(sliding.settings, sliding.state)
+    becomes_anchor = is_new and window.is_full(sliding.settings, sliding.state)
     state.residual[0] = residual
     for j in range(solution.size):
         state.solution[j] = solution[j]
@@ -310,7 +326,7 @@ def reject_columns(
 
 @inner
 def strongest(direction: Array, active: Array, first: int) -> int:
-    """Return the column, from the `first` on, that has most of a `direction` (m,)."""
+    """Return the active column, from the `first` on, with the largest entry of `direction` (m,)."""
     worst = first
     for j in range(first, direction.size):
         strength = abs(direction[j]) * active[j]
@@ -323,7 +339,10 @@ def strongest(direction: Array, active: Array, first: int) -> int:
 def readmit_columns(
     settings: Settings, state: State, sliding: Window, prior: Prior, first: int
 ) -> None:
-    """Check rejected columns again, once per window: a later one may distinguish them."""
+    """Check rejected columns again, once per window: a later one may distinguish them.
+
+    Columns from the `first` on are those of disturbances.
+    """
     rejected = 0.0
     for j in range(first, state.active.size):
         rejected += 1.0 - state.active[j]
@@ -334,21 +353,8 @@ def readmit_columns(
 
 
 @inner
-def is_preferred(settings: Settings, state: State, value: float) -> bool:
-    """Return whether a window with lambda_min `value` may replace the latched one.
-
-    When the reference stops, (27) would end with the weakest window above the
-    threshold.  A weaker window only has less information, unless the latched one is old
-    or contradicted.
-    """
-    return bool(
-        settings.change_detection == 0 or value >= _COMPARABLE * state.best_lambda[0]
-    )
-
-
-@inner
 def has_settled(settings: Settings, sliding: Window, t: float, dt: float) -> bool:
-    """Whether the window may be learned from at time t [s].
+    """Whether the window may be learned from at time t [s]; `dt` [s] is the sample time.
 
     It is full, or spans T_a: after a change of the arm, and from the start if configured.
     """
@@ -373,9 +379,13 @@ def update_excitation(
     t: float,
     dt: float,
 ) -> None:
-    """Compute lambda_min of the window; once it has settled, latch it if it suffices (27).
+    """Compute lambda_min of the window; once it has settled, latch it if it suffices, by (27).
 
-    q (n,) [rad] is the position of the arm at time t [s].
+    Arguments:
+        prior: P^(0) and R, in whose metric the eigenvalue is.
+        model: the arm, whose inertia the solution must keep positive.
+        q: position (n,) [rad] at time t [s].
+        dt: sample time [s].
     """
     if sliding.state.rows[0] == 0.0:
         return
@@ -391,8 +401,12 @@ def update_excitation(
     state.best_lambda[0] *= 1.0 - _LAMBDA_LOST * window_settings.interval / (
         window_settings.length * window_settings.row_interval
     )
-    suffices = value >= settings.excitation_threshold
-    if not (learning and suffices and is_preferred(settings, state, value)):
+    # (27) would end with the weakest window above the threshold when the reference stops.  A weaker
+    # one has less information, unless the latched one is old (its lambda decays) or contradicted.
+    required = settings.excitation_threshold
+    if settings.change_detection == 1:
+        required = max(required, _COMPARABLE * state.best_lambda[0])
+    if not (learning and value >= required):
         return
     if settings.change_detection == 1 and not accept_window(
         settings, state, workspace, sliding, prior, model, q
@@ -403,7 +417,7 @@ def update_excitation(
 
 @inner
 def latch(state: State, sliding: Window, value: float, t: float) -> None:
-    """Latch the window, whose lambda_min is the `value`, at time t [s]."""
+    """Latch the window as Phi_e, b_e of (26), with its lambda_min `value`, at time t [s]."""
     equations = sliding.workspace
     for i in range(equations.b.size):
         state.b[i] = equations.b[i]

@@ -17,10 +17,10 @@ mean square s^2 of r that theta leaves, measured while nothing touches: noise of
 sensors, ripple, friction that its columns do not describe.  A joint that moves slowly, or is
 about to reverse, has an s^2 of its own, and so has one that rests.  Both are means over several
 windows, since what friction leaves is nearly constant in each slow motion and each rest, and at
-least a share of the Coulomb friction, which is not estimated better there.
+least a fraction of the Coulomb friction, which is not estimated better there.
 
 *A tare* keeps the row [X_0 | u_0] of an arm at rest, with S_0 and s_0 of then.  As r_0 = X_0
-theta^ - u_0 has the same error of theta as r, it says what r will be:
+theta^ - u_0 has the same error of theta as r, it predicts r:
 
     r - K r_0,    K = C S_0^-1,    S - K C^T,    C = a X_L (Phi_e + rho R)^-1 X_0^T + diag(w s s_0)
 
@@ -39,6 +39,7 @@ from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
 from blf_dsc_controller.law.clipping import clip
 from blf_dsc_controller.law.lag import filter_gain
+from blf_dsc_controller.law.sums import copy
 from blf_dsc_controller.numerics.algebra import cholesky_factor, whiten
 
 # s since the first window, in which theta^ settles and s^2 is measured
@@ -75,13 +76,13 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one sample to the next."""
+    """What is kept from one sample to the next."""
 
     filtered: Annotated[Array, 'n * contact.enabled', 'm + 1']  # [X_L | u_L]
     latch_time: Cell  # s, when the window of `factor` was latched; 0: it is the prior's
     factor: Annotated[Array, 'm * contact.enabled', 'm']  # of Phi_e + rho R, or of R
     variance: Cell  # a: that times its inverse is the covariance of theta; 0: it has not begun
-    # of r by theta, less what a tare says of r, (N m)^2
+    # of r by theta, less what a tare predicts of it, (N m)^2
     covariance: Annotated[Array, 'n * contact.enabled', 'n']
     spread: Annotated[Array, 'n * contact.enabled', 'n']  # factor of S
     # s^2, in motion, in slow motion and at rest, (N m)^2
@@ -91,7 +92,7 @@ class State(NamedTuple):
     reversing: Annotated[Array, 'n * contact.enabled']
     resting: Cell  # s, for which the arm has rested
     tared: Cell  # 1: a tare is in force
-    tare_changes: Cell  # changes of the arm that were found before it
+    tare_changes: Cell  # number of changes of the arm before it
     tare: Annotated[Array, 'n * contact.enabled', 'm + 1']  # its row [X_0 | u_0]
     tare_noise: Annotated[Array, 'n * contact.enabled']  # s_0^2, (N m)^2
     at_tare: Cell  # w
@@ -115,7 +116,7 @@ class Workspace(NamedTuple):
 def filter_interval(
     settings: Settings, state: State, i: int, row: Array, friction: float, dt: float
 ) -> None:
-    """Pass [X | u] (m + 1,) of joint i in the last interval through the pole L.
+    """Pass the row [X | u] (m + 1,) of joint i in the last interval, `dt` [s], through the pole L.
 
     `friction` [N m] is that which no column of X describes: it is on the side of u.
     """
@@ -129,7 +130,7 @@ def filter_interval(
 @inner
 def begin(settings: Settings, state: State, information: Array) -> None:
     """Begin with the prior of theta, whose inverse covariance is R (m, m)."""
-    copy_upper(information, state.factor)
+    copy(information, state.factor)
     cholesky_factor(state.factor)
     state.variance[0] = 1.0
     forget_tare(state)
@@ -142,27 +143,18 @@ def begin(settings: Settings, state: State, information: Array) -> None:
 def update_covariance(
     state: State, factor: Array, variance: float, latch_time: float
 ) -> None:
-    """Take the covariance of theta from a window latched at `latch_time` [s].
+    """Replace the covariance of theta by that of a window latched at `latch_time` [s].
 
-    It is the `variance` of rows that count, times the inverse of the matrix of which
-    `factor` (m, m) is.
+    It is `variance` times the inverse of the matrix with the Cholesky `factor` (m, m).
     """
-    copy_upper(factor, state.factor)
+    copy(factor, state.factor)
     state.variance[0] = variance
     state.latch_time[0] = latch_time
 
 
 @inner
-def copy_upper(source: Array, target: Array) -> None:
-    """Copy the upper triangle of a matrix."""
-    for i in range(source.shape[0]):
-        for j in range(i, source.shape[0]):
-            target[i, j] = source[i, j]
-
-
-@inner
 def update_torque(state: State, estimate: Array) -> None:
-    """Compute r - K r_0."""
+    """Compute r - K r_0 (n,) [N m] with theta^, the `estimate` (m,), as `state.torque`."""
     for i in range(state.torque.size):
         state.torque[i] = residual(state.filtered[i], estimate) - state.offset[i]
 
@@ -179,9 +171,9 @@ def residual(row: Array, estimate: Array) -> float:
 
 @inner
 def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) -> bool:
-    """Note which joints reverse, whether the arm rests, and whether it has since a tare.
+    """Update which joints reverse and how long the arm rests; return whether it begins to move.
 
-    dqr (n,) is the velocity of the reference.  Returns whether the arm begins to move.
+    dqr (n,) is the velocity of the reference [rad/s], `dt` [s] the sample time.
     """
     duration = _AFTER / settings.bandwidth
     fastest = 0.0
@@ -202,7 +194,7 @@ def follow_reversals(settings: Settings, state: State, dqr: Array, dt: float) ->
 
 @inner
 def regime(settings: Settings, state: State, i: int) -> int:
-    """Return the row of the noise of joint i, which depends on how the arm moves."""
+    """Return the row of `State.noise` of joint i: at rest, slow, or in steady motion."""
     if state.resting[0] * settings.bandwidth > _AFTER:
         return _NOISE_REST
     return _NOISE_SLOW if state.reversing[i] > 0.0 else _NOISE_STEADY
@@ -210,7 +202,11 @@ def regime(settings: Settings, state: State, i: int) -> int:
 
 @inner
 def min_variance(settings: Settings, workspace: Workspace, k: int, i: int) -> float:
-    """Return the least variance of r of joint i in a regime k [(N m)^2]."""
+    """Return the smallest variance of r of joint i in a regime k [(N m)^2].
+
+    It has a hundredth of the unmodelled torque's square and, at low speed, a fraction of Coulomb
+    friction.
+    """
     floor = settings.unmodelled[i]
     friction = _MIN_FRICTION[k] * workspace.coulomb[i]
     return float(_MIN_NOISE * floor * floor + friction * friction)
@@ -228,7 +224,10 @@ def residual_variance(
 
 @inner
 def tare(state: State, changes: float) -> None:
-    """Take r for that of an arm that rests and that nothing touches, after so many `changes`."""
+    """Take r for zero from now on: the arm rests, and nothing touches it.
+
+    `changes` is how many changes of the arm have been found so far; the next one ends the tare.
+    """
     state.tared[0] = 1.0
     state.tare_changes[0] = changes
     state.at_tare[0] = 1.0
@@ -258,7 +257,10 @@ def settling_time(settings: Settings) -> float:
 def update_spread(
     settings: Settings, state: State, workspace: Workspace, estimate: Array
 ) -> None:
-    """Compute the covariance of r - K r_0 by theta, the factor of S, and K r_0."""
+    """Compute the covariance of r - K r_0 by theta, the factor of S, and K r_0.
+
+    `estimate` is theta^ (m,).
+    """
     whiten_rows(state, state.filtered, workspace.rows)
     fill_products(state, workspace.rows, workspace.rows, state.covariance)
     if state.tared[0] == 1.0:
@@ -273,7 +275,7 @@ def update_spread(
 
 @inner
 def whiten_rows(state: State, source: Array, rows: Array) -> None:
-    """Write the rows X of `source` (n, m + 1) to `rows` (n, m), whitened."""
+    """Write X of `source` (n, m + 1) to `rows` (n, m), whitened by the covariance of theta."""
     n, m = rows.shape
     for i in range(n):
         for k in range(m):
@@ -283,7 +285,7 @@ def whiten_rows(state: State, source: Array, rows: Array) -> None:
 
 @inner
 def fill_products(state: State, rows: Array, others: Array, target: Array) -> None:
-    """Compute a X (Phi_e + rho R)^-1 Y^T (n, n) of whitened rows X and Y."""
+    """Compute a X (Phi_e + rho R)^-1 Y^T (n, n) of whitened rows X and Y (n, m) as `target`."""
     n, m = rows.shape
     for i in range(n):
         for j in range(n):
@@ -297,7 +299,10 @@ def fill_products(state: State, rows: Array, others: Array, target: Array) -> No
 def condition_on_tare(
     settings: Settings, state: State, workspace: Workspace, estimate: Array
 ) -> None:
-    """Take what r_0 says of r from its covariance; compute K r_0."""
+    """Subtract from the covariance of r what r_0 predicts; compute K r_0 as `state.offset`.
+
+    `estimate` is theta^ (m,).
+    """
     n = state.torque.size
     whiten_rows(state, state.tare, workspace.tare_rows)
     fill_products(
@@ -329,7 +334,10 @@ def condition_on_tare(
 
 @inner
 def whiten_torque(state: State, workspace: Workspace) -> float:
-    """Whiten r by the factor of S; return its length, the distance of r from zero."""
+    """Whiten r by the factor of S, as `workspace.white`; return its length.
+
+    That is the distance of r from zero, in standard deviations.
+    """
     for i in range(state.torque.size):
         workspace.white[i] = state.torque[i]
     return sqrt(whiten(state.spread, workspace.white))
@@ -337,7 +345,7 @@ def whiten_torque(state: State, workspace: Workspace) -> float:
 
 @inner
 def is_settled(state: State, dt: float) -> bool:
-    """Whether theta^ has settled since the first window, from which on s^2 is measured."""
+    """Whether theta^ has settled since the first window, so that s^2 is measured from now on."""
     samples = 0.0
     for k in range(3):
         samples += state.samples[k, 0]
@@ -348,10 +356,10 @@ def is_settled(state: State, dt: float) -> bool:
 def update_noise(
     settings: Settings, state: State, workspace: Workspace, is_touched: bool
 ) -> None:
-    """Update s^2 from the first window on, while nothing touches the arm.
+    """Update s^2 (n,) [(N m)^2] after the first window, while nothing touches the arm.
 
-    At first it is the mean since the first window, with the unmodelled torque as a
-    small part of it.  At rest after a tare, r says nothing of it.
+    At first it is the mean since the first window, with the unmodelled torque as a small part of
+    it.  At rest after a tare, r contains no information on it.
     """
     if state.latch_time[0] == 0.0 or is_touched:
         return

@@ -34,7 +34,7 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one sample to the next."""
+    """What is kept from one sample to the next."""
 
     # xi2 behind the lags, rad/s; 0 of a joint without one
     lagged: Annotated[Array, 'n * feedback.lags']
@@ -51,7 +51,10 @@ class Workspace(NamedTuple):
 def advance(
     settings: Settings, state: State, xi2: Array, begins: bool, dt: float
 ) -> None:
-    """Pass xi2 (n,) [rad/s] of a sample, `dt` [s] after the last, through the lags."""
+    """Pass xi2 (n,) [rad/s] of a sample, `dt` [s] after the last, through the lags of K_p xi2.
+
+    At the first sample, which `begins`, the lags take its value.
+    """
     for i in range(xi2.size):
         if settings.damping_lag[i] > 0.0:
             gain = 1.0 if begins else filter_gain(settings.damping_lag[i], dt)
@@ -59,21 +62,16 @@ def advance(
 
 
 @inner
-def damped_velocity(settings: Settings, state: State, xi2: Array, i: int) -> float:
-    """Return what K_p damps of joint i [rad/s]: its xi2, behind the lag if there is one."""
-    return float(state.lagged[i] if settings.damping_lag[i] > 0.0 else xi2[i])
-
-
-@inner
 def joint_torque(
-    settings: Settings, xi1: float, xi2: float, lagged: float, layer: float, i: int
+    settings: Settings, state: State, xi1: float, xi2: float, layer: float, i: int
 ) -> float:
-    """Return the damping and the robust term of joint i [N m].
+    """Return tau_f of joint i [N m]: - K_p xi2, behind its lag if it has one, and the robust term.
 
-    `lagged` [rad/s] is what is `damped_velocity`, `layer` is b [rad/s].
+    xi1 [rad] and xi2 [rad/s] are those of this sample, `layer` is b [rad/s].
     """
     robust = settings.robust_gain[i] * abs(xi1)
-    torque = settings.gain[i] * lagged
+    damped = state.lagged[i] if settings.damping_lag[i] > 0.0 else xi2
+    torque = settings.gain[i] * damped
     torque += robust * clip(xi2 / layer, -1.0, 1.0)
     return float(-torque)
 
@@ -82,9 +80,9 @@ def joint_torque(
 def fill_acceleration(
     settings: Settings, workspace: Workspace, wanted: Array, xi2: Array, inertia: Array
 ) -> None:
-    """Compute a_f by tau_c, the acceleration that is `wanted` (n,) [rad/s^2], and m.
+    """Compute a_f (n,) [rad/s^2] from the acceleration a (n,) that is `wanted`, as above.
 
-    m is the `inertia` (n,) [kg m^2].
+    `inertia` is m (n,) [kg m^2].
     """
     out = workspace.acceleration
     for i in range(xi2.size):

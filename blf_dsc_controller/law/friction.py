@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction along the reference: how much of what reversals show of it is used.
+"""Friction along the reference: its compensation, within what reversals and d^3 allow.
 
 Coulomb friction changes its sign where a joint reverses, faster than d^3 can follow: an
 error of the estimate pushes the joint by twice that in each reversal.  In geared joints
@@ -15,8 +15,8 @@ measured velocity, pass a band around the pole p of the row's filter, x_h = (s /
 `reversals` finds c^ and k^ from what the other columns leave of the torque.
 
 *Used within the evidence.*  What is learned of friction must not cost more than not knowing it,
-which errs by |c_0 - c|.  Two things may contradict c^ before the sums do: a reversal that shows
-c_1, the last, or c_2, the one before; and the observer.  If d^3 rises by delta along the motion
+an error of |c_0 - c|.  Two things may contradict c^ before the sums do: the friction c_1 of the
+last reversal, or c_2 of the one before; and the observer.  If d^3 rises by delta along the motion
 since the last reversal, either the friction has risen by that much, which changes sign at the next
 reversal, or a push has begun, which stays.  delta is counted until v crosses zero: d^3 takes some
 0.05 s to follow, and what it adds while the joint slows down changes sign all the same.  The
@@ -27,7 +27,7 @@ compensation at v is the value nearest to c_0
 
 among all that they allow, with the dead zone z of f and the extremes of delta in
 earlier motions since a reversal was last measured.  It lies between c_0 and each of
-them, so that whichever is true, C errs by no more than c_0 does.  C is handed over to
+them, so that whichever is true, the error of C is no larger than that of c_0.  C is handed over to
 d^3 like everything that is learned: it changes no torque until the joint reverses.
 """
 
@@ -56,9 +56,9 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one sample to the next."""
+    """What is kept from one sample to the next."""
 
-    since_latch: Cell  # s
+    since_latch: Cell  # s, for which a window has been latched
     # s and b: now, behind one pole, behind both
     shape_lags: Annotated[Array, 2, 3, 'n']
     column_lags: Annotated[Array, 2, 2, 'n']  # of s_h and b_h
@@ -86,14 +86,8 @@ class Workspace(NamedTuple):
 
 
 @inner
-def begin(settings: Settings, state: State) -> None:
-    """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
-    reversals.begin(settings.reversals, state.reversals)
-
-
-@inner
 def is_coulomb(settings: Settings, j: int) -> bool:
-    """Whether entry j of theta is Coulomb friction that reversals show, not the window."""
+    """Whether entry j of theta is Coulomb friction, which reversals identify, not the window."""
     at = j - settings.first_coulomb
     return bool(settings.coulomb == 1 and 0 <= at < settings.reversals.initial.size)
 
@@ -102,7 +96,10 @@ def is_coulomb(settings: Settings, j: int) -> bool:
 def coulomb_torque(
     settings: Settings, state: State, workspace: Workspace, learned: float, i: int
 ) -> float:
-    """Return the compensation C(v) s(v) of joint i [N m], with c^ `learned` [N m]."""
+    """Return the compensation C(v) s(v) of joint i [N m], with c^ `learned` [N m].
+
+    `workspace` has s(v) and exp(-(v / v_s)^2) of the joint.
+    """
     low = learned
     high = learned
     if settings.coulomb == 1:
@@ -131,7 +128,10 @@ def compensate(
     velocity: float,
     i: int,
 ) -> None:
-    """Compute C(v) s(v) of joint i, at the `velocity` v [rad/s]; `estimate` (m,) is theta^."""
+    """Compute C(v) s(v) of joint i [N m] as `workspace.torque`, at the `velocity` v [rad/s].
+
+    `estimate` is theta^ (m,).
+    """
     if settings.coulomb == 1:
         workspace.sign[i] = sliding(velocity, settings.coulomb_velocity)
         workspace.stribeck[i] = fading(velocity, STRIBECK_SPEED)
@@ -147,9 +147,9 @@ def transfer_learned(
     estimate: Array,
     disturbance: Array,
 ) -> None:
-    """Subtract from d^3 (n,) what this sample has changed in the compensation of Coulomb friction.
+    """Subtract from d^3 (n,) [N m] the change of the friction compensation in this sample.
 
-    `estimate` (m,) is theta^ after the sample.
+    `estimate` is theta^ (m,) after the sample.  The torque thus does not change by learning.
     """
     if settings.coulomb == 0:
         return
@@ -162,14 +162,17 @@ def transfer_learned(
 
 @inner
 def follow_observer(state: State, workspace: Workspace, i: int, step: float) -> None:
-    """Add a step [N m] of d^3 of joint i by the tracking error to delta, until v crosses zero."""
+    """Add a step of d^3 of joint i [N m] to delta, until v crosses zero."""
     if workspace.sign[i] * state.direction[i] > 0.0:
         state.observer_drift[i] += step * state.direction[i]
 
 
 @inner
 def follow_motion(settings: Settings, state: State, workspace: Workspace) -> None:
-    """Find the joints that begin to reverse, and those that have reversed: delta is zero again."""
+    """Detect joints that begin to reverse, and those that have reversed: delta is zero again.
+
+    The direction is that of s(v) in `workspace`.
+    """
     if settings.coulomb == 0:
         return
     drift = state.observer_drift
@@ -189,7 +192,10 @@ def follow_motion(settings: Settings, state: State, workspace: Workspace) -> Non
 
 @inner
 def filter_shapes(settings: Settings, state: State, dq: Array, dt: float) -> None:
-    """Pass s and b of the last interval, at the velocity dq (n,), through the poles of the row."""
+    """Pass s and b of the last interval through the two poles of the row.
+
+    dq (n,) [rad/s] is the measured velocity, `dt` [s] the length of the interval.
+    """
     if settings.coulomb == 0:
         return
     gain = filter_gain(1.0 / settings.pole, dt)
@@ -209,7 +215,10 @@ def filter_shapes(settings: Settings, state: State, dq: Array, dt: float) -> Non
 def breakaway_torque(
     settings: Settings, state: State, estimate: Array, i: int
 ) -> float:
-    """Return what breakaway adds to the Coulomb friction of joint i, as it moves now [N m]."""
+    """Return c^ k^ b of joint i [N m]: what breakaway adds to its Coulomb friction at present.
+
+    `estimate` is theta^ (m,).
+    """
     if settings.coulomb == 0:
         return 0.0
     learned = estimate[settings.first_coulomb + i]
@@ -218,7 +227,10 @@ def breakaway_torque(
 
 @inner
 def high_pass(lags: Array, i: int, gain: float, x: float, begins: bool) -> float:
-    """Advance the two lags of joint i and return what they leave of x, at the beginning zero."""
+    """Return (s / (s + p))^2 x of joint i, by its two `lags`, of the filter `gain` per sample.
+
+    It is zero at the first value, which `begins`.
+    """
     if begins:
         lags[0, i] = x
         lags[1, i] = 0.0
@@ -230,7 +242,10 @@ def high_pass(lags: Array, i: int, gain: float, x: float, begins: bool) -> float
 
 @inner
 def unexplained(row: Array, estimate: Array, excluded: int) -> float:
-    """Return e [N m], what theta^ but for its entry `excluded` leaves of u in [X | u] (m + 1,)."""
+    """Return e [N m]: u - X theta^ of a `row` [X | u] (m + 1,), without entry `excluded` of theta^.
+
+    `estimate` is theta^ (m,).
+    """
     e = row[estimate.size]
     for j in range(estimate.size):
         if j != excluded:
@@ -244,8 +259,8 @@ def measure_reversals(
 ) -> None:
     """Add the last row, `dt` [s] after the one before it, to the sums of the present reversal.
 
-    e (n,) [N m] is `workspace.unexplained`, of the row behind both poles, unweighted.  What the
-    high pass leaves is zero where it `begins`.
+    e (n,) [N m] is `workspace.unexplained`, of the row behind both poles, unweighted.  The high
+    pass starts again at zero where the rows `begin`.
     """
     gain = filter_gain(1.0 / settings.pole, dt)
     weight = settings.pole * dt
@@ -266,17 +281,13 @@ def measure_reversals(
 
 
 @inner
-def update_since_latch(state: State, latched: float, dt: float) -> float:
-    """Return for how long [s] a window has been `latched` (1, or else 0)."""
-    state.since_latch[0] = latched * (state.since_latch[0] + dt)
-    return float(state.since_latch[0])
-
-
-@inner
 def return_estimate(
     settings: Settings, state: State, active: Array, estimate: Array
 ) -> None:
-    """Set c^, in theta^ (m,), and k^ to what reversals show, if it is learned and `active` (m,)."""
+    """Set c^, in theta^ (m,), and k^ to what reversals identify, where they adapt.
+
+    Entries of the `estimate` that are not `active` (m,) stay.
+    """
     if settings.coulomb == 0:
         return
     reversal_settings = settings.reversals
@@ -302,7 +313,7 @@ def follow_reversals(
 ) -> None:
     """Write c - c^ to the entries of Coulomb friction in `rate` (m,), k - k^ to `workspace`.
 
-    Entries of theta^ that are not `active` stay.
+    c and k are identified by the reversals.  Entries of theta^ that are not `active` (m,) stay.
     """
     if settings.coulomb == 0:
         return

@@ -18,7 +18,7 @@ theta explain the rows.
 Rows of joints that hardly move have a small weight (see `prediction`), and are small
 whatever the arm is.  They must not count as rows that fit: after a rest, s^2 would be
 next to nothing, and the first motion a change.  So a mean is that of rows by their
-weights: with the share w^2 of a row, the mean square of its joints' weights,
+weights: with w^2, the mean square of the weights of a row's joints,
 
     mean = sum(e^T C^-1 e / n) / sum(w^2).
 
@@ -62,7 +62,7 @@ class Prior(NamedTuple):
 class State(NamedTuple):
     """Means of e^T C^-1 e / n by the weights of the rows so far."""
 
-    noise: Cell  # s^2, (N m)^2
+    noise: Cell  # s^2, (N m)^2; 0 before `begin`
     mean: Cell  # mean square
     rows: Cell  # moving ones that it is of
     recent: Cell  # mean over 0.1 s of motion
@@ -71,7 +71,7 @@ class State(NamedTuple):
 
 @inner
 def begin(state: State, unmodelled: float) -> None:
-    """Begin, with rows in which a mean square of (N m)^2 is `unmodelled`."""
+    """Begin with s^2 assumed from the mean square torque that is `unmodelled` [(N m)^2]."""
     state.noise[0] = _ASSUMED_FRACTION * unmodelled
     state.mean[0] = 0.0
     state.rows[0] = 0.0
@@ -79,14 +79,8 @@ def begin(state: State, unmodelled: float) -> None:
 
 
 @inner
-def has_begun(state: State) -> bool:
-    """Whether s^2 has its first value."""
-    return bool(state.noise[0] != 0.0)
-
-
-@inner
 def forget_recent(state: State) -> None:
-    """Forget the last rows: those that follow are of another arm."""
+    """Forget the mean of the last rows: those that follow are of another arm."""
     state.recent[0] = 0.0
 
 
@@ -94,7 +88,7 @@ def forget_recent(state: State) -> None:
 def raise_noise(state: State) -> None:
     """Take the last rows for noise: no theta explains their torque.
 
-    s^2 stays so large for some `LASTING`, and is measured meanwhile as if it were not.
+    s^2 stays that large for some `LASTING`, and is measured meanwhile as if it were not.
     """
     state.floor[0] = max(state.noise[0], state.recent[0])
     state.noise[0] = state.floor[0]
@@ -102,7 +96,10 @@ def raise_noise(state: State) -> None:
 
 @inner
 def row_variance(state: State, period: float) -> float:
-    """Return a, with a row each `period` [s]: s^2 times the number of rows that count as one."""
+    """Return a = s^2 CORRELATION / T [(N m)^2], the variance of a row, one each T [s].
+
+    `period` is T.
+    """
     return float(state.noise[0] * CORRELATION / period)
 
 
@@ -110,9 +107,14 @@ def row_variance(state: State, period: float) -> float:
 def normalized_square(
     X: Array, e: Array, factor: Array, period: float, C: Array
 ) -> float:
-    """Return e^T C^-1 e / n of a row, with the `factor` of A and a row each `period` [s].
+    """Return e^T C^-1 e / n [(N m)^2] of a row, the mean square of its normalized innovation.
 
-    Overwrites X (n, m) and e (n,), and C (n, n), which is scratch.
+    Arguments:
+        X: row (n, m), overwritten.
+        e: innovation (n,) [N m], overwritten.
+        factor: Cholesky factor of A (m, m).
+        period: T [s], from one row to the next.
+        C: scratch (n, n).
     """
     n = e.size
     for i in range(n):
@@ -137,9 +139,14 @@ def update(
     period: float,
     window_rows: float,
 ) -> bool:
-    """Add e^T C^-1 e / n of a row with its share w^2; return whether the arm has changed.
+    """Add a row with its normalized square [(N m)^2]; return whether the arm has changed.
 
-    The mean square is of some `window_rows` moving rows, a window.
+    Arguments:
+        square: e^T C^-1 e / n of the row.
+        square_weight: w^2 of the row.
+        unmodelled: mean square torque that no column describes [(N m)^2].
+        period: T [s].
+        window_rows: moving rows over which the mean square is taken, a window.
     """
     excess = square - square_weight * state.recent[0]
     state.recent[0] += min(1.0, period / MEMORY) * excess
@@ -157,9 +164,9 @@ def update(
 
 @inner
 def alarm(state: State, period: float, window_rows: float) -> float:
-    """Return the mean square [(N m)^2] that is a change although s^2 may be of few rows.
+    """Return the mean square [(N m)^2] above which the arm has changed.
 
-    It is 8 s^2 where s^2 is of a window, of `window_rows` rows, and more where it is of fewer.
+    It is 8 s^2 where s^2 is the mean of `window_rows`, and more where it is that of fewer.
     """
     rows = state.rows[0] + _ASSUMED_ROWS * (1.0 - state.rows[0] / window_rows)
     excess = _excess(rows * period / CORRELATION)
@@ -183,7 +190,10 @@ def _excess(rows: float) -> float:
 def noise_estimate(
     mean: float, count: float, unmodelled: float, window_rows: float
 ) -> float:
-    """Return s^2 by the `mean` square of `count` rows, and what is assumed before any."""
+    """Return s^2 [(N m)^2]: the `mean` square of `count` rows, and an assumption that fades.
+
+    `unmodelled` [(N m)^2] is the assumption, which counts as 100 rows at first.
+    """
     assumed_rows = _ASSUMED_ROWS * (1.0 - count / window_rows)
     assumed_fraction = assumed_rows / (assumed_rows + count)
     noise = mean + assumed_fraction * (_ASSUMED_FRACTION * unmodelled - mean)

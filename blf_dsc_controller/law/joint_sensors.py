@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What joint torque sensors show in each sample, in an arm that has them.
+"""What is computed from joint torque sensors in each sample, in an arm that has them.
 
 load_observer     the torque on the links beyond the model's, which is added to the law's
 torque_sensors    whether it may go on: else it is left out
 motor_friction    friction of the motors, which the sensors do not see
 
-`learning` calls these functions.  What they show is of an interval, by the row of
+`learning` calls these functions.  They use the last interval, by the row of
 `prediction`.
 """
 
@@ -25,7 +25,10 @@ from blf_dsc_controller.law.state import Settings, Signals, State
 
 @inner
 def observe_load(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Let `load_observer` find r by the row of the last interval, before its poles."""
+    """Compute r of `load_observer` by the row of the last interval, `dt` [s], before its poles.
+
+    Nothing changes while an effort is missing (NaN).
+    """
     observer_settings, observer, row = settings.observer, state.observer, signals.row.Xu
     if observer.elapsed[0] == 0.0:
         load_observer.begin(observer, state.disturbance)
@@ -57,7 +60,10 @@ def observe_load(settings: Settings, state: State, signals: Signals, dt: float) 
 def check_sensors(
     settings: Settings, state: State, signals: Signals, begins: bool, dt: float
 ) -> None:
-    """Fade r out where it oscillates, or efforts are not those of torque sensors."""
+    """Fade r out where it oscillates, or efforts are not those of torque sensors.
+
+    `begins`: r has just settled.  `dt` [s] is the sample time.
+    """
     observer, sensors, workspace = state.observer, state.sensors, signals.sensors
     limit = settings.torque.limit
     for i in range(settings.n):
@@ -73,7 +79,7 @@ def check_sensors(
 
 @inner
 def shows_friction(settings: Settings, state: State) -> bool:
-    """Whether the sensors have shown friction, and nothing speaks against them."""
+    """Whether the sensors have measured friction, and r is not in doubt."""
     return bool(
         settings.observer.enabled == 1
         and state.motors.rows[0] > 0.0
@@ -83,7 +89,7 @@ def shows_friction(settings: Settings, state: State) -> bool:
 
 @inner
 def add_friction_row(settings: Settings, state: State, signals: Signals) -> None:
-    """Add the row to those that show the friction of the motors, unless a sensor is silent."""
+    """Add the row to the means of `motor_friction`, unless an effort is missing."""
     motor_settings, motors, row = settings.motors, state.motors, signals.row.Xu
     if load_observer.is_missing(signals.effort):
         return
@@ -107,7 +113,10 @@ def add_friction_row(settings: Settings, state: State, signals: Signals) -> None
 
 @inner
 def transfer_learned(settings: Settings, state: State, H: Array, before: Array) -> None:
-    """Let d^3 take what r gives up by the change of theta^ since `before` (m,); H is (n, m)."""
+    """Let d^3 take what r gives up by the change of theta^ since `before` (m,).
+
+    H is the regressor (n, m) of what is learned.
+    """
     observer_settings, observer, d3 = (
         settings.observer,
         state.observer,
@@ -123,7 +132,7 @@ def transfer_learned(settings: Settings, state: State, H: Array, before: Array) 
 def follow_absorbed(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Let P_f follow, as P^ does; d^3 takes what r loses."""
+    """Advance P_f by `dt` [s] as P^ does; d^3 takes what r loses by it."""
     motors, workspace = state.motors, signals.scratch.motors
     adaptation, rotors = settings.adaptation, settings.observer.rotors
     motor_friction.follow(

@@ -27,7 +27,7 @@ class State(NamedTuple):
 
 @inner
 def keep(state: State, estimate: Array, disturbance: Array, observed: Array) -> None:
-    """Keep the estimate (m,), and d^3 (n,) with r (n,), of a sample that is not suspect.
+    """Keep theta^ (m,), and d^3 (n,) with r (n,) [N m], of a sample that is not suspect.
 
     `observed` is the steady r of `load_observer`, empty without sensors.
     """
@@ -42,7 +42,7 @@ def keep(state: State, estimate: Array, disturbance: Array, observed: Array) -> 
 
 @inner
 def keep_moved(state: State) -> None:
-    """Take the kept estimates for those of a joint that moves."""
+    """Keep the same as those of when a joint last moved."""
     for j in range(state.kept.size):
         state.moved[j] = state.kept[j]
 
@@ -55,9 +55,13 @@ def keep_consistent(
     begins: bool,
     dt: float,
 ) -> None:
-    """Keep the estimates of the smallest recent error, whose largest |xi1| / k is `ratio`.
+    """Keep the same as those from before the error grew: of the smallest recent error.
 
-    `is_sound`: the arm does not oscillate, and r of `load_observer` is not in doubt.
+    Arguments:
+        ratio: largest |xi1| / k of the sample.
+        is_sound: the arm does not oscillate, and r of `load_observer` is not in doubt.
+        begins: it is the first sample.
+        dt: sample time [s].
     """
     threshold = state.min_ratio[0] * (1.0 + dt / _RELAXED)
     threshold = max(_SMALL, threshold)

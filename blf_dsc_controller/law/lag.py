@@ -7,5 +7,8 @@ from blf_dsc_controller.numerics.elementary import exp
 
 @inner
 def filter_gain(time_constant: float, dt: float) -> float:
-    """Return the exact gain 1 - exp(-dt / time_constant) of a first-order lag with held input."""
+    """Return 1 - exp(-dt / time_constant), the exact gain of a first-order lag with held input.
+
+    A step of the lag is x += gain (input - x); `time_constant` [s] > 0, `dt` [s].
+    """
     return 1.0 - exp(-dt / time_constant)

@@ -45,7 +45,8 @@ def for_law(
 ) -> Callable[..., Any]:
     """Return a kernel for a law of `for_kernels`: the same, or compiled with that law.
 
-    Its compilation raises BlfDscError where the law of a file cannot be compiled.
+    Raises (when it is compiled):
+        BlfDscError: the law of a file cannot be compiled.
     """
     if isinstance(kernel_law, (BlfDsc, CalledLaw)):
         return compiled

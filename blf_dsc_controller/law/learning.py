@@ -47,7 +47,11 @@ from blf_dsc_controller.law.window import Window
 def observe(
     settings: Settings, state: State, signals: Signals, t: float, dt: float
 ) -> None:
-    """Compute the regressors at time t [s], and the row of the last interval."""
+    """Compute the regressors at time t [s], and the row of the last interval, `dt` [s] long.
+
+    H of what is learned is left in `signals.H`, the friction compensation in `signals.friction`,
+    the row [X | u] in `signals.row.Xu`.
+    """
     compute_regressors(settings, state, signals)
     fill_learned(settings, state, signals, dt)
     friction.follow_motion(settings.friction, state.friction, signals.friction)
@@ -58,7 +62,10 @@ def observe(
 
 @inner
 def learn(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Add the row to the window; find whether the arm has changed, and what the window shows."""
+    """Add the row to the window; detect a change of the arm, and latch a window that suffices.
+
+    `dt` [s] is the sample time.
+    """
     samples = int(state.samples[0])
     if samples == 0:
         return
@@ -77,7 +84,7 @@ def learn(settings: Settings, state: State, signals: Signals, dt: float) -> None
 def check_excitation(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Latch the window if it suffices."""
+    """Latch the window if it suffices by (27); solve for the friction of the motors then."""
     t = signals.t[0]
     sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.prior_mean, settings.information)
@@ -104,7 +111,7 @@ def check_excitation(
 
 @inner
 def fill_columns(settings: Settings, signals: Signals, t: float) -> None:
-    """Fill the columns D of [Yr | D] for the row, at the measured motion.
+    """Fill the columns D of [Yr | D] for the row, at the measured motion and time t [s].
 
     The row's torque has passed the velocity filter, half of the lag, but positions have not.
     """
@@ -119,7 +126,7 @@ def fill_columns(settings: Settings, signals: Signals, t: float) -> None:
 
 @inner
 def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> None:
-    """Form the row of the last interval."""
+    """Form the row [X | u] of the last interval, `dt` [s], and pass it on to what uses it."""
     row_settings, row_state, row = settings.row, state.row, signals.row
     if state.samples[0] > 0.0:
         begins = state.samples[0] <= 1.0
@@ -137,7 +144,10 @@ def form_row(settings: Settings, state: State, signals: Signals, dt: float) -> N
 def filter_external_torque(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> None:
-    """Let `external_torque` filter the row of the last interval, before its poles."""
+    """Pass the row of the last interval, `dt` [s], through the pole of `external_torque`.
+
+    It is the row before its own poles.
+    """
     for i in range(settings.n):
         extra = friction.breakaway_torque(
             settings.friction, state.friction, state.estimate, i
@@ -153,8 +163,8 @@ def measure_reversals(
 ) -> None:
     """Let `friction` measure reversals, with a row each `period` [s].
 
-    Torque sensors show the friction alone, from the first row that is not of an arm before.
-    Without them, what the other columns leave of the torque shows it: from T_a after the latch on,
+    Torque sensors measure the friction alone, from the first row that is not of an arm before.
+    Without them, it is what the other columns leave of the torque: from T_a after the latch on,
     when these are those of the window, and once a full window is known to be of one arm or
     this one is half full; with fewer rows they are too uncertain.
     """
@@ -162,7 +172,8 @@ def measure_reversals(
         return
     latch, rows = state.latch, state.window.rows[0]
     length = settings.window.length
-    since_latch = friction.update_since_latch(state.friction, latch.latched[0], period)
+    since_latch = state.friction.since_latch
+    since_latch[0] = latch.latched[0] * (since_latch[0] + period)
     if joint_sensors.shows_friction(settings, state):
         settled = rows * period * settings.row.filter_pole >= prediction.SETTLED
         begins = not settled or load_observer.is_missing(signals.effort)
@@ -173,7 +184,7 @@ def measure_reversals(
             or latch.min_residual[0] > 0.0
             or rows >= 0.5 * length
         )
-        begins = since_latch <= settling_time or not is_known
+        begins = since_latch[0] <= settling_time or not is_known
     fill_unexplained(settings, state, signals)
     friction.measure_reversals(
         settings.friction, state.friction, signals.friction, begins, period
@@ -182,7 +193,7 @@ def measure_reversals(
 
 @inner
 def fill_unexplained(settings: Settings, state: State, signals: Signals) -> None:
-    """Write e, what all but Coulomb friction leaves of the torque, where `friction` reads it."""
+    """Write e (n,) [N m], the torque without all but Coulomb friction, to `signals.friction`."""
     senses = joint_sensors.shows_friction(settings, state)
     rotors = settings.observer.rotors
     for i in range(settings.n):
@@ -209,7 +220,7 @@ def detect_change(
     excitation_settings, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.scratch.window)
     prior = Prior(settings.prior_mean, settings.row_information)
-    if change.is_predicted(sliding):
+    if settings.window.prior_weight > 0.0:  # without, rows predict too little
         has_changed = change.compare_with_rows(
             state.change,
             signals.scratch.change,
@@ -245,10 +256,10 @@ def detect_change(
 
 @inner
 def take_back(settings: Settings, state: State, signals: Signals) -> None:
-    """Return to the estimate before the window; the torque stays the same.
+    """Return to the estimate before the window, with the torque unchanged.
 
-    What is not learned from the window stays: Coulomb friction is of reversals, and the other
-    friction of the sensors, if there are any.
+    What is not learned from the window stays: Coulomb friction is identified by reversals, and
+    the other friction by the sensors, if there are any.
     """
     senses = joint_sensors.shows_friction(settings, state)
     before = signals.scratch.change.before
@@ -276,7 +287,8 @@ def adapt(
 ) -> None:
     """Learn from the row, and advance theta^ and d^3 by `dt` [s]: (20), (30).
 
-    While a contact lasts, and something reacts to it, only d^3 follows.
+    While a contact lasts, and something reacts to it, only d^3 is advanced.  `saturated`: the
+    torque was cut.
     """
     if state.frozen[0] > 0.0:  # the row is of a contact
         state.frozen[0] = max(0.0, state.frozen[0] - dt)
@@ -342,7 +354,7 @@ def adapt_estimate(
 
 @inner
 def transfer_friction(settings: Settings, state: State, signals: Signals) -> None:
-    """Subtract from d^3 what this sample has changed in the compensation of Coulomb friction."""
+    """Subtract from d^3 the change of the Coulomb compensation in this sample."""
     friction.transfer_learned(
         settings.friction,
         state.friction,
@@ -372,7 +384,7 @@ def follow_disturbance(
 
 @inner
 def scale_by_inertia(settings: Settings, signals: Signals, x: Array) -> None:
-    """Replace x (n,) by M(q, P^(0)) x / m."""
+    """Replace x (n,) by M(q, P^(0)) x / m, with m the joint inertia of the settings."""
     momentum = signals.scratch.momentum
     for i in range(settings.n):
         x[i] /= settings.joint_inertia[i]

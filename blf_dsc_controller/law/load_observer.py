@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Load observer: torque on the links beyond the model's, by joint torque sensors.
 
-A sensor behind a gear shows the torque tau_J that reaches the links, whatever motor and
+A sensor behind a gear measures the torque tau_J that reaches the links, whatever motor and
 friction do.  With the row X of the last interval (see `prediction`), by the measured
 motion, and P_l, the learned parameters less those of the motors,
 
@@ -22,12 +22,12 @@ a pole L below that of the drives leaves no phase for a light one.  |r| is at mo
 a half of the torque limit, as for a load in the safe torque; beyond that, r takes over what is
 learned no longer, until it needs less.
 
-*Bias.*  In the first `_SETTLING_TIMES` / L, r is zero.  What is seen then is subtracted; it fades
-within 10 / L if the prior explains it.  A joint whose sensor shows more than `_PRIOR_SIGMAS`
-deviations keeps it: it has an offset, or the arm holds something.  It is also kept if the
-law continues with a d^3 of its own, which may have that already.
+*Bias.*  In the first `_SETTLING_TIMES` / L, r is zero.  What is measured then is subtracted; it
+fades within 10 / L if the prior explains it.  A joint whose sensor measures more than
+`_PRIOR_SIGMAS` deviations keeps it: it has an offset, or the arm holds something.  It is also
+kept if the law continues with a d^3 of its own, which may have that already.
 
-*Late.*  r passes L, so that after a change of P^ it gives up X_L (P^ - P^_before), and d^3 would
+*Lag.*  r passes L, so that after a change of P^ it gives up X_L (P^ - P^_before), and d^3 would
 have to give up the rest of H (P^ - P^_before): the torque of a load that has just gone, of an
 inertia that accelerates.  That is not of the arm, and fades with L (`hand_over`).
 
@@ -52,7 +52,7 @@ _STEADY_TIME = 0.02  # s: oscillations have 8 Hz or more
 
 
 def max_load_torque(limit: Array) -> Array:
-    """Return the largest |r| (n,) [N m] with a torque limit (n,) [N m]."""
+    """Return the largest |r| (n,) [N m] with a torque limit (n,) [N m]: half of it."""
     return _MAX_LOAD * limit
 
 
@@ -77,7 +77,7 @@ class Links(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one sample to the next."""
+    """What is kept from one sample to the next."""
 
     torque: Annotated[Array, 'n * observer.enabled']  # r, N m
     # r without what oscillates, which a stop may hold, N m
@@ -87,11 +87,11 @@ class State(NamedTuple):
     bias: Annotated[Array, 'n * observer.enabled']  # N m
     # 1: it stays
     keeps_bias: Annotated[Array, 'n * observer.enabled']
-    faded: Cell  # share of r that is left out: see `torque_sensors`
+    faded: Cell  # fraction of r that is left out: see `torque_sensors`
     elapsed: Cell  # s, since the first interval
     # beyond the largest |r|, since what it takes over was learned, N m
     over: Annotated[Array, 'n * observer.enabled']
-    # what r lacks of a changed estimate, since it is late; it fades, N m
+    # what r has not yet given up of a changed estimate, since it lags; it fades, N m
     handover: Annotated[Array, 'n * observer.enabled']
 
 
@@ -104,13 +104,13 @@ class Workspace(NamedTuple):
 
 @inner
 def has_settled(settings: Settings, state: State) -> bool:
-    """Whether the filters have settled, so that r is that of the arm."""
+    """Whether the filters have settled, so that r is valid: after `_SETTLING_TIMES` / L."""
     return bool(state.elapsed[0] * settings.observer_bandwidth >= _SETTLING_TIMES)
 
 
 @inner
 def is_missing(effort: Array) -> bool:
-    """Whether a reading (n,) is missing, NaN: then r stays, and is zero before the first."""
+    """Whether a measured effort (n,) is missing, NaN: then r does not change."""
     missing = False
     for i in range(effort.size):
         missing = missing or not isfinite(effort[i])
@@ -121,7 +121,10 @@ def is_missing(effort: Array) -> bool:
 def filter_interval(
     settings: Settings, state: State, i: int, row: Array, effort: float, dt: float
 ) -> None:
-    """Pass X of `row` and the sensed `effort` [N m] of joint i in an interval through L."""
+    """Pass X of `row` and the sensed `effort` [N m] of joint i in an interval, `dt` [s], through L.
+
+    The effort passes the lag of the velocities first.
+    """
     passes = state.elapsed[0] == 0.0 or settings.sensor_lag == 0.0
     gain = 1.0 if passes else filter_gain(settings.sensor_lag, dt)
     state.lagged[i] += gain * (effort - state.lagged[i])
@@ -135,7 +138,7 @@ def filter_interval(
 
 @inner
 def residual(state: State, i: int, links: Links) -> float:
-    """Return tau_J,L - X_L P_l of joint i [N m]."""
+    """Return tau_J,L - X_L P_l of joint i [N m]: the torque on the links beyond the model's."""
     filtered = state.filtered[i]
     p = filtered.size - 1
     r = filtered[p]
@@ -147,7 +150,10 @@ def residual(state: State, i: int, links: Links) -> float:
 
 @inner
 def load_torque(settings: Settings, state: State, i: int, observed: float) -> float:
-    """Return r of joint i [N m] for what is `observed` beyond the model and the bias [N m]."""
+    """Return r of joint i [N m], for a torque `observed` beyond the model and the bias [N m].
+
+    It is limited, faded by `torque_sensors`, and zero until the filters have settled.
+    """
     if not has_settled(settings, state):
         return 0.0
     max_torque = settings.max_torque[i] + state.over[i]
@@ -158,7 +164,7 @@ def load_torque(settings: Settings, state: State, i: int, observed: float) -> fl
 def take_over(
     settings: Settings, state: State, i: int, observed: float, observed_before: float
 ) -> None:
-    """Let r go beyond its largest by what is learned no longer.
+    """Raise the limit of r by what is learned no longer.
 
     `observed` [N m] is the torque beyond the model and the bias, and `observed_before` [N m] the
     same with the estimate of before.
@@ -181,32 +187,25 @@ def update(
 ) -> None:
     """Compute r after an interval of `dt` [s], and its bias once the filters have settled.
 
-    The `information` (m, m) is the inverse covariance of the prior of theta.
+    `information` is R (m, m), the inverse covariance of the prior of theta.
     """
     settling = _SETTLING_TIMES / settings.observer_bandwidth
     before = state.elapsed[0]
     state.elapsed[0] = before + dt
     if before < settling <= state.elapsed[0]:
         find_bias(settings, state, workspace, links, information)
-    release_bias(settings, state, dt)
     gain = filter_gain(1.0 / settings.observer_bandwidth, dt)
+    release_gain = filter_gain(_BIAS_RELEASE / settings.observer_bandwidth, dt)
     steady_gain = filter_gain(_STEADY_TIME, dt)
     for i in range(state.torque.size):
+        if state.keeps_bias[i] == 0.0:
+            state.bias[i] -= release_gain * state.bias[i]
         state.handover[i] -= gain * state.handover[i]
         observed = residual(state, i, links) - state.bias[i]
         state.over[i] = clip(abs(observed) - settings.max_torque[i], 0.0, state.over[i])
         r = load_torque(settings, state, i, observed)
         state.torque[i] = r + state.handover[i]
         state.steady[i] += steady_gain * (state.torque[i] - state.steady[i])
-
-
-@inner
-def release_bias(settings: Settings, state: State, dt: float) -> None:
-    """Let the bias fade where it is not kept."""
-    gain = filter_gain(_BIAS_RELEASE / settings.observer_bandwidth, dt)
-    for i in range(state.bias.size):
-        if state.keeps_bias[i] == 0.0:
-            state.bias[i] -= gain * state.bias[i]
 
 
 @inner
@@ -217,7 +216,10 @@ def find_bias(
     links: Links,
     information: Array,
 ) -> None:
-    """Subtract what the sensors show at the start; keep it where the prior does not explain it."""
+    """Take r at the start as its bias; keep the bias of joints where the prior does not explain it.
+
+    `information` is R (m, m).
+    """
     m = information.shape[0]
     for j in range(m):
         for k in range(j, m):
@@ -236,7 +238,7 @@ def find_bias(
 
 @inner
 def begin(state: State, disturbance: Array) -> None:
-    """Begin with d^3 (n,) [N m], which may have what the sensors show."""
+    """Begin with d^3 (n,) [N m]; if it may contain what the sensors measure, the bias is kept."""
     continues = 0.0
     for i in range(disturbance.size):
         if disturbance[i] != 0.0:
@@ -265,7 +267,7 @@ def transfer_learned(
 
 
 def expect(settings: Settings, state: State, change: Array) -> None:
-    """Hold what r gives up by an expected `change` (p,) of P^ until the sensors show it.
+    """Hold what r gives up by an expected `change` (p,) of P^ until the sensors measure it.
 
     It fades with L, as r would catch up, whether or not the load comes.
     """
@@ -283,10 +285,10 @@ def hand_over(
     links: Links,
     before: Links,
 ) -> None:
-    """Take from d^3, the `disturbance` (n,) [N m], what it has given up only since r is late.
+    """Move from d^3 (n,) [N m] to r what d^3 has given up only because r lags.
 
-    By a change of theta^ since `before`, d^3 has given up (H - X_L) (theta^ - before), H (n, m)
-    being at the reference and now.  It is not the arm's and fades as r catches up.
+    By a change of theta^ since `before`, d^3 has given up (H - X_L) (theta^ - before) too much,
+    with H (n, m) at the reference, now.  It is not the arm's and fades as r catches up.
     """
     if not has_settled(settings, state):
         return

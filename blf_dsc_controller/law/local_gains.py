@@ -31,7 +31,7 @@ from blf_dsc_controller.law.surface import virtual_slope
 def joint_stiffness(
     settings: Settings, signals: Signals, i: int, damping: float
 ) -> float:
-    """Return the stiffness [N m/rad] of joint i, whose damping is known."""
+    """Return the stiffness [N m/rad] of joint i with a `damping` [N m s/rad], as above."""
     wall, surface = settings.barrier, settings.surface
     xi, bound = signals.xi1[i], signals.bound[i]
     stiffness = wall.slope_limit[i]
@@ -45,7 +45,7 @@ def joint_stiffness(
 def fill_local_gains(
     model: ArmModel, settings_vector: Array, signals_vector: Array, gains: Array
 ) -> None:
-    """Write stiffness and damping (2, n) of the last sample."""
+    """Write stiffness [N m/rad] and damping [N m s/rad] of the last sample to `gains` (2, n)."""
     settings = settings_of(settings_vector, model)
     signals = signals_of(signals_vector, settings)
     feedback = settings.feedback

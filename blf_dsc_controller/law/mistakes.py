@@ -57,7 +57,7 @@ def tell_mistakes(kernel: Callable[..., Any], law: type) -> None:
 
 
 def mistake_in(law: type, text: str) -> str:
-    """Return the file and line of a law, what is wrong there and what to do, from numba's text."""
+    """Return the file and line of a mistake in a law, and its remedy, from the text of numba."""
     file = Path(str(sys.modules[law.__module__].__file__))
     source = ast.parse(file.read_bytes())
     places = [

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction of the motors, as joint torque sensors show it: its columns d, and what P^ absorbs.
+"""Friction of the motors by joint torque sensors: its columns d, and what P^ absorbs.
 
 P^ is learned from the torque u of the motors.  It takes all of it that X can describe: the
 torque of the links, and what friction has that is not in its columns D.  What pushes the arm
-it takes for either.  With the torque tau_J that sensors behind the gears show, P_r of the
+it takes for either.  With the torque tau_J of sensors behind the gears, P_r of the
 assumed rotors, and D_c d_c of Coulomb friction and ripple,
 
     g = u - X P_r - D_c d_c - tau_J
@@ -18,9 +18,9 @@ torque that they do not describe, as of a motor that drags, makes P_f small.  Th
 those of the window, but fade over `_MEAN_WINDOWS` of it in motion, as friction outlasts what is
 carried.
 
-P^ - P_f - P_r describes the links: by it `load_observer` sees what acts on them.  d^ is this d,
+P^ - P_f - P_r describes the links: by it `load_observer` finds what acts on them.  d^ is this d,
 in place of that of the window, and outlasts changes of the arm; P_f and d^ follow while P^
-learns, at the same rate.  What is left of g is also what reversals show of Coulomb friction.
+learns, at the same rate.  What is left of g also identifies Coulomb friction at reversals.
 """
 
 from typing import Annotated, NamedTuple
@@ -36,7 +36,7 @@ _EMPTY_ROWS = 0.1  # of that: rows of zeros before the first
 
 
 class Settings(NamedTuple):
-    """The rows that it uses, and the least weight of its prior."""
+    """Which rows are used, and the smallest weight of the prior."""
 
     size: int  # entries of theta that are found: P, and columns before those of Coulomb friction
     filter_pole: float  # of both poles of a row, rad/s
@@ -46,7 +46,7 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """Means over its rows, and their solution."""
+    """Means over the rows, and their solution."""
 
     sensed1: Annotated[Array, 'n * observer.enabled']  # tau_J behind one pole, N m
     sensed2: Annotated[Array, 'n * observer.enabled']  # and behind both, N m
@@ -69,7 +69,10 @@ class Workspace(NamedTuple):
 
 @inner
 def pass_poles(settings: Settings, state: State, sensed: Array, dt: float) -> None:
-    """Pass tau_J, `sensed` (n,) [N m] in the last interval, through both poles of a row."""
+    """Pass tau_J of the last interval, `dt` [s], through both poles of a row.
+
+    `sensed` is tau_J (n,) [N m].
+    """
     gain = filter_gain(1.0 / settings.filter_pole, dt)
     for i in range(sensed.size):
         state.sensed1[i] += gain * (sensed[i] - state.sensed1[i])
@@ -86,9 +89,9 @@ def forget(state: State) -> None:
 
 @inner
 def fade(settings: Settings, state: State, square_weight: float) -> float:
-    """Let the means fade by one row, whose joints have the mean square weight `square_weight`.
+    """Let the means fade by one row with the mean square weight of its joints; return its gain.
 
-    Return its share of them.
+    That is the weight with which `add_row` adds the row.
     """
     max_rows = _MEAN_WINDOWS * settings.length
     state.rows[0] = min(state.rows[0] + square_weight, max_rows)
@@ -112,9 +115,13 @@ def row_friction(
     initial: Array,
     estimate: Array,
 ) -> float:
-    """Return g - D d_0 of joint i [N m] by its `weight`, for a `row` [X | D | u] (n, m + 1).
+    """Return g - D d_0 of joint i [N m], the friction in a weighted `row` [X | D | u] (n, m + 1).
 
-    d_0 is of the `initial` theta (m,), d_c of the `estimate` (m,), P_r are `rotors` (p,).
+    Arguments:
+        weight: by which the row of the joint is multiplied.
+        rotors: P_r (p,).
+        initial: theta (m,) with d_0.
+        estimate: theta^ (m,) with d_c.
     """
     m = estimate.size
     g = row[i, m] - weight * state.sensed2[i]
@@ -129,7 +136,7 @@ def row_friction(
 def unexplained(
     state: State, row: Array, i: int, rotors: Array, estimate: Array, excluded: int
 ) -> float:
-    """Return e of joint i [N m], what P_f and d^, but for entry `excluded` of theta^, leave of g.
+    """Return e of joint i [N m]: what P_f and d^ leave of g, without entry `excluded` of theta^.
 
     `row` [X | D | u] (m + 1,) is unweighted, theta^ the `estimate` (m,), P_r are `rotors` (p,).
     """
@@ -145,7 +152,7 @@ def unexplained(
 
 @inner
 def add_row(state: State, row: Array, i: int, g: float, gain: float) -> None:
-    """Add the row of joint i with its g - D d_0 [N m] to the means."""
+    """Add the row of joint i with its g - D d_0 [N m] to the means, with the `gain` of `fade`."""
     size = state.b.size
     state.square[0] += gain * g * g
     for a in range(size):
@@ -159,7 +166,7 @@ def add_row(state: State, row: Array, i: int, g: float, gain: float) -> None:
 def solve(
     settings: Settings, state: State, workspace: Workspace, information: Array
 ) -> None:
-    """Solve for P_f and d; the `information` (m, m) is R.  s^2 is that of the last solution."""
+    """Solve for P_f and d; `information` is R (m, m).  s^2 is that of the last solution."""
     duration = max(state.rows[0], 1.0) * settings.period
     weight = max(settings.min_weight, state.residual[0] * CORRELATION / duration)
     for a in range(state.b.size):
@@ -188,9 +195,9 @@ def mean_residual(state: State) -> float:
 def follow(
     state: State, workspace: Workspace, weight: float, gain: Array, dt: float
 ) -> None:
-    """Let P_f follow its solution for `dt` [s], at the rate of P^: `weight` times `gain` (m,).
+    """Let P_f follow its solution for `dt` [s], at the rate `weight` times `gain` (m,) of P^.
 
-    What it was before is left in the scratch.
+    P_f of before is left in `workspace.before`.
     """
     for j in range(state.absorbed.size):
         workspace.before[j] = state.absorbed[j]
@@ -202,7 +209,7 @@ def follow(
 def follow_columns(
     state: State, initial: Array, active: Array, estimate: Array, rate: Array
 ) -> None:
-    """Write d - d^ of the columns that it finds to `rate` (m,); those not `active` (m,) stay.
+    """Write d - d^ of the columns that the sensors identify to `rate` (m,), if `active` (m,).
 
     d_0 is of the `initial` theta (m,), d^ of the `estimate` (m,).
     """

@@ -19,7 +19,7 @@ of which the last two grow:
 - Where friction reverses, its compensation sweeps the torque by more than a twentieth,
   and a light link may rattle in the play of its gear.  m takes that sweep away.
 - Torque ripple has about a hundredth of the limit.
-- A reference of fast tones is followed: the error does not show it.
+- A reference of fast tones is followed: it is not in the error.
 
 It is taken from the positions: a velocity of the wrong sign changes nothing.
 """
@@ -37,10 +37,10 @@ WAVES = 6
 """Half waves in a row that are an oscillation."""
 
 SOME = 2
-"""Half waves in a row from which on what a joint shows may be an oscillation."""
+"""Half waves in a row from which on a joint may oscillate."""
 
 FEW = 3
-"""Half waves in a row that tell why an arm stops: an oscillation may grow fast."""
+"""Half waves in a row that explain a stop: an oscillation may grow fast."""
 
 VIOLENT = 0.5
 """Part of the torque limit, as amplitude of its torque, from which nothing may wait."""
@@ -100,10 +100,14 @@ def watch(
     resolution: Array,
     dt: float,
 ) -> None:
-    """Take the errors (n,) [rad] and the torques (n,) [N m] of the last interval `dt` [s].
+    """Update the half waves by the errors and torques of the last interval, `dt` [s].
 
-    `limit` (n,) [N m] are those of the torques; `noise` [rad^2] is the mean square of
-    the sensor's noise, `resolution` [rad] its step.
+    Arguments:
+        limit: torque limit (n,) [N m].
+        error: e (n,) [rad].
+        torque: tau (n,) [N m].
+        noise: mean square of the sensor's noise (n,) [rad^2].
+        resolution: step of the sensor (n,) [rad].
     """
     gain = filter_gain(_TIME_CONSTANT, dt)
     for i in range(limit.size):
@@ -139,7 +143,7 @@ def watch(
 
 @inner
 def begin(state: State, error: Array, torque: Array) -> None:
-    """Begin with an error (n,) [rad] and a torque (n,) [N m], at rest."""
+    """Begin with an error (n,) [rad] and a torque (n,) [N m], without any half wave."""
     state.wait[0] = 0.0
     for i in range(error.size):
         state.slow[0, i] = error[i]
@@ -151,19 +155,19 @@ def begin(state: State, error: Array, torque: Array) -> None:
 
 @inner
 def oscillates(state: State, i: int) -> bool:
-    """Whether joint i oscillates."""
+    """Whether joint i oscillates: WAVES half waves in a row, or fewer that grow."""
     return bool(state.waves[i] >= WAVES or grows(state, i))
 
 
 @inner
 def grows(state: State, i: int) -> bool:
-    """Whether the last half waves of joint i grow."""
+    """Whether the last two half waves of joint i grow."""
     return bool(state.grown[i] >= _GROWING_WAVES)
 
 
 @inner
 def is_violent(state: State, limit: Array) -> bool:
-    """Whether a joint oscillates with much of its torque, of a `limit` (n,) [N m]."""
+    """Whether a joint oscillates with more than VIOLENT of its torque limit (n,) [N m]."""
     is_any = False
     for i in range(limit.size):
         is_strong = state.amplitude[i] > VIOLENT * limit[i]
@@ -175,8 +179,8 @@ def is_violent(state: State, limit: Array) -> bool:
 def count_down(state: State, limit: Array, dt: float) -> bool:
     """Count down to the next report; return whether an oscillation is to be reported now.
 
-    `dt` [s] is the time since the last call, `limit` (n,) [N m] are those of the
-    torques.
+    `dt` [s] is the time since the last call, `limit` (n,) [N m] the torque limit.  A violent
+    oscillation does not wait.
     """
     state.wait[0] = max(0.0, state.wait[0] - dt)
     is_any = False
@@ -190,7 +194,7 @@ def count_down(state: State, limit: Array, dt: float) -> bool:
 
 @inner
 def forget(state: State, i: int, p: float) -> None:
-    """Wait for the next half wave of joint i, from p [rad] on."""
+    """Forget the half waves of joint i; the next begins at p [rad]."""
     state.waves[i] = state.grown[i] = state.amplitude[i] = 0.0
     state.square[i] = state.sum[i] = state.span[i] = 0.0
     state.before[0, i] = state.before[1, i] = 0.0
@@ -200,7 +204,7 @@ def forget(state: State, i: int, p: float) -> None:
 
 @inner
 def forget_all(state: State) -> None:
-    """Wait for the next half waves of all joints, from where they are."""
+    """Forget the half waves of all joints; the next begin where they are."""
     state.wait[0] = 0.0
     for i in range(state.waves.size):
         forget(state, i, state.farthest[i])
@@ -211,8 +215,8 @@ def forget_all(state: State) -> None:
 def end_span(state: State, i: int) -> float:
     """Return the amplitude of the torque [N m] in the half wave that ends, and begin another.
 
-    It is about the mean of two half waves; of a first one, which may be half of a wave
-    about nothing, it is about 0.
+    It is about the mean of two half waves; of a first one, which may be half of a wave about
+    nothing, it is about 0.
     """
     own_mean = state.sum[i] / state.span[i]
     mean = 0.0
@@ -230,9 +234,12 @@ def end_span(state: State, i: int) -> float:
 def end_half_wave(
     state: State, i: int, travel: float, is_clear: bool, strong: float
 ) -> None:
-    """Count the half wave of joint i that has ended, over `travel` [rad], if it counts.
+    """Count the half wave of joint i that has ended if it is one of an oscillation.
 
-    `strong` [N m] is the least amplitude of its torque.
+    Arguments:
+        travel: its height in p [rad].
+        is_clear: it is larger than noise and steps of the sensor.
+        strong: smallest amplitude of its torque [N m].
     """
     half = state.farthest_at[i]
     state.amplitude[i] = end_span(state, i)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tip holds: mass and centre of a load, with intervals, while the arm moves as it must.
+"""Payload estimate: mass and centre of a load in the tip, with intervals, while the arm works.
 
 The rows X theta = u of the window (see `prediction`) are those of an arm.  A load in
 the tip with the ten inertial parameters phi changes its base parameters by N phi, so
@@ -14,18 +14,18 @@ links and friction are.
 
 The rows before are those of the first window, or of less if they contradict each other
 (see `innovation`): a load that is put down and picked up from the first cycle on is
-weighed, too.  Where later rows contradict the solution, something else is held.  If
+estimated, too.  Where later rows contradict the solution, something else is held.  If
 what was held until then is clearly less than nothing, the arm held a load before: what
 is lightest is taken for nothing.  If it was nothing, its rows are added to those before
 until they make a window.  Rows are kept apart for `innovation.LATE`, and then once more, so that
-those of a change that has not been found yet can be discarded.
+those of a change that has not been detected yet can be discarded.
 
 Rows of slow joints count little, since they may stick.  Friction must not be taken for a load,
-nor a load for friction.  What the columns of theta do not say of it are unknowns, too, each
+nor a load for friction.  What the columns of theta do not describe of it are unknowns, too, each
 with its prior:
 
     b_i  what a joint has in excess at breakaway, as shaped by `friction`;
-    k_i  the share of the torque tau_L in its gear that is lost there, k |tau_L| s(dq): a load
+    k_i  the fraction of the torque tau_L in its gear that is lost there, k |tau_L| s(dq): a load
          adds to it, and its loss does not average out while a joint mostly moves one way;
     e    by how much viscous and Coulomb friction differ since from before, as the arm gets
          warm: its variance grows for 20 s, since friction does not change at once.
@@ -63,9 +63,9 @@ _SCALE_DEVIATION = 0.03
 
 
 class Settings(NamedTuple):
-    """How a load in the tip acts, and which rows count."""
+    """How a load in the tip acts, and which rows are used."""
 
-    size: int  # m + 2 n + 1, or 0: nothing is weighed
+    size: int  # m + 2 n + 1, or 0: no load is estimated
     inertial: int  # p, entries of theta that are base parameters
     since: int  # unknowns of the rows since alone: z, then e
     unknowns: int  # theta, b, k, z and e
@@ -74,7 +74,7 @@ class Settings(NamedTuple):
     pole: float  # of the row filters, rad/s
     motion_scale: float  # reference velocity below which rows count less, rad/s
     unmodelled: float  # mean square torque that no column describes, (N m)^2
-    load_friction: float  # of the shares k, 1 / variance
+    load_friction: float  # of the fractions k, 1 / variance
     # of the breakaway torques, 1 / variance, 1/(N m)^2
     breakaway: Annotated[Array, 'n']
     # [N D | E], e in standard deviations, and rows of zeros
@@ -84,7 +84,7 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one row to the next."""
+    """What is kept from one row to the next."""
 
     begun: Cell  # 1: the load has been solved for, at first by the prior
     rows: Annotated[Array, 5]  # moving ones in each part
@@ -102,14 +102,14 @@ class State(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What it reads of a sample."""
+    """What is read of a sample."""
 
     Xu: Array  # [X | u] (n, m + 1)
     shapes: Array  # of breakaway (n,), filtered and weighted as the row
     signs: Array  # s of the motion (n,), filtered alone
     dqr: Array  # (n,) rad/s
     samples: int  # number of samples so far
-    changes: float  # of the arm that were found so far
+    changes: float  # of the arm so far
     dt: float  # s
 
 
@@ -135,7 +135,10 @@ def add_row(
     prior: Prior,
     sample: Sample,
 ) -> None:
-    """Add the row of this sample if one is due, and solve for the load ten times a second."""
+    """Add the row of this sample if one is due; estimate the load ten times a second.
+
+    Each `row_interval` samples, half an interval after the window's.  `prior` is that of theta.
+    """
     samples, dqr = sample.samples, sample.dqr
     if samples % settings.row_interval != settings.row_interval // 2:
         return
@@ -146,8 +149,7 @@ def add_row(
         state.age[0] += period
     row = workspace.row
     find_held(settings, state, workspace.held)
-    extend_row(sample, workspace.held, row)
-    weight_row(row, dqr)
+    fill_row(sample, workspace.held, row)
     if state.begun[0] == 0.0:
         begin(settings, state, workspace, prior, period)
     elif has_changed:
@@ -173,9 +175,14 @@ def refresh(
     rows: int,
     period: float,
 ) -> None:
-    """Use the rows that are old enough, and solve for the load, each when it is due."""
-    if is_first(state) and rows_before(state) >= settings.window:
-        state.complete[0] = 1.0
+    """Use the rows that are old enough, and estimate the load, each at its own rate.
+
+    `rows` is the number of rows so far, one each `period` [s].
+    """
+    if is_first(state):
+        moving_rows = state.rows[BEFORE] + state.rows[RECENT] + state.rows[LATEST]
+        if moving_rows >= settings.window:
+            state.complete[0] = 1.0
     if rows % max(1, round(innovation.DETECTION_TIME / period)) == 0:
         promote(settings, state)
     if rows % max(1, round(innovation.REFRESH / period)) == 0:
@@ -186,7 +193,7 @@ def refresh(
 
 @inner
 def find_held(settings: Settings, state: State, held: Array) -> None:
-    """Write the base parameters of the arm with what it holds, by the solution, to `held` (p,)."""
+    """Write the base parameters theta + N D z of the arm with its load to `held` (p,)."""
     x = state.solution
     load = settings.size - 1
     for j in range(held.size):
@@ -196,8 +203,11 @@ def find_held(settings: Settings, state: State, held: Array) -> None:
 
 
 @inner
-def extend_row(sample: Sample, held: Array, row: Array) -> None:
-    """Write [X | u] (n, m + 1) with columns of b, then of k, to `row`."""
+def fill_row(sample: Sample, held: Array, row: Array) -> None:
+    """Write [X | u] (n, m + 1) with columns of b and of k, weighted, to `row`.
+
+    Rows of slow joints have a small weight.  `held` (p,) gives tau_L.
+    """
     Xu, shapes, signs = sample.Xu, sample.shapes, sample.signs
     n = shapes.size
     m = row.shape[1] - 1 - 2 * n
@@ -212,20 +222,18 @@ def extend_row(sample: Sample, held: Array, row: Array) -> None:
         row[i, m + i] = shapes[i]
         row[i, m + n + i] = abs(torque) * signs[i]
         row[i, m + 2 * n] = Xu[i, m]
-
-
-@inner
-def weight_row(row: Array, dqr: Array) -> None:
-    """Let the rows of slow joints count little."""
-    for i in range(row.shape[0]):
-        weight = abs(dqr[i]) / sqrt(dqr[i] ** 2 + _SLOW_SPEED**2)
+        speed = sample.dqr[i]
+        weight = abs(speed) / sqrt(speed**2 + _SLOW_SPEED**2)
         for j in range(row.shape[1]):
             row[i, j] *= weight
 
 
 @inner
 def counted_weight(dqr: Array, motion_scale: float) -> float:
-    """Return the mean square weight that the joints' rows have here."""
+    """Return the mean square weight of the joints' rows, with that of `fill_row`.
+
+    dqr (n,) [rad/s] is the velocity of the reference.
+    """
     mean = 0.0
     for i in range(dqr.size):
         square = dqr[i] ** 2
@@ -240,16 +248,13 @@ def counted_weight(dqr: Array, motion_scale: float) -> float:
 
 @inner
 def is_first(state: State) -> bool:
-    """Whether the rows before are not complete."""
+    """Whether the rows before are not complete yet: then the tip is taken to hold nothing."""
     return bool(state.complete[0] == 0.0)
 
 
 @inner
 def held_mass(state: State) -> tuple[float, float]:
-    """Return the mass that the tip holds [kg] and its deviation [kg], infinite where unknown.
-
-    Before the rows of the arm alone are complete, it holds nothing.
-    """
+    """Return the mass of the load [kg] and its standard deviation [kg], infinite where unknown."""
     mass = state.load[MASS]
     deviation = state.load[DEVIATION]
     if deviation == 0.0 and not is_first(state):
@@ -261,24 +266,17 @@ def held_mass(state: State) -> tuple[float, float]:
 def mass_interval(load: Array) -> float:
     """Return half of the 95 % interval [kg] of the mass in a `State.load`.
 
-    Beside what the rows leave open, the scale of the torques is in doubt, which no row shows.
+    To what the rows leave open, it adds the error of the torques' scale, which no row reveals.
     """
     by_scale = _SCALE_DEVIATION * load[MASS]
     return TWO_SIDED * sqrt(load[DEVIATION] ** 2 + by_scale**2)
 
 
 @inner
-def rows_before(state: State) -> float:
-    """Return the number of moving rows so far, while the rows before are not complete."""
-    rows = state.rows
-    return float(rows[BEFORE] + rows[RECENT] + rows[LATEST])
-
-
-@inner
 def begin(
     settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
-    """Begin with an arm of which only the prior is known."""
+    """Begin with an arm of which only the prior is known; rows come each `period` [s]."""
     state.begun[0] = 1.0
     innovation.begin(state.innovation, settings.unmodelled)
     discard(state, BEFORE)
@@ -290,7 +288,7 @@ def begin(
 
 @inner
 def discard(state: State, first: int) -> None:
-    """Discard the rows of the parts from the `first` on, and what was held."""
+    """Discard the rows of the parts from the `first` on, and the load."""
     for part in range(first, LATEST + 1):
         clear_part(state, part)
     for k in range(state.load.size):
@@ -330,7 +328,7 @@ def promote(settings: Settings, state: State) -> None:
 def end_part(
     settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
-    """Something else is held: close the part, without its latest rows, and begin another."""
+    """Close the part, without its latest rows, and begin another: something else is held."""
     clear_part(state, RECENT)
     clear_part(state, LATEST)
     fewest = _FEWEST_MOTION / period
@@ -353,7 +351,10 @@ def end_part(
 def compare_with_nothing(
     settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
-    """Take the newer rows for those of an empty hand if it held nothing, or less than before."""
+    """Take the newer rows for those of an empty tip if it held nothing, or less than before.
+
+    Nothing: a mass within 2 deviations of zero.  Less: a mass below minus 4 deviations.
+    """
     solve(settings, state, workspace, prior, period)
     describe(settings, state, workspace, period)
     mass = state.load[MASS]
@@ -368,8 +369,8 @@ def compare_with_nothing(
 
 
 @inner
-def fill_rows(settings: Settings, is_held: bool, row: Array, out: Array) -> None:
-    """Fill [X | X N D | X E]; zeros in place of the last two before anything `is_held`."""
+def add_load_columns(settings: Settings, is_held: bool, row: Array, out: Array) -> None:
+    """Fill `out` with [X | X N D | X E]; zeros in the last two before anything `is_held`."""
     m = row.shape[1] - 1
     ND = settings.columns
     for i in range(row.shape[0]):
@@ -391,10 +392,10 @@ def update_innovation(
     dqr: Array,
     period: float,
 ) -> bool:
-    """Compare a row with the solution; return whether the last ones contradict it."""
+    """Compare a row (n, m + 1) with the solution; return whether the last ones contradict it."""
     e = workspace.torque
     x = state.solution
-    fill_rows(settings, not is_first(state), row, workspace.rows)
+    add_load_columns(settings, not is_first(state), row, workspace.rows)
     for i in range(e.size):
         e[i] = row[i, row.shape[1] - 1]
         for j in range(x.size):
@@ -425,7 +426,7 @@ def fill_equations(
         [S + a R       S' N D             ] [theta]   [S_u + a R theta_0]
         [D^T N^T S'    D^T N^T S' N D + a ] [z    ] = [D^T N^T S'_u     ]
 
-    where theta has b and k, too, and a is divided by the share that has `grown` of the
+    where theta has b and k, too, and a is divided by the fraction that has `grown` of the
     variance of e for its entries.
     """
     m = settings.size - 1
@@ -473,7 +474,7 @@ def add_prior(settings: Settings, prior: Prior, a: float, A: Array, x: Array) ->
 def solve(
     settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
-    """Find theta and z of all rows, one each `period` [s], those kept apart included."""
+    """Solve for theta and z by all rows, one each `period` [s], those kept apart included."""
     parts = state.sums
     sums.add(parts[OLDER], 1.0, parts[NEWER], workspace.since)
     sums.add(parts[BEFORE], 0.0, parts[BEFORE], workspace.before)

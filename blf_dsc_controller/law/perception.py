@@ -37,7 +37,7 @@ CONTACT, DISTANCE = 0, 1  # in `sample.contact`
 
 @inner
 def update_covariance(settings: Settings, state: State) -> None:
-    """Give `external_torque` the covariance of theta: of the prior, then of each full window."""
+    """Pass the covariance of theta to `external_torque`: of the prior, then of each full window."""
     if state.external.variance[0] == 0.0:
         external_torque.begin(settings.external, state.external, settings.information)
         return
@@ -69,7 +69,10 @@ def fill_coulomb(settings: Settings, state: State, coulomb: Array) -> None:
 def update_external_torque(
     settings: Settings, state: State, signals: Signals, dt: float
 ) -> float:
-    """Find r of the last sample and whether it is a contact; return its distance from none."""
+    """Compute r of the last sample, `dt` [s]; return its distance from what explains it.
+
+    Detects whether r is a contact, once theta^ has settled.
+    """
     observer_settings, observer, workspace = (
         settings.external,
         state.external,
@@ -99,7 +102,10 @@ def update_external_torque(
 def update_contact(
     settings: Settings, state: State, signals: Signals, distance: float, dt: float
 ) -> float:
-    """Find whether r, at a `distance` from zero, is a contact; return the remaining one."""
+    """Detect whether r is a contact; return its unexplained distance.
+
+    `distance` is that of r from zero, `dt` [s] the length of the sample.
+    """
     tip = settings.payload
     mass, deviation = payload.held_mass(state.payload)
     load = TipLoad(tip.columns, tip.scale, mass, deviation)
@@ -118,7 +124,7 @@ def fill_sample(
     distance: float,
     sample: Sample,
 ) -> None:
-    """Write r with its interval, and the contact, to the telemetry sample."""
+    """Write r (n,) [N m] with its 95 % interval, and the contact, to the telemetry sample."""
     observer, workspace = state.external, signals.scratch.external
     for i in range(observer.torque.size):
         sample.external[i] = observer.torque[i]
@@ -139,7 +145,7 @@ def sense(
     sample_vector: Array,
     dt: float,
 ) -> bool:
-    """Find the external torque of the last sample, `dt` [s] long; return whether a contact begins.
+    """Compute the external torque of the last sample, `dt` [s]; return whether a contact begins.
 
     While it lasts, and until the filters have settled, nothing is learned.
     """
@@ -155,14 +161,6 @@ def sense(
     return is_touched and not was_touched
 
 
-@inner
-def fill_breakaway(settings: Settings, state: State, signals: Signals) -> None:
-    """Compute the shapes of breakaway, filtered and weighted as the row."""
-    for i in range(settings.n):
-        weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
-        signals.scratch.payload.shapes[i] = weight * state.friction.shape_lags[1, 2, i]
-
-
 @kernel
 def estimate_payload(
     model: ArmModel,
@@ -171,13 +169,19 @@ def estimate_payload(
     signals_vector: Array,
     dt: float,
 ) -> None:
-    """Weigh what the tip holds by the row of the last sample, `dt` [s] long."""
+    """Estimate the load in the tip by the row of the last sample, `dt` [s] long.
+
+    Rows of a contact are left out.
+    """
     settings = settings_of(settings_vector, model)
     state = state_of(state_vector, settings)
     signals = signals_of(signals_vector, settings)
     if state.frozen[0] > 0.0:  # the row is of a contact
         return
-    fill_breakaway(settings, state, signals)
+    shapes = signals.scratch.payload.shapes
+    for i in range(settings.n):
+        weight = prediction.motion_weight(settings.row, signals.dqr[i], i)
+        shapes[i] = weight * state.friction.shape_lags[1, 2, i]
     payload.add_row(
         settings.payload,
         state.payload,
@@ -185,7 +189,7 @@ def estimate_payload(
         Prior(settings.initial_estimate, settings.row_information),
         payload.Sample(
             signals.row.Xu,
-            signals.scratch.payload.shapes,
+            shapes,
             state.friction.shape_lags[0, 2],
             signals.dqr,
             int(state.samples[0]),

@@ -36,7 +36,7 @@ class Settings(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one sample to the next."""
+    """What is kept from one sample to the next."""
 
     Yp: Annotated[Array, 'n', 'p']  # of the last sample
     Yr: Annotated[Array, 'n', 'm']  # [Yr | D] of the last sample
@@ -48,7 +48,7 @@ class State(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Values of one sample."""
+    """Values of one sample: regressors of the momentum, and the row."""
 
     Yp: Annotated[Array, 'n', 'p']  # Yp P = M dq
     Yr: Annotated[Array, 'n', 'm']  # [Yr | D], Yr P = G - C^T dq
@@ -59,10 +59,11 @@ class Workspace(NamedTuple):
 def delay_torque(
     settings: Settings, state: State, applied: Array, begins: bool, dt: float
 ) -> None:
-    """Pass the `applied` torque (n,) through the lags of drives and sensors, to `state.late`.
+    """Pass the `applied` torque (n,) [N m] through the lags of drives and sensors.
 
-    A measured motion is that of a torque of `robot.lag` ago: half of it is the drives',
-    half the velocity filter's.  Where it `begins`, the torque has always been applied.
+    A measured motion is that of a torque of `robot.lag` ago: half of it is the drives', half the
+    velocity filter's.  The result is `state.lagged`.  Where it `begins`, the torque has always
+    been applied.  `dt` [s] is the sample time.
     """
     passes = settings.lag == 0.0 or begins
     gain = 0.0
@@ -79,7 +80,10 @@ def delay_torque(
 
 @inner
 def fill_interval(state: State, workspace: Workspace, dt: float) -> None:
-    """Compute [X | u] of the last interval, between the last regressors and these."""
+    """Compute [X | u] (n, m + 1) [N m] of the last interval, `dt` [s], as `workspace.Xu`.
+
+    It is that between the last regressors, in `state`, and these, in `workspace`.
+    """
     Yp, Yr, row = workspace.Yp, workspace.Yr, workspace.Xu
     n, m = Yr.shape
     for i in range(n):
@@ -92,10 +96,9 @@ def fill_interval(state: State, workspace: Workspace, dt: float) -> None:
 
 @inner
 def motion_weight(settings: Settings, dqr: float, i: int) -> float:
-    """Return the weight of the row of joint i.
+    """Return the weight of the row of joint i, whose reference has the velocity dqr [rad/s].
 
-    Rows of a joint that hardly moves count less: its stiction would be mistaken for
-    gravity.
+    Rows of a joint that hardly moves count less: its stiction would be mistaken for gravity.
     """
     weight = settings.row_weight[i]
     if settings.motion_scale > 0.0:
@@ -105,14 +108,17 @@ def motion_weight(settings: Settings, dqr: float, i: int) -> float:
 
 @inner
 def square_weight(speed: float, motion_scale: float) -> float:
-    """Return the squared weight of a joint's row by its speed: 1 in motion, 0 at rest."""
+    """Return the squared weight of a joint's row by its speed [rad/s]: 1 in motion, 0 at rest."""
     square = speed**2
     return square / (square + motion_scale**2 + 1e-12)
 
 
 @inner
 def mean_square_weight(dqr: Array, motion_scale: float) -> float:
-    """Return the mean square weight of the joints' rows: 1 in motion, 0 at rest."""
+    """Return the mean square weight of the joints' rows, w^2: 1 in motion, 0 at rest.
+
+    dqr (n,) [rad/s] is the velocity of the reference.
+    """
     mean = 0.0
     for i in range(dqr.size):
         mean += square_weight(dqr[i], motion_scale) / dqr.size
@@ -123,7 +129,10 @@ def mean_square_weight(dqr: Array, motion_scale: float) -> float:
 def pass_poles(
     settings: Settings, state: State, workspace: Workspace, dqr: Array, dt: float
 ) -> None:
-    """Pass [X | u] of the last interval through both poles, and weight it."""
+    """Pass [X | u] of the last interval, `dt` [s], through both poles, and weight it.
+
+    dqr (n,) [rad/s] is the velocity of the reference.
+    """
     row = workspace.Xu
     gain = filter_gain(1.0 / settings.filter_pole, dt)
     for i in range(dqr.size):
@@ -143,7 +152,7 @@ def forget(state: State) -> None:
 
 @inner
 def keep_regressors(state: State, workspace: Workspace) -> None:
-    """Keep Yp and [Yr | D] for the next interval."""
+    """Keep Yp and [Yr | D] of this sample for the next interval."""
     Yp, Yr = workspace.Yp, workspace.Yr
     for i in range(Yr.shape[0]):
         for j in range(Yr.shape[1]):

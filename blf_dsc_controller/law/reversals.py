@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What reversals of the joints show of their friction, and what of that is taken back.
+"""Coulomb friction and breakaway, identified at the reversals of the joints.
 
 The window of the learning cannot be trusted with Coulomb friction: its rows are dominated by the
 frequencies of the reference, at which a sin w t against the velocity takes 0.64 a off the estimate
@@ -22,8 +22,8 @@ where d is the friction whose step would be as large as what the friction c_1 of
 leaves of the torque around it, n the rms of e_h away from reversals, its noise, C the
 `_CHANCE_RATIO`, and a what the shape g s is wrong by: a part of f, and of c.
 
-If the arm has changed, what reversals have shown since some 0.2 s before that was found
-is taken back: a load that comes on in a reversal looks like the step of friction.
+If the arm has changed, the evidence since some 0.2 s before that was detected is taken back:
+a load that comes on in a reversal looks like the step of friction.
 """
 
 from typing import Annotated, NamedTuple
@@ -36,7 +36,7 @@ from blf_dsc_controller.law.lag import filter_gain
 
 _MEMORY_ENERGY = 1.0  # of p int s_h^2 dt; a reversal has an eighth of it
 _IDENTIFIED_ENERGY = (
-    0.05  # of p int (g s)_h^2 dt: half a reversal, which shows its friction
+    0.05  # of p int (g s)_h^2 dt: half a reversal, which identifies its friction
 )
 # pull to c_0, of (f / its deviation)^2; that of a reversal is an eighth
 _COULOMB_PRIOR = 0.015
@@ -73,7 +73,7 @@ class Row(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What reversals have shown."""
+    """Sums of the reversals, and the Coulomb friction by the last two."""
 
     # p int of s_h e_h, b_h e_h [N m], s_h^2, s_h b_h and b_h^2, over past reversals
     past: Annotated[Array, 5, 'n']
@@ -86,7 +86,7 @@ class Evidence(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it keeps from one row to the next."""
+    """What is kept from one row to the next."""
 
     evidence: Evidence
     earlier: Evidence  # some `DETECTION_TIME` ago or less
@@ -100,7 +100,7 @@ class State(NamedTuple):
 
 @inner
 def begin(settings: Settings, state: State) -> None:
-    """Begin with the initial estimate of Coulomb friction, in place of past reversals."""
+    """Begin with c_0 in place of the friction of past reversals."""
     for i in range(settings.initial.size):
         for k in range(2):
             state.evidence.coulomb[k, i] = settings.initial[i]
@@ -125,7 +125,8 @@ def add_row(
 ) -> bool:
     """Add a row of joint i, `dt` [s] after the last, to its present reversal.
 
-    Return whether that shows its friction since this row.  k is k^.
+    Return whether this row is the first from which the reversal identifies its friction.  It
+    then gives c_1 as well.  k is k^.
     """
     sums = state.evidence.present
     s, b, e, weight = row
@@ -136,7 +137,16 @@ def add_row(
     sums[_SB, i] += weight * s * b
     sums[_BB, i] += weight * b * b
     add_torque(state, i, row, dt)
-    return find_last(settings, state, i, k, was_identified)
+    if accepted_weight(settings, state, i, k) == 0.0:
+        return False
+    coulomb = state.evidence.coulomb
+    if not was_identified:
+        coulomb[1, i] = coulomb[0, i]
+    torque = sums[_SE, i] + k * sums[_BE, i]
+    coulomb[0, i] = clip(
+        torque / energy(state.evidence, i, k), settings.lower[i], settings.upper[i]
+    )
+    return not was_identified
 
 
 @inner
@@ -168,43 +178,25 @@ def add_torque(state: State, i: int, row: Row, dt: float) -> None:
 
 @inner
 def fade(sums: Array, i: int, time_constant: float, dt: float) -> None:
-    """Let the sums of joint i fade for `dt` [s]."""
+    """Let the sums of joint i fade for `dt` [s], with a time constant [s]."""
     retained = 1.0 - filter_gain(time_constant, dt)
     for row in range(sums.shape[0]):
         sums[row, i] *= retained
 
 
 @inner
-def find_last(
-    settings: Settings, state: State, i: int, k: float, was_identified: bool
-) -> bool:
-    """Compute c_1 of joint i while its reversal shows it; return whether this is the first time.
-
-    `was_identified` is whether it did so a row ago.
-    """
-    if accepted_weight(settings, state, i, k) == 0.0:
-        return False
-    evidence = state.evidence
-    is_first = not was_identified
-    if is_first:
-        evidence.coulomb[1, i] = evidence.coulomb[0, i]
-    torque = evidence.present[_SE, i] + k * evidence.present[_BE, i]
-    evidence.coulomb[0, i] = clip(
-        torque / energy(evidence, i, k), settings.lower[i], settings.upper[i]
-    )
-    return is_first
-
-
-@inner
 def energy(evidence: Evidence, i: int, k: float) -> float:
-    """Return p int (g s)_h^2 dt of the present reversal of joint i."""
+    """Return p int (g s)_h^2 dt of the present reversal of joint i, with g of k."""
     sums = evidence.present
     return float(sums[_SS, i] + 2.0 * k * sums[_SB, i] + k * k * sums[_BB, i])
 
 
 @inner
 def robust_weight(settings: Settings, state: State, i: int, k: float) -> float:
-    """Return how much the present reversal of joint i counts: 1 where e_h is that of friction."""
+    """Return the weight 1 / (1 + (d / a)^2) of the present reversal of joint i, in [0, 1].
+
+    k is k^.
+    """
     evidence, noise = state.evidence, state.noise
     friction_energy = energy(evidence, i, k)
     if friction_energy <= 0.0:
@@ -225,16 +217,16 @@ def robust_weight(settings: Settings, state: State, i: int, k: float) -> float:
 
 @inner
 def accepted_weight(settings: Settings, state: State, i: int, k: float) -> float:
-    """Return how much the present reversal of joint i counts; 0 until it shows its friction."""
+    """Return the same; 0 until the reversal identifies its friction."""
     weight = robust_weight(settings, state, i, k)
     return weight if weight * energy(state.evidence, i, k) > _IDENTIFIED_ENERGY else 0.0
 
 
 @inner
 def close(settings: Settings, state: State, i: int, k: float) -> None:
-    """Add the sums of the present reversal of joint i to those of all, if it shows its friction.
+    """Add the sums of the present reversal of joint i to those of all, if it counts.
 
-    Otherwise they are the beginning of the next.
+    Otherwise they are the beginning of the next.  k is k^.
     """
     evidence = state.evidence
     latest, sums = evidence.present, evidence.past
@@ -274,7 +266,10 @@ def overrule(settings: Settings, state: State, i: int) -> None:
 def learned(
     settings: Settings, state: State, i: int, k_now: float
 ) -> tuple[float, float]:
-    """Return c [N m] and k of joint i by all sums, k within its limits; `k_now` is k^."""
+    """Return c [N m] and k of joint i, the least-squares solution of all sums; 0 <= k <= 1.
+
+    `k_now` is k^, which gives the present reversal its weight.
+    """
     f = settings.unmodelled[i]
     pull = _COULOMB_PRIOR * f * f / settings.variance[i]
     sums = state.evidence.past
@@ -308,9 +303,9 @@ def keep(state: State, dt: float) -> None:
 
 @inner
 def take_back(state: State, breakaway: Array) -> None:
-    """Take back what the last rows have shown, since they are of a change of the arm.
+    """Return to the evidence from before the last rows, which are those of a change of the arm.
 
-    A reversal that has just begun is forgotten as a whole.  `breakaway` (n,) is k^.
+    A reversal that has just begun is forgotten as a whole.  `breakaway` is k^ (n,).
     """
     evidence = state.evidence
     copy(state.earliest, evidence)
@@ -325,7 +320,7 @@ def take_back(state: State, breakaway: Array) -> None:
 
 @inner
 def copy(source: Evidence, out: Evidence) -> None:
-    """Copy what reversals have shown."""
+    """Copy the evidence."""
     for i in range(out.coulomb.shape[1]):
         for row in range(5):
             out.past[row, i] = source.past[row, i]

@@ -10,6 +10,6 @@ from blf_dsc_controller.law.state import Sample, Settings, sample_of
 
 
 def sample_columns(rows: Array, settings: Settings) -> Sample:
-    """Split packed samples (N, s) into columns by name, located by unpacking a row of indices."""
+    """Return packed samples (N, s) as columns by name: field of shape (k,) is (N, k)."""
     places = sample_of(np.arange(rows.shape[1], dtype=np.float64), settings)
     return Sample(*(rows[:, place.astype(np.intp)] for place in places))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What readings show of their sensor: its noise and steps, and velocities that are wrong.
+"""Noise and steps of the joint sensors by their readings, and velocities that are wrong.
 
-The noise is that of second differences, in which a smooth motion hardly shows; the step
+The noise is that of second differences, which a smooth motion hardly changes; the step
 is the smallest change of a position.
 
 A velocity that is plausible but not that of the arm (stuck, of the wrong sign, of
@@ -45,7 +45,7 @@ SLOW = 0.03  # rad/s: slower motion shows nothing
 
 
 class State(NamedTuple):
-    """What it keeps of the readings of q and dq."""
+    """What is kept of the readings of q and dq."""
 
     readings: Cell  # in a row so far
     last_read: Annotated[Array, '2 * n']
@@ -67,14 +67,17 @@ def restart(state: State) -> None:
 
 @inner
 def position_changed(state: State, i: int, change: float) -> bool:
-    """Whether noise and steps of the sensor of joint i do not explain a change [rad]."""
+    """Whether a change of the position of joint i [rad] exceeds noise and steps of its sensor."""
     noise = _MOVED * sqrt(state.noise[i])
     return bool(abs(change) > max(noise, _FLICKER_STEPS * state.resolution[i]))
 
 
 @inner
 def measure_noise(state: State, dt: float, measurement: Array) -> None:
-    """Update noise and resolution by a reading [q, dq, ...], `dt` [s] after the last."""
+    """Update noise and resolution by a reading, `dt` [s] after the last.
+
+    `measurement` is [q, dq, ...] (2 n or more,).
+    """
     n = state.resolution.size
     count = state.readings[0]
     gain = max(min(1.0, dt / _NOISE_TIME), 1.0 / max(1.0, count - 1.0))
@@ -100,9 +103,13 @@ def compare_velocities(
     dt: float,
     measurement: Array,
 ) -> bool:
-    """Update with a reading [q, dq, ...]; return whether a velocity is contradicted.
+    """Update with a reading [q, dq, ...]; return whether a velocity contradicts the positions.
 
-    The readings are finite, and `dt` [s] apart, usually a `sample_time` [s].
+    Arguments:
+        half_waves: oscillation of the joints: a lag explains more of a fast one.
+        sample_time: usual time between readings [s].
+        dt: time since the last reading [s].
+        measurement: the reading (2 n or more,), finite.
     """
     n = state.resolution.size
     measure_noise(state, dt, measurement)
@@ -138,7 +145,7 @@ def is_contradicted(
 ) -> bool:
     """Whether the velocity of joint i contradicts its positions, which no lag explains.
 
-    `gain` is that of a reading in a filtered velocity.
+    `gain` is that of the filter 1/(tau s + 1) in a sample.
     """
     threshold = max(_WRONG_POWER * state.speed[i], explained_square(state, i, gain))
     is_lag = oscillation.is_fast(half_waves, i) and is_late(state, i)
@@ -156,7 +163,10 @@ def is_late(state: State, i: int) -> bool:
 
 @inner
 def explained_square(state: State, i: int, gain: float) -> float:
-    """Return the mean square [(rad/s)^2] of the difference that noise and steps explain."""
+    """Return the mean square difference [(rad/s)^2] that noise and steps of the sensor explain.
+
+    `gain` is that of the filter 1/(tau s + 1) in a sample.
+    """
     n = state.resolution.size
     position = (
         _FILTERED_SIGMAS * _FILTERED_SIGMAS * state.noise[i] + state.resolution[i] ** 2

@@ -49,7 +49,7 @@ left in, and what the tip holds or touches is unknown after a time without comma
 
 
 def keep(start: Start, before: State, state: State) -> None:
-    """Let the parts of the state `before` go on in a `state` that has been reset."""
+    """Copy the parts that `KEPT` names from the state `before` to a reset `state`."""
     for name in KEPT[start]:
         _copy(getattr(before, name), getattr(state, name))
 

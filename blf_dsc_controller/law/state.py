@@ -173,7 +173,7 @@ class Sample(NamedTuple):
     estimate: Annotated[Array, 'm']
     lambda_min: Cell  # of the current window's Phi
     latched: Cell  # 0 or 1
-    changes: Cell  # number of times that the arm was found to have changed
+    changes: Cell  # number of changes of the arm that were detected
     # of the state, with 95 % intervals (half); NaN where unknown
     load: Annotated[Array, 8]
     external: Annotated[Array, 'n * contact.enabled']  # r of `external_torque`, N m

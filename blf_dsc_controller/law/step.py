@@ -59,7 +59,7 @@ compile_methods(Law, ('compute_demand', 'finish'), BlfDsc, CalledLaw)
 def fill_sample(
     settings: Settings, state: State, signals: Signals, sample: Sample
 ) -> None:
-    """Fill the telemetry of what is learned."""
+    """Write the telemetry of what is learned to `sample`."""
     for i in range(settings.n):
         sample.disturbance[i] = state.disturbance[i] + signals.friction.torque[i]
         for j in range(settings.p, settings.m):
@@ -82,7 +82,11 @@ def fill_sample(
 
 @inner
 def check_measurement(checks: Checks, measurement: Array, dt: float) -> int:
-    """Return the flags of a measurement that the law must not use, or 0; update the sensor's."""
+    """Return the flags of a measurement (3 n,) that the law must not use, or 0.
+
+    INVALID: it is not finite, or too fast.  CONTRADICTION: velocities contradict the positions.
+    `dt` [s] is the time since the last; noise and steps of the sensor are updated.
+    """
     if not are_on(checks):
         return 0
     if not is_valid_state(checks, measurement):
@@ -99,7 +103,7 @@ def check_measurement(checks: Checks, measurement: Array, dt: float) -> int:
 def take_measurement(
     checks: Checks, signals: Signals, measurement: Array, begins: bool, dt: float
 ) -> None:
-    """Write q, dq and effort into the signals, without repeats if there are checks."""
+    """Write q, dq and effort (n,) to the signals, without repeats if there are checks."""
     used = measurement
     if are_on(checks):
         T = checks.sample_time[0]
@@ -121,7 +125,7 @@ def prepare(
     t: float,
     dt: float,
 ) -> None:
-    """Find what every law reads: torques at work, reference, bound and error."""
+    """Compute what every law reads, at t [s]: torque applied, reference, bound and error xi1."""
     signals.t[0], signals.dt[0] = t, dt
     torque.find_added(settings.torque, signals.saturation, signals.q)
     torque.find_applied(
@@ -137,7 +141,7 @@ def prepare(
 def compute_torque(
     law: Law, settings: Settings, state: State, signals: Signals, sample: Sample
 ) -> None:
-    """Let the law compute its torque, within its limits; fill the telemetry of it."""
+    """Let the law compute its torque, cut it at its limits, and fill its telemetry."""
     t, dt = signals.t[0], signals.dt[0]
     has_last = state.samples[0] > 0.0 or state.saturation.takes_over[0] > 0.0
     law.compute_demand(settings, state, signals, t, dt)
@@ -172,8 +176,8 @@ def report_oscillation(
 ) -> int:
     """Return the flags of an arm that `oscillates`, and of a load observer that is left out.
 
-    The observer, which may be the cause, is left out before the arm is said to oscillate, unless
-    that is violent.  `had_fault` is what was wrong with it before this sample.
+    The observer, which may be the cause, is left out before the arm is reported to oscillate,
+    unless that is violent.  `had_fault` is what was wrong with it before this sample.
     """
     half_waves, sensors = checks.oscillation, state.sensors
     is_violent = oscillation.is_violent(half_waves, settings.torque.limit)

@@ -29,7 +29,7 @@ class Settings(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Values of one sample."""
+    """Values of one sample that the law passes on to the filter."""
 
     beta2: Annotated[Array, 'n']  # virtual control, rad/s
     # its rate as far as it is known before the filter (13); else zero, rad/s^2
@@ -54,9 +54,16 @@ def virtual_control(
 ) -> float:
     """Return beta2 = -(K/2) xi1 sinc(pi xi1^2 / k_c^2) - mu xi1 + dqr   [rad/s], (15) and (18).
 
-    (15) is printed as a quotient that is 0/0 at xi1 = 0; sin s cos s = sin(2 s)/2 turns
-    it into a sinc.  Its barrier part falls to zero at the bound, where only mu acts;
-    beyond, it would change sign and is set to zero.
+    (15) is printed as a quotient that is 0/0 at xi1 = 0; sin s cos s = sin(2 s)/2 turns it into a
+    sinc.  Its barrier part falls to zero at the bound, where only mu acts; beyond, it would change
+    sign and is set to zero.
+
+    Arguments:
+        xi1: error [rad].
+        bound: k(t) [rad].
+        barrier_gain: K [1/s].
+        linear_gain: mu [1/s].
+        reference_velocity: dqr, with xi1 k'/k of a funnel [rad/s].
     """
     ratio = xi1 / bound
     barrier_part = 0.0
@@ -69,7 +76,10 @@ def virtual_control(
 def virtual_slope(
     xi1: float, bound: float, barrier_gain: float, linear_gain: float
 ) -> float:
-    """Return -d beta2 / d xi1 = (K/2) (2 cos x - sinc x) + mu,  x = pi xi1^2 / k_c^2   [1/s]."""
+    """Return -d beta2 / d xi1 = (K/2) (2 cos x - sinc x) + mu,  x = pi xi1^2 / k_c^2   [1/s].
+
+    The arguments are those of `virtual_control`.
+    """
     ratio = xi1 / bound
     barrier_part = 0.0
     if abs(ratio) < 1.0:
@@ -89,7 +99,10 @@ def known_rate(
     ddqr: float,
     i: int,
 ) -> tuple[float, float]:
-    """Return f of joint i [rad/s^2], and what dqr^ lacks of dqr [rad/s]."""
+    """Return f of joint i [rad/s^2], and dqr - dqr^ = (lag / 2) ddqr [rad/s].
+
+    `narrowing` is k'/k [1/s] of the bound.
+    """
     lag_offset = 0.5 * settings.lag * ddqr
     slope = virtual_slope(xi1, bound, settings.gain[i], settings.mu[i])
     slope -= narrowing

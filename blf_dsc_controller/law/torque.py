@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques of the law become commands of the drives here, and back: saturation, what drives add.
+"""Saturation, and conversion between torques of the law and commands of the drives.
 
 *Drives.*  A law computes with the whole torque of a joint.  A drive may add the torque that holds
 the arm against gravity itself, by its own model of the arm and of the payload that it knows:
@@ -13,15 +13,15 @@ it (`Robot.friction`).  A drive that adds nothing has no columns here, and all s
 with zero, which changes no bit.
 
 *Saturation* is in level and rate.  The level limit holds for the whole torque of the joint, which
-is what its motor bears, and for the command alone, which is what its driver may cut: the two differ
-by what the drive adds.  The rate is that of the command, and not limited at the first
+is what its motor tolerates, and for the command alone, which is what its driver may cut: the two
+differ by what the drive adds.  The rate is that of the command, and not limited at the first
 sample, unless another torque acts by then (`Controller.take_over`).  The level limit takes
 precedence, for example if it is lowered below the last torque.
 
 *What the rate limit holds back.*  A torque that always moves towards its demand still climbs to it
 while the demand falls already: it lags behind, the more the larger the motion, and a loop that has
 met its limit once may run away.  So the torque moves as its demand does, within the limit, and the
-difference is released at a share r of the limit:
+difference is released at a fraction r of the limit:
 
     |held - held'| <= r R dt,      torque = demand - held', within R dt of the last
 
@@ -87,7 +87,7 @@ class Workspace(NamedTuple):
 
 @inner
 def find_added(settings: Settings, workspace: Workspace, q: Array) -> None:
-    """Compute what the drives add at the position q (n,) [rad]."""
+    """Compute G_d(q) (n,) [N m], what the drives add, at q (n,) [rad], as `workspace.added`."""
     if settings.drive == 0:
         return
     added, zeros = workspace.added, workspace.zeros
@@ -122,7 +122,10 @@ def added_torque(settings: Settings, q: Array) -> Array:
 
 @inner
 def slow_down(demand: float, last: float, held: float, step: float) -> float:
-    """Return the torque [N m] for a demand, by at most `step` from `last`, less what is `held`."""
+    """Return the torque [N m] for a demand [N m], limited in rate.
+
+    It is at most `step` from `last`, and less what is `held` back, of which r `step` is released.
+    """
     released = clip(held, -_RELEASED_RATE * step, _RELEASED_RATE * step)
     return clip(demand - (held - released), last - step, last + step)
 
@@ -138,9 +141,13 @@ def saturate(
     dt: float,
     torque: Array,
 ) -> None:
-    """Limit the `demand` (n,), giving the command `torque` (n,) [N m]; `cuts` tells which.
+    """Limit the `demand` (n,) [N m] in level and rate; write the command (n,) [N m] to `torque`.
 
-    `last` (n,) [N m] is the last command, `dt` [s] ago, if it `has_last`.
+    `workspace.cuts` says which limit cut it.
+
+    Arguments:
+        last: last command (n,) [N m].
+        has_last: whether there is one, `dt` [s] ago; else the rate is not limited.
     """
     added, cuts = workspace.added, workspace.cuts
     for i in range(demand.size):
@@ -168,7 +175,7 @@ def saturate(
 
 @inner
 def is_cut(workspace: Workspace) -> bool:
-    """Whether a torque of this sample is cut."""
+    """Whether a torque of this sample was cut by a limit."""
     is_any = False
     for cut in workspace.cuts:
         is_any = is_any or cut > 0.0

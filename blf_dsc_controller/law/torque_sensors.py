@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the load observer may go on: else it is left out for good.
 
-Commissioning, or a preset, has shown that efforts are the torques of joint sensors at the links.
+Commissioning, or a preset, has established that efforts are torques of joint sensors at the links.
 That may not hold for ever, or for another arm: a sensor may be stuck, dead, or in another unit,
 efforts may be commands or currents of motors, encoders may be at the motors, and gears may be
 softer than they were.  The load observer then is feedback that nobody designed.  With U the
@@ -18,7 +18,7 @@ of a gear,
 are stable only with an L of some rad/s.  So r fades out for good where
 
 - *it oscillates* (`oscillation`, of r instead of the error), or the arm does: r is left out before
-  the arm is said to oscillate, unless that is violent.
+  the arm is reported to oscillate, unless that is violent.
 - *efforts do not follow*: drives with a loop around sensors make of them what is commanded,
   whatever load or contact is behind.  An effort that is off by `_OFF_TORQUE` of the torque limit
   leaves r out while that lasts, and if it lasts while the arm follows its reference, for
@@ -47,10 +47,10 @@ _FOLLOWED_SPEED = 0.25  # of the speed of the reference
 
 
 class State(NamedTuple):
-    """What it keeps from one sample to the next."""
+    """What is kept from one sample to the next."""
 
     fault: Cell  # one of NONE to OFF
-    joint: Cell  # that shows it
+    joint: Cell  # that has it
     # N m, of the last interval behind L: the torque commanded
     command: Annotated[Array, 'n * observer.enabled']
     lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
@@ -68,7 +68,7 @@ class Workspace(NamedTuple):
 
 @inner
 def begin(state: State, torque: Array) -> None:
-    """Begin with r, a `torque` (n,) [N m]."""
+    """Begin to watch r, a `torque` (n,) [N m]."""
     oscillation.begin(state.oscillation, torque, torque)
 
 
@@ -76,7 +76,10 @@ def begin(state: State, torque: Array) -> None:
 def follow_applied(
     state: State, row: Array, m: int, bandwidth: float, dt: float
 ) -> None:
-    """Pass the torque of the last interval, at m of `row`, through L, `bandwidth` [rad/s]."""
+    """Pass the applied torque of the last interval, at m of `row`, through the pole L.
+
+    `bandwidth` is L [rad/s], `dt` [s] the length of the interval.
+    """
     gain = filter_gain(1.0 / bandwidth, dt)
     for i in range(state.command.size):
         state.command[i] += gain * (row[i, m] - state.command[i])
@@ -84,7 +87,7 @@ def follow_applied(
 
 @inner
 def note_fault(state: State, fault: float, i: int) -> None:
-    """Keep the `fault` that joint i shows, unless r is left out already."""
+    """Keep the first `fault`, and the joint i that has it."""
     if state.fault[0] == NONE:
         state.fault[0] = fault
         state.joint[0] = i
@@ -94,7 +97,10 @@ def note_fault(state: State, fault: float, i: int) -> None:
 def watch_oscillation(
     state: State, workspace: Workspace, limit: Array, torque: Array, dt: float
 ) -> None:
-    """Find whether r, a `torque` (n,) [N m], oscillates; `limit` (n,) [N m] as configured."""
+    """Detect whether r oscillates.
+
+    `torque` is r (n,) [N m], `limit` (n,) [N m] the torque limit.
+    """
     for i in range(torque.size):
         workspace.clear[i] = _OSCILLATION_TORQUE * limit[i]
     oscillation.watch(
@@ -113,7 +119,7 @@ def watch_oscillation(
 
 @inner
 def leave_out_oscillating(state: State, arm: oscillation.State) -> None:
-    """Leave r out if the `arm` oscillates."""
+    """Leave r out for good if the `arm` oscillates."""
     for i in range(state.lasted.size):
         if oscillation.oscillates(arm, i):
             note_fault(state, OSCILLATING, i)
@@ -123,10 +129,10 @@ def leave_out_oscillating(state: State, arm: oscillation.State) -> None:
 def watch_following(
     state: State, workspace: Workspace, limit: Array, dq: Array, dqr: Array, dt: float
 ) -> bool:
-    """Find whether efforts are off, for good; return whether they are now, which may pass.
+    """Detect whether efforts are off for good; return whether they are off now, which may pass.
 
-    `limit` (n,) [N m] is that of the torques.  The arm follows its reference where dq and
-    dqr (n,) [rad/s] are about equal.
+    The arm follows its reference where dq and dqr (n,) [rad/s] are about equal.  `limit` (n,)
+    [N m] is the torque limit.
     """
     error_square = speed_square = 0.0
     for i in range(limit.size):
@@ -135,9 +141,9 @@ def watch_following(
     follows = error_square < _FOLLOWED_SPEED * _FOLLOWED_SPEED * speed_square
     is_off = False
     for i in range(limit.size):
-        is_one = abs(workspace.differences[i]) > _OFF_TORQUE * limit[i]
-        is_off = is_off or is_one
-        state.lasted[i] = state.lasted[i] + dt if is_one and follows else 0.0
+        differs = abs(workspace.differences[i]) > _OFF_TORQUE * limit[i]
+        is_off = is_off or differs
+        state.lasted[i] = state.lasted[i] + dt if differs and follows else 0.0
         if state.lasted[i] > _OFF_TIME:
             note_fault(state, OFF, i)
     return is_off
@@ -151,7 +157,10 @@ def is_fading(faded: Array) -> bool:
 
 @inner
 def fade(state: State, faded: Array, is_off: bool, dt: float) -> None:
-    """Leave more of r out where the efforts are in doubt, or less; zero stays zero."""
+    """Fade r out while the efforts are in doubt, or in again, over `dt` [s].
+
+    `faded` is the fraction of r that is left out, modified in place; a zero stays exact.
+    """
     target = 1.0 if is_off or state.fault[0] != NONE else 0.0
     if faded[0] != target:
         faded[0] += filter_gain(_FADE, dt) * (target - faded[0])

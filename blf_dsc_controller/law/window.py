@@ -74,8 +74,8 @@ def is_full(settings: Settings, state: State) -> bool:
 def push_row(state: State, row: Array) -> None:
     """Replace the oldest row of the window by `row`, [X | u] (n, m + 1).
 
-    The oldest row of the ring is at the cursor, and counts once the window is full.
-    The sums of [X | u]^T [X | u], S, F and L, have only their upper triangle filled.
+    The oldest row of the ring is at the cursor, and counts once the window is full.  The sums of
+    [X | u]^T [X | u], S, F and L, have only their upper triangle filled.
     """
     running = state.running
     fresh = state.fresh
@@ -110,7 +110,10 @@ def push_row(state: State, row: Array) -> None:
 
 @inner
 def newer_part(state: State, newer: Array) -> int:
-    """Fill `newer` with the sum of the newer part of a full ring; return its number of rows."""
+    """Fill `newer` (m + 1, m + 1) with the sum of the newer part of a full ring.
+
+    Return its number of rows, between a quarter and three quarters of all.
+    """
     cursor = int(state.cursor[0])
     length = int(state.ring.shape[0])
     middle = length // 2
@@ -126,7 +129,10 @@ def newer_part(state: State, newer: Array) -> int:
 
 @inner
 def average_window(running: Array, samples: int, Phi: Array, b: Array) -> None:
-    """Fill Phi (m, m) and b (m,), the means (21) and (22) over the window."""
+    """Fill Phi (m, m) and b (m,), the means (21) and (22) over `samples` rows.
+
+    `running` (m + 1, m + 1) is the sum of their [X | u]^T [X | u].
+    """
     m = Phi.shape[0]
     for i in range(m):
         b[i] = running[i, m] / samples
@@ -220,7 +226,10 @@ def min_eigenvector(
 def solve(
     settings: Settings, workspace: Workspace, information: Array, active: Array
 ) -> None:
-    """Factor Phi + rho R, and solve Phi theta = b, with theta in `workspace.solution`."""
+    """Factor Phi + rho R, and solve Phi theta = b, with theta in `workspace.solution`.
+
+    Columns that are not `active` (m,) are removed; `information` is R (m, m).
+    """
     regularized_factor(
         active,
         settings.regularization,
@@ -264,7 +273,10 @@ def reset_direction(state: State) -> None:
 def fill_equations(
     settings: Settings, workspace: Workspace, prior: Prior, sums: Array, rows: int
 ) -> None:
-    """Fill Phi and b of some rows, whose `sums` (m + 1, m + 1) of [X | u]^T [X | u] are given."""
+    """Fill Phi and b of some `rows`, whose sum (m + 1, m + 1) of [X | u]^T [X | u] is `sums`.
+
+    Both are pulled to P^(0) by the prior, if the settings say so.
+    """
     average_window(sums, rows, workspace.Phi, workspace.b)
     if settings.prior_weight > 0.0:
         pull_to(
@@ -280,10 +292,10 @@ def fill_equations(
 def find_excitation(
     sliding: Window, prior: Prior, active: Array, iterations: int
 ) -> float:
-    """Return lambda_min of the window's Phi; leave Phi, b and the factor in its scratch.
+    """Return lambda_min of the window's Phi (27); leave Phi, b and the factor in its workspace.
 
-    Columns that are not `active` (m,) are removed.  The inverse iteration begins where
-    the last one ended.
+    Columns that are not `active` (m,) are removed.  The inverse iteration begins where the last
+    one ended.
     """
     settings, state, workspace = sliding
     R = prior.information
@@ -303,5 +315,5 @@ def find_excitation(
 
 @inner
 def is_at_start(settings: Settings, state: State) -> bool:
-    """Return whether the ring has wrapped since the last check: true once per window."""
+    """Whether the ring has wrapped since the last check: true once per window."""
     return bool(state.cursor[0] * settings.row_interval < settings.interval)
