@@ -294,10 +294,16 @@ def adapt(
         state.frozen[0] = max(0.0, state.frozen[0] - dt)
         if not saturated:
             follow_disturbance(settings, state, signals, dt)
-        transfer_friction(settings, state, signals)
-        return
-    learn(settings, state, signals, dt)
-    adapt_estimate(settings, state, signals, dt, saturated)
+    else:
+        learn(settings, state, signals, dt)
+        adapt_estimate(settings, state, signals, dt, saturated)
+    friction.transfer_learned(
+        settings.friction,
+        state.friction,
+        signals.friction,
+        state.estimate,
+        state.disturbance,
+    )
 
 
 @inner
@@ -349,19 +355,6 @@ def adapt_estimate(
         friction.adapt_breakaway(
             settings.friction, state.friction, signals.friction, dt
         )
-    transfer_friction(settings, state, signals)
-
-
-@inner
-def transfer_friction(settings: Settings, state: State, signals: Signals) -> None:
-    """Subtract from d^3 the change of the Coulomb compensation in this sample."""
-    friction.transfer_learned(
-        settings.friction,
-        state.friction,
-        signals.friction,
-        state.estimate,
-        state.disturbance,
-    )
 
 
 @inner
