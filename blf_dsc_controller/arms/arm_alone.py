@@ -15,7 +15,13 @@ from blf_dsc_controller.arms.xml_text import parse_xml
 
 
 def arm_alone(text: str, joints: Sequence[str], tip: str) -> str:
-    """Return the URDF of some joints of a URDF text, from its root to its tip."""
+    """Return the URDF of some joints of a URDF text, from its root to the link `tip`.
+
+    All other joints are fixed; links that no joint of these moves have no inertia.
+
+    Raises:
+        BlfDscError: the text is no URDF, or has no such tip.
+    """
     tree = Tree.of(text)
     kept = _links(tree, joints, tip)
     robot = parse_xml(text)
@@ -59,7 +65,7 @@ def _child(joint: ET.Element) -> str:
 
 
 def _strip(link: ET.Element, *, is_moved: bool) -> None:
-    """Leave only an inertia that has an effect; others need not be physical."""
+    """Remove all of a link but an inertia that has an effect; others need not be physical."""
     for part in list(link):
         mass = part.find('mass')
         has_mass = mass is not None and float(mass.get('value', '0')) > 0.0
@@ -68,7 +74,7 @@ def _strip(link: ET.Element, *, is_moved: bool) -> None:
 
 
 def _fix(joint: ET.Element, joints: Sequence[str]) -> None:
-    """Make a joint that is none of the arm's a fixed one."""
+    """Make a joint fixed that is none of the arm's."""
     for mimic in joint.findall('mimic'):
         joint.remove(mimic)
     if joint.get('name') not in joints:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base parameters of a chain, and the prior that its URDF gives of them.
 
-Torques show only certain combinations of the inertias.  Of the columns of the full
+Torques depend on the inertias by certain combinations only.  Of the columns of the full
 regressor Y (ten per body, a rotor per joint), a maximal set of independent ones, Y_B,
 is kept; the others are Y_D = Y_B X, so that Y phi = Y_B K phi, where K has unit columns
 for B and X for D (Gautier, Numerical calculation of the base inertial parameters of
 robots, 1991).  The columns are tried from base to tip, so that what a body has in
 common with the bodies before it is grouped with those, which is the usual grouping.
 
-The prior says how far a URDF may be off, and in which directions.  Bodies vary
+The prior is how far a URDF may be off, and in which directions.  Bodies vary
 independently, in terms of their pseudo-inertia: the mass with all that scales with it,
 the centre of mass, and the spread of the mass around it.  The last body also carries a
 payload.
@@ -60,7 +60,7 @@ _DEPENDENT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Base parameters P of a chain."""
+    """Base parameters P of a chain, and how they follow from its inertias."""
 
     model: SerialChain  # whose regressors multiply P, named after the kept columns
     # (p, 11 n) to P from each body's ten inertial parameters and its rotor
@@ -77,7 +77,10 @@ class BaseParameters:
 
 @functools.lru_cache(maxsize=16)
 def base_parameters(chain: Chain, gravity: tuple[float, ...]) -> BaseParameters:
-    """Return the base parameters of a chain; gravity [m/s^2] is in its base."""
+    """Return the base parameters of a chain; `gravity` (3,) [m/s^2] is in its base.
+
+    They are the independent columns of the full regressor at random motions, by Gautier (1991).
+    """
     full = serial_chain(chain, gravity)
     kept, X = independent_columns(_regressor_at_random(full), _DEPENDENT)
     K = np.where(np.abs(X) < _DEPENDENT, 0.0, X.round(12))
@@ -144,8 +147,12 @@ def payload_inertia(payload: float) -> np.ndarray:
 def deviations(J: np.ndarray, relative: float, centre: float) -> np.ndarray:
     """Return one standard deviation of the ten along each of ten independent directions (10, 10).
 
-    `relative` is that of mass and spread, relative to them, `centre` that of the centre of
-    mass [m].
+    Columns are directions: one that scales all, three of the centre of mass, six of the spread.
+
+    Arguments:
+        J: pseudo-inertia (4, 4) of a body.
+        relative: standard deviation of mass and spread, relative to them.
+        centre: standard deviation of the centre of mass [m].
     """
     if J[3, 3] == 0.0:
         return np.zeros((10, 10))

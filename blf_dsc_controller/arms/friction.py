@@ -10,8 +10,8 @@ Some of friction differs between them on purpose:
   at rest if it were steeper; `identify` only looks back, and has half of that.
 - At a reversal, the contacts of `identification.sliding` yield over a distance first.  The law
   follows the velocity of its reference, which has no memory, and measures each reversal.
-- Load and quadratic friction are `identify`'s alone: they show in half a minute of motion, not in
-  one window of the learning.
+- Load and quadratic friction are `identify`'s alone: they are identifiable in half a minute of motion,
+  not in one window of the learning.
 - Simulated plants have friction of their own: a truth that is independent of what looks for it.
 """
 
@@ -29,26 +29,26 @@ STRIBECK_SPEED = 0.1
 
 @inner
 def sliding(velocity: float, scale: float) -> float:
-    """Return s(v) in [-1, 1] for the scale v_c, in units of the velocity."""
+    """Return s(v) = tanh(v / v_c) in [-1, 1]; `scale` is v_c, in units of the velocity."""
     return float(tanh(velocity / scale))
 
 
 @inner
 def fading(velocity: float, scale: float) -> float:
-    """Return g(v) in [0, 1] for the scale v_s, in units of the velocity."""
+    """Return g(v) = exp(-(v / v_s)^2) in [0, 1]; `scale` is v_s, in units of the velocity."""
     ratio = velocity / scale
     return float(exp(-ratio * ratio))
 
 
 def slidings(velocity: Floats, scale: float) -> Floats:
-    """Return s (N, k) at velocities (N, k)."""
+    """Return s (N, k) at velocities (N, k); `scale` is v_c."""
     values = np.empty(velocity.shape)
     fill_slidings(np.ascontiguousarray(velocity), scale, values)
     return values
 
 
 def fadings(velocity: Floats, scale: float) -> Floats:
-    """Return g (N, k) at velocities (N, k)."""
+    """Return g (N, k) at velocities (N, k); `scale` is v_s."""
     values = np.empty(velocity.shape)
     fill_fadings(np.ascontiguousarray(velocity), scale, values)
     return values

@@ -10,8 +10,8 @@ stiffness k and the damping d of a joint follow the gains of the law (28),
     r = k / (1.8 d),    K = 0.4 r,  mu = 1.3 r,  K_p = d,  w = 0.3 r d,  gamma = c r d
 
 so that near the reference the torque is - d xi1' - (1.8 + c) r d xi1 - 1.5 c r^2 d int xi1.
-The integral's share c is at most 0.45, or 0.15 where drives have a torque loop: there a
-load observer integrates beside it, and play in the gears bears no more.  It is less where
+The factor c of the integral is at most 0.45, or 0.15 where drives have a torque loop: there a
+load observer integrates beside it, and play in the gears tolerates no more.  It is less where
 the damping is small for the inertia J of the outstretched, loaded arm: d (1.8 r d) >
 J 1.5 c r^2 d keeps the slow oscillation damped, here by a factor of three, or two with
 drives as heavy as they may be where they are a guess.  What the tracking error adapts is
@@ -50,14 +50,14 @@ SURFACE = 0.004
 
 
 ALONE, BESIDE = 0.45, 0.15
-"""Largest share c of an integral by itself, and beside another one."""
+"""Largest c of an integral by itself, and beside another one."""
 
 GIVEN = 'stiffness', 'damping'
 """Fields of `JointGains` that a configuration gives as `feedback.joint_*`."""
 
 
 class JointGains(NamedTuple):
-    """What each joint's feedback follows from."""
+    """Stiffness and damping of each joint, from which its gains follow."""
 
     stiffness: Floats  # (n,) N m/rad
     damping: Floats  # (n,) N m s/rad
@@ -70,7 +70,10 @@ class JointGains(NamedTuple):
         return self.stiffness / (_POSITION * self.damping)
 
     def integral(self, inertia: Floats) -> Floats:
-        """Return gamma (n,) [N m/rad] for the largest inertia of each joint (n,) [kg m^2]."""
+        """Return gamma (n,) [N m/rad] with the largest `inertia` of each joint (n,) [kg m^2].
+
+        c is smaller than its limit where the damping is small for the inertia.
+        """
         damped = _DAMPED * self.damping / (self.rate * inertia)
         return self.rate * self.damping * np.minimum(damped, self.integral_fraction)
 
@@ -82,12 +85,12 @@ class JointGains(NamedTuple):
 
 
 def max_integral_fraction(*, has_torque_loop: bool) -> float:
-    """Return the largest share of the integral of an arm."""
+    """Return the largest c of the integral of an arm, without or with a torque loop."""
     return BESIDE if has_torque_loop else ALONE
 
 
 def unknown_arm(motors: Floats) -> JointGains:
-    """Return gains that hold an arm of which only motors (n,) [kg m^2] are guessed."""
+    """Return gains that hold an arm of which only the motors (n,) [kg m^2] are guessed."""
     damping = _HELD * motors
     return JointGains(_POSITION * _HELD_RATE * damping, damping)
 
@@ -102,7 +105,10 @@ def damped_arm(damping: Floats, inertia: Floats) -> JointGains:
 
 
 def linear(gains: JointGains, inertia: Floats, postures: int) -> Feedback:
-    """Return the law with these gains at small errors, in as many postures."""
+    """Return the law with these gains at small errors, in as many `postures`.
+
+    `inertia` (n,) [kg m^2] is the largest of each joint.
+    """
     one = np.broadcast_to(np.eye(len(inertia)), (postures, len(inertia), len(inertia)))
     rate, damping = gains.rate, gains.damping
     return Feedback(
@@ -127,7 +133,7 @@ class Barriers(NamedTuple):
 
 
 def barriers(gains: JointGains) -> Barriers:
-    """Return what follows from the gains of joints."""
+    """Return the gains of barrier and surface that follow from the gains of joints."""
     rate, damping = gains.rate, gains.damping
     barrier_gain, linear_gain = _FILTERED
     return Barriers(

@@ -55,7 +55,7 @@ class Gears(NamedTuple):
     )
 
     def variants(self) -> tuple[Joints, ...]:
-        """Return the joints that these may be."""
+        """Return the joints that these gears may have: other motors, encoders on either side."""
         if self.stiffness is None:
             guessed = Joints(motors=self.motors, viscous=self.viscous)
             if self.unknown is None:
@@ -101,11 +101,14 @@ class GearedArm(NamedTuple):
         ]
 
     def margin(self, feedback: Feedback) -> Margin:
-        """Return the least modulus margin of a law."""
+        """Return the smallest modulus margin of a law over the variants of the gears."""
         return min(loop.margin() for loop in self.loops(feedback))
 
     def joint_gains(self) -> JointGains:
-        """Return the stiffest gains of joints, each on its own, with the margin."""
+        """Return the stiffest gains of joints, each on its own, that keep the margin.
+
+        Found by bisection over the rate of the damping.
+        """
         integral_fraction = max_integral_fraction(
             has_torque_loop=self.gears.has_torque_loop
         )

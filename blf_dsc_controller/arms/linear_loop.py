@@ -16,10 +16,10 @@ and velocity filter have lags, torques are held for a sample and arrive after wh
 samples, and velocities are differences of positions (th or q).
 
 What a law adds is linear as well: `Feedback`.  `Loop.margin` is the modulus margin,
-the least singular value of I + G C over the frequencies, for the loop cut at the
+the smallest singular value of I + G C over the frequencies, for the loop cut at the
 torques of all joints: the distance from instability that no simultaneous change of
 the joints' responses may bridge.  It is looked for above 5 Hz: below, an arm is rigid,
-and its damping ratio says more.
+and its damping ratio is the better measure.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 SLOWEST = 5.0
-"""Frequency [Hz] from which on margins count: below, the damping ratio says more."""
+"""Frequency [Hz] from which on margins count: below, the damping ratio is the better measure."""
 
 _SHORTEST = 1e-5  # s, of a lag that is not left out
 _FREQUENCIES = 120
@@ -90,7 +90,7 @@ class Feedback(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """Arm, sampling and law, in k postures."""
+    """Arm, sampling and law, in k postures: the linear loop."""
 
     links: Floats  # M (k, n, n), kg m^2
     joints: Joints
@@ -137,7 +137,7 @@ class Loop(NamedTuple):
 
 
 class Margin(NamedTuple):
-    """A modulus margin, with the frequency [Hz], posture and joint at which it is least."""
+    """A modulus margin, with the frequency [Hz], posture and joint at which it is smallest."""
 
     value: float
     frequency: float
@@ -146,7 +146,11 @@ class Margin(NamedTuple):
 
 
 def arm_response(links: Floats, joints: Joints, timing: Timing, s: Complex) -> Complex:
-    """Return G (k, f, n, n) [rad/(N m)] at s = i omega (f,), from torque to position."""
+    """Return G (k, f, n, n) [rad/(N m)] at s = i omega (f,), from torque to measured position.
+
+    `links` are M (k, n, n) [kg m^2].  Holding the torque, delay and lag of the drives are part of
+    it.
+    """
     T = timing.period
     hold = (1.0 - np.exp(-T * s)) / (T * s) * np.exp(-timing.delay * T * s)
     hold = hold / (1.0 + timing.drive_lag * s)
@@ -199,7 +203,7 @@ def law_responses(feedback: Feedback, T: float, s: Complex) -> tuple[Complex, Co
 def _alpha2_response(
     feedback: Feedback, T: float, z: Complex, alpha2: Complex, velocity: float
 ) -> Complex:
-    """Return what the law adds for alpha2 (f, n) and the velocity."""
+    """Return what the law adds for alpha2 (f, n) and the velocity, at z (f, 1): (k, f, n, n)."""
     dalpha2 = (z - 1.0) / T * alpha2
     xi2 = velocity - alpha2
     d3 = -T / (z - 1.0) * xi2
@@ -212,7 +216,7 @@ def _alpha2_response(
 
 
 def low_pass(decay: float | Floats, z: Complex) -> Complex:
-    """Return the response (...) at z (...) of a lag of which `decay` is left after a sample."""
+    """Return the response (...) at z (...) of a lag that retains `decay` in a sample."""
     return np.asarray((1.0 - decay) / (1.0 - decay / z))
 
 
@@ -226,7 +230,7 @@ def _decay(lag: float, T: float) -> float:
 
 
 def _damping_decay(feedback: Feedback, T: float) -> Floats:
-    """Return what is left of a late xi2 after a sample: of all joints or of each (n,)."""
+    """Return what the lags of xi2 retain in a sample: of all joints or of each (n,)."""
     lag = np.asarray(feedback.damping_lag)
     return np.where(lag > 0.0, np.exp(-T / np.maximum(lag, _SHORTEST)), 0.0)
 
@@ -318,7 +322,7 @@ class _Memory(NamedTuple):
 
 
 def _memory_before(size: int, n: int, delay: int, *, lags: bool) -> _Memory:
-    """Return what is held before a sample: behind the `size` states of the arm."""
+    """Return the memory before a sample: behind the `size` states of the arm."""
     blocks = delay + 4 + lags
     rows = np.eye(size + blocks * n)[size:].reshape(blocks, n, -1)
     y, v, alpha2, d3 = rows[delay : delay + 4]
@@ -328,7 +332,7 @@ def _memory_before(size: int, n: int, delay: int, *, lags: bool) -> _Memory:
 def _law_step(
     memory: _Memory, y: Floats, T: float, velocity_lag: float, law: Feedback
 ) -> tuple[Floats, _Memory]:
-    """Return the law's torque at the measured position y, and what is held after it.
+    """Return the law's torque at the measured position y, and the memory after it.
 
     Both are matrices, as is y, that take them from the whole state.
     """
@@ -356,7 +360,7 @@ def _law_step(
 def _with_law(
     arm: Floats, G: Floats, sensed: Floats, timing: Timing, law: Feedback
 ) -> tuple[Floats, Floats]:
-    """Return A and B of arm, torques under way and law together."""
+    """Return A (k, N, N) and B (k, N, n) of arm, pending torques and law together."""
     k, size, _ = arm.shape
     n = len(sensed)
     memory = _memory_before(size, n, timing.delay, lags=bool(np.any(law.damping_lag)))

@@ -75,7 +75,7 @@ compile_methods(
 
 
 def regressors_at(model: ArmModel, q: Array, dq: Array, v: Array, a: Array) -> Array:
-    """Return H (k, n, p) of the states (k, n): H P = M(q) a + C(q, dq) v + G(q)   [N m]."""
+    """Return H (k, n, p) of k states (k, n), as in (19): H P = M(q) a + C(q, dq) v + G(q)   [N m]."""
     H = np.zeros((*q.shape, model.p))
     q, dq, v, a = (np.ascontiguousarray(array) for array in (q, dq, v, a))
     _fill_regressors(model, q, dq, v, a, H)
@@ -83,7 +83,7 @@ def regressors_at(model: ArmModel, q: Array, dq: Array, v: Array, a: Array) -> A
 
 
 def inertia_matrices(model: ArmModel, P: Array, q: Array) -> Array:
-    """Return M (k, n, n) at the positions (k, n) of an arm with the parameters P (p,)."""
+    """Return M (k, n, n) [kg m^2] at positions (k, n) of an arm with the parameters P (p,)."""
     k, n = q.shape
     Yp, Yr = np.zeros((2, k * n, n, P.size))
     units = np.tile(np.eye(n), (k, 1))
@@ -92,7 +92,10 @@ def inertia_matrices(model: ArmModel, P: Array, q: Array) -> Array:
 
 
 def free_inertias(M: Array) -> Array:
-    """Return the inertia (k, n) of each joint with the others free, of matrices M (k, n, n)."""
+    """Return 1 / (M^-1)_ii (k, n) [kg m^2], the inertia of each joint with the others free.
+
+    M is (k, n, n).
+    """
     return 1.0 / np.diagonal(inverse(M), axis1=1, axis2=2)
 
 

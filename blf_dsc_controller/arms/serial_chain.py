@@ -64,7 +64,7 @@ bodies_of = view_of(Bodies)
 def fill_regressor(
     vector: Array, q: Array, dq: Array, v: Array, a: Array, H: Array
 ) -> None:
-    """Implement `SerialChain.regressor`."""
+    """Fill H (n, p) of a packed chain: see `SerialChain.regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
     for i in range(bodies.n):
@@ -76,7 +76,7 @@ def fill_regressor(
 def fill_momentum_regressor(
     vector: Array, q: Array, dq: Array, Yp: Array, Yr: Array
 ) -> None:
-    """Implement `SerialChain.momentum_regressor`."""
+    """Fill Yp and Yr (n, p) of a packed chain: see `SerialChain.momentum_regressor`."""
     bodies = bodies_of(vector)
     begin(bodies)
     for i in range(bodies.n):
@@ -95,7 +95,7 @@ def fill_regressors(
     Yp: Array,
     Yr: Array,
 ) -> None:
-    """Implement `SerialChain.regressors`."""
+    """Fill H, Yp and Yr (n, p) of a packed chain: see `SerialChain.regressors`."""
     bodies = bodies_of(vector)
     begin(bodies)
     for i in range(bodies.n):
@@ -118,7 +118,7 @@ def linear(motion: Array) -> Vector:
 
 @inner
 def begin(bodies: Bodies) -> None:
-    """Set the motions of the base."""
+    """Set the motions of the base: at rest, under gravity."""
     for k in range(3):
         for row in range(AXES):
             bodies.motions[row, k] = 0.0
@@ -129,7 +129,10 @@ def begin(bodies: Bodies) -> None:
 
 @inner
 def advance(bodies: Bodies, i: int, q: float, dq: float, v: float, a: float) -> None:
-    """Transform all motions from the frame of body i - 1 to that of i, and add those of joint i."""
+    """Transform all motions from the frame of body i - 1 to that of i, and add those of joint i.
+
+    q, dq, v, a are those of the joint [rad, rad/s, rad/s, rad/s^2].
+    """
     motions = bodies.motions
     rotation = bodies.rotation[i]
     c, s = cos(q), sin(q)
@@ -182,7 +185,10 @@ def rotation_column(rotation: Array, c: float, s: float, k: int) -> Vector:
 
 @inner
 def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
-    """Fill the columns of body i in M a + C v + G."""
+    """Fill the columns of body i in M a + C v + G, in rows 0 to i of H (n, p).
+
+    `a` [rad/s^2] is that of joint i, which turns its rotor.
+    """
     motions = bodies.motions
     products = bodies.products[0]
     w = angular(motions[VELOCITY])
@@ -199,7 +205,7 @@ def add_torque(bodies: Bodies, i: int, a: float, H: Array) -> None:
 
 @inner
 def add_momentum(bodies: Bodies, i: int, dq: float, Yp: Array, Yr: Array) -> None:
-    """Fill the columns of body i in M dq and in G - C^T dq."""
+    """Fill the columns of body i in M dq and in G - C^T dq, in rows 0 to i of Yp and Yr (n, p)."""
     motions = bodies.motions
     momenta = bodies.products[1]
     forces = bodies.products[2]

@@ -70,7 +70,7 @@ _UNKNOWN = 3.0  # ... and times that of motions where it is not known
 
 
 def loop_delay(sample_time: float, lag: float) -> float:
-    """Return the delay of the loop [s] that its gains allow for."""
+    """Return the delay of the loop [s] that its gains allow for: 3 T + lag."""
     return SAMPLES * sample_time + lag
 
 
@@ -78,7 +78,7 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...] | tuple[str, ...
 
 
 class Design(NamedTuple):
-    """What the gains of an arm follow from."""
+    """An arm, as far as its gains follow from it."""
 
     chain: Chain
     parameters: BaseParameters
@@ -114,7 +114,9 @@ class Design(NamedTuple):
 class Gains(NamedTuple):
     """Gains of the law (28) that follow from an arm."""
 
-    sag: tuple[float, ...]  # (n,) rad, at the start, by gravity that the model lacks
+    sag: tuple[
+        float, ...
+    ]  # (n,) rad, at the start, by gravity that is not in the model
     funnel_rate: float  # 1/s, at which a bound of that sag narrows
     weight: tuple[float, ...]  # (n,) w, N m/rad
     slope_limit: tuple[float, ...]  # (n,) N m/rad
@@ -127,21 +129,23 @@ class Gains(NamedTuple):
 
 
 def gains_of(arm: Design) -> Gains:
-    """Return the gains of the law for an arm."""
+    """Return the gains of the law (28) for an arm."""
     if arm.joints is None:
         return _inertia_feedback(arm)
     return _joint_feedback(arm, arm.joints.scaled(arm.stiffness))
 
 
 def defaults_of(arm: Design) -> Mapping[str, Value]:
-    """Return what follows from an arm, by the dotted name of its parameter."""
+    """Return the parameters that follow from an arm, by their dotted names."""
     n = len(arm.chain.joints)
     gains = gains_of(arm)
     if arm.joints is None:
         bound = (float(f'{_BOUND / arm.stiffness**2:.4g}'),) * n
     else:
         bound = _listed(np.maximum(gains.sag, _BOUND))
-    return _independent_defaults(arm) | {
+    return {
+        **_limits(arm),
+        **_learning(arm),
         'feedback.inertia': 'whole' if arm.joints is None else 'none',
         'barrier.bound': bound,
         'disturbance.gain': gains.integral,
@@ -224,11 +228,6 @@ def adaptation_gain(integral: np.ndarray, deviation: np.ndarray) -> float:
     return min(_ADAPTATION, float(f'{slow:.4g}'))
 
 
-def _independent_defaults(arm: Design) -> dict[str, Value]:
-    """Return what does not depend on the feedback: limits, learning, safety."""
-    return {**_limits(arm), **_learning(arm)}
-
-
 def _limits(arm: Design) -> dict[str, Value]:
     """Return the joints, their limits, a reference that holds within them, and safety."""
     joints = arm.chain.joints
@@ -272,7 +271,7 @@ def _learning(arm: Design) -> dict[str, Value]:
 
 
 def geared_arm(arm: Design, gears: Gears) -> GearedArm:
-    """Return an arm with its gears, in a few postures, without and with its payload."""
+    """Return an arm with its gears, in three postures, without and with its rated payload."""
     none = np.zeros(len(arm.rotors))
     P = arm.parameters.of(arm.chain.inertias, none)
     q = np.random.default_rng(0).uniform(*arm.limits, (_FEW, len(none)))

@@ -126,10 +126,11 @@ class Chain:
 def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain:
     """Return the serial chain of the moving `joints`, in order, between two links of a URDF text.
 
-    An empty base means the root, an empty tip the link of the last joint, no joints all
-    that move; without tip and joints, these must form one chain.
+    An empty base means the root, an empty tip the link of the last joint, no joints all that
+    move; without tip and joints, these must form one chain.
 
-    Raises BlfDscError, which says what was found and how to correct it.
+    Raises:
+        BlfDscError: there is no such chain; the text says what is there and how to correct it.
     """
     tree = Tree.of(text)
     wanted = joints or (() if tip else tree.only_chain())
@@ -158,7 +159,11 @@ def read_chain(text: str, base: str, tip: str, joints: tuple[str, ...]) -> Chain
 
 
 def placement_of(text: str, link: str) -> np.ndarray:
-    """Return the frame (4, 4) of a link in that of the root, with all joints between at zero."""
+    """Return the frame (4, 4) of a link in that of the root, with all joints between at zero.
+
+    Raises:
+        BlfDscError: the text is no URDF, or has no such link.
+    """
     tree = Tree.of(text)
     frame = np.eye(4)
     for element in tree.path(tree.root, link):
@@ -213,7 +218,7 @@ def _check_masses(joints: Sequence[Joint]) -> None:
 def frames(chain: Chain, q: np.ndarray) -> list[np.ndarray]:
     """Return the placements (..., 4, 4), in the base frame, of the base, each joint and the tip.
 
-    `q` is (..., n): one posture or an array of postures.
+    `q` is (..., n): one posture or an array of postures [rad or m].
     """
     placements = [np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))]
     for i, joint in enumerate(chain.joints):
@@ -251,7 +256,8 @@ class Tree(NamedTuple):
     def of(cls, text: str) -> Tree:
         """Read a URDF, in which each joint has its links, and no link two joints above it.
 
-        Raises BlfDscError if it is none, or no tree.
+        Raises:
+            BlfDscError: the text is no URDF, or its joints are no tree.
         """
         robot = _robot(text)
         links = _named(robot, 'link')
@@ -276,7 +282,11 @@ class Tree(NamedTuple):
         return next((link for link in self.links if link not in self.above), '')
 
     def path(self, base: str, tip: str) -> list[ET.Element]:
-        """Return the joints from a link to another."""
+        """Return the joints from the link `base` down to the link `tip`.
+
+        Raises:
+            BlfDscError: one is no link, or the tip is not below the base.
+        """
         for role, link in (('base', base), ('tip', tip)):
             if link not in self.links:
                 joint = self.joints.get(link)
@@ -357,7 +367,11 @@ class Tree(NamedTuple):
         return np.array([_number(limit, 'velocity') or inf for limit in limits])
 
     def only_chain(self) -> tuple[str, ...]:
-        """Return the moving joints, which must be one chain."""
+        """Return the moving joints, which must be one chain.
+
+        Raises:
+            BlfDscError: no joint moves, or they branch.
+        """
         moving = _moving([*self.joints.values()])
         if not moving:
             raise BlfDscError(
@@ -381,7 +395,11 @@ class Tree(NamedTuple):
         return ', '.join(kinds[:_MAX_KINDS]) or 'there is none'
 
     def body(self, link: str, joints: Sequence[str]) -> _Body:
-        """Return a link with all that it carries, where no other joint than `joints` moves."""
+        """Return a link with all that it carries, where no other joint than `joints` moves.
+
+        Raises:
+            BlfDscError: it carries something by a floating or planar joint.
+        """
         J = _link_inertia(self.links[link])
         held = np.zeros((4, 4))
         fixed: tuple[str, ...] = ()

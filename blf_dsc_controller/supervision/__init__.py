@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Supervision of the law: checks, stops and the torque without it, without ROS.
 
-Begin with `guard`, which shows how a joint state passes through all of it.
+Begin with `guard`: there a joint state passes through all of it.
 
 The law, or the torque that holds the arm in its place:
 
@@ -23,7 +23,7 @@ Checks, and what follows:
     state_check       stamps, missed and invalid states, before the law
     state_watchdog    no states at all
     reading           which states are trusted; their turns (`wraps`) and velocities
-    sample_check      what the law computed, before its torque is sent; `stop_cause` says why
+    sample_check      what the law computed, before its torque is sent; its `stop_cause`
     findings          what the law detects: contacts, wrong sensors (`not_sensors`), oscillations
     oscillation_check what follows from an oscillation: a stop, or a warning
     contact           contacts in words, and whether the arm holds after one

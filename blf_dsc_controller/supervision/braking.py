@@ -55,7 +55,7 @@ def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Arra
 
 
 def _inertia(settings: Settings, q: Array) -> Array | None:
-    """Return M0 (n, n) [kg m^2] at q (n,) [rad]; None without an estimate."""
+    """Return M0 (n, n) [kg m^2] at q (n,) [rad]; None without a positive estimate."""
     M = inertia_matrices(
         settings.model, settings.initial_estimate[: settings.p], q[np.newaxis]
     )[0]
@@ -64,7 +64,10 @@ def _inertia(settings: Settings, q: Array) -> Array | None:
 
 
 def _limited_rate(rate: Array, gap: float) -> Array:
-    """Return the rates (n,) that low pass and gap bear: 1/tau makes a joint half critical."""
+    """Return the rates (n,) [1/s] that low pass and gap tolerate.
+
+    1/tau makes a joint half critical.
+    """
     return np.minimum(rate, 1.0 / max(gap, FILTER))
 
 

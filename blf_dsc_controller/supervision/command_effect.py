@@ -21,7 +21,7 @@ class CommandEffect:
 
     An arm held by brakes, or by drives whose effort controller is inactive, does not
     accelerate, whatever is commanded.  One that brakes by the commanded damping does,
-    or that falls with a load that the model lacks.
+    or that falls with a load that is not in the model.
     """
 
     def __init__(self, n: int) -> None:
@@ -29,14 +29,17 @@ class CommandEffect:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all that has been seen."""
+        """Forget the torques so far."""
         self._elapsed = 0.0
         self._without_effect = 0.0
         self._average[:] = 0.0
         self.is_proven = False
 
     def update(self, accelerating: Vector, limit: Vector, dt: float) -> None:
-        """Take the torque (n,) [N m] that has accelerated the arm for `dt` [s]."""
+        """Average the torque M ddq (n,) [N m] that has accelerated the arm for `dt` [s].
+
+        `is_proven` becomes true once it exceeds 5 % of the torque `limit` (n,) [N m] on a joint.
+        """
         self._elapsed += dt
         if self._elapsed < _SETTLING_TIME:
             return

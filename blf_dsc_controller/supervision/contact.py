@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.reference.retargeting import TrajectoryError
@@ -14,7 +13,7 @@ from blf_dsc_controller.run import Contact
 
 
 def contact_of(controller: Controller, config: ControllerConfig, stamp: int) -> Contact:
-    """Return what the last sample, of a stamp [ns], shows of a contact."""
+    """Return the contact of the last sample, whose stamp is in ns, with its sentence."""
     sample = controller.sample
     worst = int(np.argmax(np.abs(sample.external) / sample.external_interval))
     joint, unit = config.joints[worst], config.units[worst].torque
@@ -29,7 +28,7 @@ def contact_of(controller: Controller, config: ControllerConfig, stamp: int) -> 
 
 
 class Contacts:
-    """What has touched an arm.
+    """The contacts of an arm so far.
 
     Attributes:
         last: the last contact; None: nothing so far.
@@ -48,23 +47,12 @@ class Contacts:
         self.count += 1
 
     def check_target(self) -> None:
-        """Raise TrajectoryError for a target, which may lead into what the arm holds before."""
+        """Check that the arm may follow a target, which could lead back into what it has touched.
+
+        Raises:
+            TrajectoryError: the arm holds since a contact.
+        """
         if self.hold:
             remedy = 'send a trajectory that leads away from it, or call reset'
             why = self.last.text if self.last else ''
             raise TrajectoryError([f'{why}, and the arm holds: {remedy}'])
-
-
-def untarable(
-    controller: Controller, config: ControllerConfig, stamp: int, *, is_at_rest: bool
-) -> str:
-    """Return why the external torque of a law in command cannot be tared; empty if it can.
-
-    `stamp` [ns] is that of the last sample, `is_at_rest` whether reference and arm rest.
-    """
-    if is_touched(controller.state.contact):
-        return f'{contact_of(controller, config, stamp).text}: clear it first'
-    if not (is_at_rest and controller.can_tare):
-        rest = f'{controller.tare_rest:.2g} s'
-        return f'the arm moves, or has just come to rest: hold it still for {rest}'
-    return ''

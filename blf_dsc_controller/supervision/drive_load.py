@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Declare a weighed load to the drives, so that no joint torque steps.
+"""Declare an estimated payload to the drives, so that no joint torque steps.
 
 Drives that compensate gravity only count the load that is declared to them.  A law that
-has weighed it can declare it.  They then add its weight, and the command is reduced by
+has estimated it can declare it.  They then add its weight, and the command is reduced by
 it,
 
     whole torque = command + G_d(q) = command' + G_d'(q),    G_d' = G_d + that of the load
@@ -42,14 +42,14 @@ _STEP = 0.005  # of the torque limit
 
 
 def widest_interval(mass: ArrayLike) -> Vector:
-    """Return half of the widest 95 % intervals [kg] with which masses [kg] are declared."""
+    """Return half of the widest 95 % interval [kg] with which a mass [kg] is declared."""
     return np.maximum(_NARROW, _FRACTION * np.abs(mass))
 
 
 class DriveLoads:
     """The load that is declared to the drives of an arm, step by step.
 
-    It follows what the law weighs with `load.tell_drive`, else from the first load on that is
+    It follows the payload estimate with `load.tell_drive`, else from the first load on that is
     declared by hand.
 
     Attributes:
@@ -62,14 +62,14 @@ class DriveLoads:
         self.in_force = self._at_start
         # when the law began to learn: at the start, or at a reset
         self._base = self._at_start
-        self._requested: TipLoad | None = None  # by hand, whatever is weighed
+        self._requested: TipLoad | None = None  # by hand, whatever is estimated
         self._controller = controller
         self._robot, self._joints = robot, config.joints
         self._is_used = config.load.tell_drive
         self._has_begun = False  # a load has been declared in part
 
     def declare(self, load: TipLoad) -> None:
-        """Let the steps lead to this load, whatever is weighed.
+        """Let the steps lead to this load, whatever is estimated.
 
         Raises:
             BlfDscError: the drives add no weight.
@@ -86,7 +86,7 @@ class DriveLoads:
         self._is_used = True
 
     def take(self, load: TipLoad) -> None:
-        """Count the weight of this load, which the drives add from now on, in the law.
+        """Subtract the weight of this load, which the drives add from now on, from the commands.
 
         Raises:
             BlfDscError: the drives add no weight.
@@ -109,8 +109,8 @@ class DriveLoads:
     def forget(self) -> None:
         """Begin again with a law that has forgotten what the tip holds.
 
-        The drives hold it by the load in force: the law counts neither.  Joint torque
-        sensors show both, so the load observer is off from then on.
+        The drives hold it by the load in force: the law counts neither.  Joint torque sensors
+        measure both, so the load observer is off from then on.
         """
         if not self._is_used:
             return
@@ -123,9 +123,9 @@ class DriveLoads:
         settings.observer.max_torque[:] = max_torque
 
     def begin_step(self) -> TipLoad | None:
-        """Begin the next step: return the load to declare; None if there is none, or too uncertain.
+        """Begin the next step: return the load to declare now; None if there is none.
 
-        Nothing is declared while something touches the arm.
+        There is none either while the estimate is too uncertain, or something touches the arm.
         """
         if not self._is_used:
             return None
@@ -151,7 +151,10 @@ class DriveLoads:
         return TipLoad.of(moments + fraction * (target - moments))
 
     def _requested_target(self) -> Vector | None:
-        """Return mass and moments (4,) that a user declares; None: the drives have them."""
+        """Return mass [kg] and moments [kg m] (4,) that a user declares.
+
+        None: the drives have them, or nothing is declared.
+        """
         if self._requested is None or np.allclose(
             self.in_force.moments, self._requested.moments
         ):
@@ -164,7 +167,10 @@ class DriveLoads:
         return self._requested_target() is None
 
     def _estimated_target(self) -> Vector | None:
-        """Return mass and moments (4,) that the drives should get; None: no change."""
+        """Return mass [kg] and moments [kg m] (4,) that the drives should get by the estimate.
+
+        None: it is too uncertain, or no change.
+        """
         load = self._controller.state.payload.load
         interval = TWO_SIDED * load[DEVIATION]
         narrow = widest_interval(load[MASS])
@@ -182,7 +188,7 @@ class DriveLoads:
         return target if is_new or self._has_begun else None
 
     def _added(self) -> Vector:
-        """Return the factors of the columns of the drives' gravity, for the law."""
+        """Return the factors of the columns of the drives' gravity that the law subtracts."""
         if self._base is self._at_start:
             return self._columns(self.in_force)
         change = self._columns(self.in_force) - self._columns(self._base)

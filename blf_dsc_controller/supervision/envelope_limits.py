@@ -25,7 +25,7 @@ _USED_TORQUE = 0.5  # ... and of what is left, to stop at the end of the range
 
 
 def envelope_of(config: ControllerConfig, settings: Settings) -> Envelope:
-    """Return the envelope of an arm."""
+    """Return the envelope of an arm, by its configuration and the `settings` of its law."""
     return Envelope(*limits_of(config, settings))
 
 

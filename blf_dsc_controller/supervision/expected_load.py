@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A load that somebody knows before the arm does: a gripper closes, or a box comes again.
+"""A load that is announced before the arm can estimate it: a gripper closes, or a box comes again.
 
 The mean of the prior then has the load at once, and the estimate within the interval in which
 the tip takes it up.  Learning corrects what is wrong with it.  It is as if `robot` had been
-described with that load, except for the gains, which a wrong word must not make too stiff.
+described with that load, except for the gains, which a wrong announcement must not make too
+stiff.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class ExpectedLoad:
 
     Attributes:
         load: what is expected now.
-        weighed: the last load that the law has weighed; None: none yet.
+        estimated: the last payload estimate that was certain enough; None: none yet.
     """
 
     def __init__(self, config: ControllerConfig, controller: Controller) -> None:
@@ -49,15 +50,15 @@ class ExpectedLoad:
         self._empty = np.zeros(0)
         self._step = np.zeros(0)  # of P^, in a sample
         self._steps = 0  # that are left
-        self._last_mass = 0.0  # kg, the mass that was weighed last, sure or not
+        self._last_mass = 0.0  # kg, the last estimate of the mass, certain or not
 
     def expect(self, load: TipLoad | None, interval: float, q: Vector) -> TipLoad:
         """Expect this load, which the tip takes up within an `interval` [s], at q (n,) [rad].
 
-        None: the load that was weighed last.  Return it.
+        None: the last estimated load.  Return the load that is expected.
 
         Raises:
-            BlfDscError: it is no load of this arm's tip, or none has been weighed.
+            BlfDscError: it is no load of this arm's tip, or none has been estimated.
         """
         if not (self._config.model == 'urdf' and self._config.robot.tip):
             raise BlfDscError(
@@ -83,13 +84,13 @@ class ExpectedLoad:
         return load
 
     def advance(self) -> None:
-        """Let the estimate follow, before each sample of the law."""
+        """Advance the estimate of the law towards the expected load, before each sample."""
         if self._steps:
             self._controller.shift_estimate(self._step)
             self._steps -= 1
 
     def observe(self) -> None:
-        """Remember what the law has weighed, once it is sure of it."""
+        """Remember the payload estimate of the law, once it is certain enough."""
         load = self._controller.state.payload.load
         if not load.size or load[MASS] == self._last_mass:
             return  # it is solved for ten times a second
@@ -100,7 +101,7 @@ class ExpectedLoad:
             self.estimated = TipLoad(mass, tuple(centre))
 
     def apply_again(self) -> None:
-        """Expect the same load after the settings were replaced."""
+        """Expect the same load after the settings of the law were replaced."""
         if self.load.mass > 0.0:
             self._controller.expect(self._parameters(self.load))
 
@@ -120,6 +121,11 @@ class ExpectedLoad:
     def _check(
         self, load: TipLoad, parameters: Vector, interval: float, q: Vector
     ) -> None:
+        """Check an interval [s], and a load with its `parameters` (p,), at q (n,) [rad].
+
+        Raises:
+            BlfDscError: they are not plausible for this arm.
+        """
         config, settings = self._config, self._controller.settings
         if not (isinstance(interval, Real) and 0.0 <= interval <= LONGEST):
             raise BlfDscError(

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.errors import TareError
 from blf_dsc_controller.law.check_state import CONTRADICTION, NOT_SENSORS, OSCILLATES
+from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.sensor import SLOW, is_late
 from blf_dsc_controller.messages.journal import EventType
 from blf_dsc_controller.supervision import not_sensors
-from blf_dsc_controller.supervision.contact import Contacts, contact_of, untarable
+from blf_dsc_controller.supervision.contact import Contacts, contact_of
 from blf_dsc_controller.supervision.in_command import InCommand
 from blf_dsc_controller.supervision.reading import Reading
 from blf_dsc_controller.supervision.state_check import velocity_lag_remedy
@@ -41,12 +42,12 @@ class Findings:
         self.contacts.hold = False
 
     def check_efforts(self) -> None:
-        """Record that efforts are not those of joint torque sensors, when the law finds it."""
-        command, joints = self._command, self._command.config.joints
-        if not command.controller.flags & NOT_SENSORS:
+        """Record that efforts are not those of joint torque sensors, once the law detects it."""
+        command, controller = self._command, self._command.controller
+        if not controller.flags & NOT_SENSORS:
             return
-        joint = not_sensors.joint_of(command.controller, joints)
-        self.untrusted = not_sensors.text_of(command.controller, command.config)
+        joint = command.config.joints[int(controller.state.sensors.joint[0])]
+        self.untrusted = not_sensors.text_of(controller, command.config)
         command.samples.compare_efforts()
         command.note(EventType.TORQUE_SENSORS, joint=joint, text=self.untrusted)
 
@@ -64,7 +65,10 @@ class Findings:
         return None
 
     def react_to_contact(self) -> None:
-        """React to a contact, as `contact.reaction` says."""
+        """React to a contact of the last sample, as `contact.reaction` says.
+
+        The arm goes on, holds its reference, stops, or yields; the journal has it in each case.
+        """
         command = self._command
         reaction = command.config.contact.reaction
         stamp = command.reference.last_stamp
@@ -104,8 +108,13 @@ class Findings:
         if not (supervisor.running and command.has_sample):
             why = supervisor.text or supervisor.phase
             return f'the law is not in command ({why})'
-        stamp = command.reference.last_stamp
-        return untarable(law, command.config, stamp, is_at_rest=command.is_at_rest)
+        if is_touched(law.state.contact):
+            contact = contact_of(law, command.config, command.reference.last_stamp)
+            return f'{contact.text}: clear it first'
+        if not (command.is_at_rest and law.can_tare):
+            rest = f'{law.tare_rest:.2g} s'
+            return f'the arm moves, or has just come to rest: hold it still for {rest}'
+        return ''
 
     def stop_at_invalid(self, reading: Reading) -> None:
         """Stop because of a state that the law has not used."""

@@ -23,7 +23,7 @@ from blf_dsc_controller.supervision.reading import Reading
 Vector = NDArray[np.float64]
 
 MATTERS = 0.05
-"""Share of the torque limit from which a torque of gravity matters."""
+"""Fraction of the torque limit from which a torque of gravity matters."""
 
 # rad/s: below it efforts are those of rest, which encoder steps interrupt
 _RESTING_SPEED = 0.05
@@ -39,10 +39,13 @@ _DRIVER = (
 def check_support(
     controller: Controller, config: ControllerConfig, measurement: Vector
 ) -> None:
-    """Raise StartError if it is unknown what holds the arm, and no step is limited.
+    """Check that it is known what holds the arm, or that the first step is limited.
 
-    Brakes may hold it, or drives that compensate gravity, to which gravity would be
-    added.
+    Brakes may hold it, or drives that compensate gravity, to which gravity would be added.
+    `measurement` is [q, dq, effort] (3 n,).
+
+    Raises:
+        StartError: it is not known, and gravity matters.
     """
     robot = config.robot
     is_known = robot.drive_compensates != 'none' or robot.effort in ('whole', 'current')
@@ -53,7 +56,7 @@ def check_support(
     unlimited = np.where(np.array(config.torque.first_step) > 0.0, 0.0, np.abs(gravity))
     worst = int(np.argmax(unlimited))
     matters = unlimited[worst] > MATTERS * config.torque.limit[worst]
-    # of an effort like gravity, `check_first_torque` says more
+    # an effort like gravity is refused by `check_first_torque`, with more to say
     is_held = np.isfinite(effort).all() and is_like(effort, gravity)
     if matters and not is_held and not np.abs(dq).max() > AT_REST:
         unit = config.units[worst].torque
@@ -73,10 +76,14 @@ def check_first_torque(
     reading: Reading,
     acting: Vector | None,
 ) -> None:
-    """Raise StartError if the first torque must not be sent; the controller has begun.
+    """Check that the first torque may be sent; the controller has begun.
 
     `reading` is the first state; `acting` (n,) [N m] the command of another node, if one holds
     the arm.
+
+    Raises:
+        StartError: a joint would step by more than `torque.first_step`, gravity would be sent
+            twice, or not at all.
     """
     if config.safety.first_torque == 'send':
         return
@@ -161,7 +168,7 @@ def _check_not_twice(
 ) -> None:
     """Raise StartError if an arm rests by efforts (n,) [N m] before any command.
 
-    A joint torque sensor shows the weight of the arm, whatever holds it.
+    A joint torque sensor measures the weight of the arm, whatever holds it.
     """
     robot = config.robot
     shows_drives = robot.effort != 'commanded' and not robot.torque_loop
@@ -181,7 +188,7 @@ def _check_not_twice(
 def _check_compensated(
     config: ControllerConfig, effort: Vector, gravity: Vector, torque: Vector
 ) -> None:
-    """Raise StartError if efforts (n,) [N m] do not show the drives that compensate gravity."""
+    """Raise StartError if efforts (n,) [N m] contradict that the drives compensate gravity."""
     worst = int(np.argmax(np.abs(gravity)))
     joint, unit = config.joints[worst], config.units[worst].torque
     is_commanded = config.robot.effort == 'commanded'

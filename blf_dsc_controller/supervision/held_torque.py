@@ -22,7 +22,7 @@ Vector = NDArray[np.float64]
 
 
 class HeldTorque:
-    """The command and the load of a controller's arm.
+    """The command that holds a controller's arm, and the load in it besides the model.
 
     Attributes:
         recent: the motion of the last samples.

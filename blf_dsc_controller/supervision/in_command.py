@@ -163,7 +163,10 @@ class InCommand:
             self.watchdog.wait()
 
     def stop(self, reason: Reason, text: str) -> None:
-        """Enter the safe stop, unless the law is not in command or about to be."""
+        """Enter the safe stop for a reason, if the law is in command or about to be.
+
+        `text` says what happened and what to do; it is recorded in the journal.
+        """
         missed = self.states.missed_per_state
         if missed > _MANY and reason is not Reason.OVERRUN:
             T = self.config.sample_time
@@ -183,7 +186,7 @@ class InCommand:
         )
 
     def deactivate(self) -> None:
-        """Leave command: the torque ramps to the safe torque."""
+        """Take the law out of command in order: its torque ramps to the safe torque."""
         self.note(EventType.DEACTIVATE)
         was_running = self.supervisor.running
         self.reference.resumable = was_running
@@ -232,7 +235,7 @@ class InCommand:
     def safe_at(self, reading: Reading) -> Vector | None:
         """Return the safe torque for a state that the law has not used.
 
-        A state in doubt shows no motion, and a copy or two of the last one change nothing.
+        A state in doubt is used for no motion, and a copy or two of the last one change nothing.
         """
         T, gap = self.config.sample_time, reading.gap
         if reading.doubt is None:

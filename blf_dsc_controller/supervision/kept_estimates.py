@@ -18,7 +18,7 @@ Vector = NDArray[np.float64]
 
 
 class KeptEstimates:
-    """The estimates that count for the torque without the law, and for its next start."""
+    """The estimates for the torque without the law, and for its next start."""
 
     def __init__(self, controller: Controller) -> None:
         """Keep the estimates that the law has now."""
@@ -46,20 +46,20 @@ class KeptEstimates:
         self.disturbance[: observed.size] += observed
 
     def begin(self) -> None:
-        """Take the kept ones for those of all past samples: a start has no others."""
+        """Take the kept estimates for those of all past samples: a start has no others."""
         self._past.consistent[:] = self._past.kept
         self._past.moved[:] = self._past.kept
 
     def return_to_consistent(self) -> None:
-        """Keep those from before the error grew."""
+        """Keep the estimates from before the error grew."""
         self._past.kept[:] = self._past.consistent
 
     def return_to_moved(self) -> None:
-        """Keep those of when a joint last moved."""
+        """Keep the estimates of when a joint last moved."""
         self._past.kept[:] = self._past.moved
 
     def restore(self) -> None:
-        """Let the law begin with the kept ones."""
+        """Let the law begin with the kept estimates."""
         state = self._controller.state
         state.estimate[:] = self.estimate
         state.disturbance[:] = self.disturbance

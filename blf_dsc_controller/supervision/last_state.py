@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The last trusted joint state, from which the safe torque is computed.
 
-The safe torque damps the velocity that the positions show, behind a low pass:
+The safe torque damps the velocity by the positions, behind a low pass:
 
     v' = (dq/dt - v) / 0.03 s
 

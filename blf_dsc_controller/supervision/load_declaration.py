@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Declare a weighed load to the drives, one step after the other has taken effect.
+"""Declare an estimated payload to the drives, one step after the other has taken effect.
 
 This is the sequence, whatever reaches the drives: the SDK of a robot (`drive/`) or a ROS
-service of its driver (`nodes/`).  Which steps there are is said by `drive_load`.
+service of its driver (`nodes/`).  Which steps there are is decided by `drive_load`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _EVERY = 20  # states, from one step that is in force to the next
 
 
 class DeclarationError(BlfDscError):
-    """The drives cannot be told a load, or refuse it."""
+    """The drives do not accept a load."""
 
 
 class LawWithLoad(Protocol):
@@ -52,14 +52,17 @@ class LoadDeclaration(ABC):
     def follow(self, law: LawWithLoad, *, in_motion: bool) -> None:
         """Before each state: let the law take over a step in force, or declare the next.
 
-        `in_motion`: whether the drives may be told a load while the arm moves.
+        `in_motion`: whether the drives accept a load while the arm moves.
         """
         if self.problem:
             return
         self.states += 1
         try:
-            if self._declared is not None:
-                self._take_over_in_force(law, self._declared)
+            if (declared := self._declared) is not None:
+                if self.is_in_force(declared):
+                    self.states = 0
+                    self.in_force, self._declared = declared, None
+                    law.take_over(declared)
             elif self.states >= _EVERY and self.can_declare():
                 self.states = 0
                 load = law.load_to_tell() if in_motion or law.is_at_rest else None
@@ -69,26 +72,20 @@ class LoadDeclaration(ABC):
         except DeclarationError as error:
             self.give_up(str(error))
 
-    def _take_over_in_force(self, law: LawWithLoad, load: TipLoad) -> None:
-        if self.is_in_force(load):
-            self.states = 0
-            self.in_force, self._declared = load, None
-            law.take_over(load)
-
     def give_up(self, problem: str) -> None:
         """Declare no more loads, for this reason."""
         self.problem = problem
 
     def can_declare(self) -> bool:
-        """Whether the drives can be told a load now."""
+        """Whether the drives accept a load now."""
         return True
 
     @abstractmethod
     def declare(self, load: TipLoad) -> None:
-        """Begin to tell the drives a load in the frame of the tip, without waiting.
+        """Begin to send a load in the frame of the tip to the drives, without waiting.
 
         Raises:
-            DeclarationError: they cannot be told.
+            DeclarationError: it cannot be sent.
         """
 
     @abstractmethod

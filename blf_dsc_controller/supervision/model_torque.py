@@ -16,14 +16,20 @@ Vector = NDArray[np.float64]
 
 
 def gravity_torque(settings: Settings, estimate: Vector, q: Vector) -> Vector:
-    """Return H(q, 0, 0, 0) P^ (n,) [N m], which holds the model at rest at q (n,) [rad]."""
+    """Return H(q, 0, 0, 0) P^ (n,) [N m], which holds the model at rest at q (n,) [rad].
+
+    `estimate` is theta^ = [P^; d^] (m,).
+    """
     return model_torque(settings, estimate, q, *np.zeros((2, settings.n)))
 
 
 def model_torque(
     settings: Settings, estimate: Vector, q: Vector, dq: Vector, ddq: Vector
 ) -> Vector:
-    """Return H(q, dq, dq, ddq) P^ (n,) [N m] of a motion q, dq, ddq (n,)."""
+    """Return H(q, dq, dq, ddq) P^ = M ddq + C dq + G (n,) [N m] of a motion q, dq, ddq (n,).
+
+    `estimate` is theta^ = [P^; d^] (m,).
+    """
     (H,) = regressors_at(
         settings.model, *(vector[np.newaxis] for vector in (q, dq, dq, ddq))
     )
@@ -33,7 +39,7 @@ def model_torque(
 def friction_torque(
     settings: Settings, estimate: Vector, dq: Vector, tau: Vector
 ) -> Vector:
-    """Return the friction (n,) [N m] of the estimate, zero without columns.
+    """Return the friction D d^ (n,) [N m] of the estimate theta^ (m,), zero without columns.
 
     It is that at dq (n,) [rad/s], of gears that carry tau (n,) [N m].
     """
@@ -51,7 +57,10 @@ def friction_torque(
 def needed_torque(
     settings: Settings, estimate: Vector, q: Vector, dq: Vector, ddq: Vector
 ) -> Vector:
-    """Return the command (n,) [N m] behind a motion, by model and friction of the estimate."""
+    """Return the command (n,) [N m] that causes a motion q, dq, ddq (n,).
+
+    It is model and friction of the estimate theta^ (m,), less what the drives add.
+    """
     with np.errstate(over='ignore', invalid='ignore'):  # the caller checks it
         needed = model_torque(settings, estimate, q, dq, ddq)
         needed += friction_torque(settings, estimate, dq, needed)

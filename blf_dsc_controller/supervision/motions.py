@@ -37,7 +37,7 @@ class Plan(NamedTuple):
     content: dict[str, Any]  # of its event
 
     def check(self, reference_vector: np.ndarray, t: float) -> None:
-        """Check that a loop with this packed reference can still adopt it now [s].
+        """Check that a loop with this packed reference can still adopt it at t [s].
 
         Raises:
             LatePlanError: it begins in the past.
@@ -118,13 +118,16 @@ class Motions:
 
         Raises:
             LatePlanError: it begins in the past.
-            TrajectoryError: it does not continue the current reference, which stays in force.
+            TrajectoryError: it does not continue the current reference, which stays in force, or
+                it is a target and the arm holds after a contact.
         """
         command, reference = self._command, self._command.reference
         command.check_running()
         planned.check(command.controller.reference_vector, reference.time)
         if isinstance(planned.command, Target):
-            self._adopt_target(planned)
+            self._contacts.check_target()
+            command.note(EventType.TARGET, **planned.content)
+            reference.follow(planned.motion.vector)
             return
         command.end_silence()
         command.journal.add(EventType.TRAJECTORY, planned.content)
@@ -133,12 +136,6 @@ class Motions:
         reference.settled = planned.motion.settled
         is_settled = reference.settled <= reference.time
         command.supervisor.enter(Phase.TRACKING if is_settled else Phase.APPROACHING)
-
-    def _adopt_target(self, planned: Plan) -> None:
-        """Follow a target; raise TrajectoryError if the arm holds after a contact."""
-        self._contacts.check_target()
-        self._command.note(EventType.TARGET, **planned.content)
-        self._command.reference.follow(planned.motion.vector)
 
     def brake(self) -> float:
         """Bring the reference to rest within the limits; return when it rests [s].

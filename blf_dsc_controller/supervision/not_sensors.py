@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.torque_sensors import NONE, OFF, OSCILLATING
@@ -32,12 +30,12 @@ _LOAD = ', or the drives compensate another load than robot.drive_payload, {:g} 
 
 
 def fault_of(controller: Controller) -> int:
-    """Return what is wrong with the efforts, NONE if nothing is."""
+    """Return what is wrong with the efforts: NONE, OSCILLATING or OFF of `law.torque_sensors`."""
     return int(controller.state.sensors.fault[0])
 
 
 def is_off(controller: Controller) -> bool:
-    """Whether efforts do not even follow the commands, so that they show nothing about them."""
+    """Whether efforts do not even follow the commands, so that they prove nothing about them."""
     return fault_of(controller) == OFF
 
 
@@ -53,8 +51,3 @@ def text_of(controller: Controller, config: ControllerConfig) -> str:
     adds_weight = robot.effort == 'whole' and robot.drive_compensates != 'none'
     load = _LOAD.format(robot.drive_payload) if adds_weight else ''
     return _TEXTS[fault].format(joint=config.joints[i], off=off, unit=unit, load=load)
-
-
-def joint_of(controller: Controller, joints: Sequence[str]) -> str:
-    """Return the joint that shows it most."""
-    return joints[int(controller.state.sensors.joint[0])]

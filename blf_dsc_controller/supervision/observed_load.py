@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds an arm besides its model, observed from its motion.
+"""The load besides the model, observed from the motion of an arm.
 
     residual' = L1 (tau - H(q, dq, dq, ddq) P^ - friction - residual)
     load' = L2 (residual - load),   |load| <= half the torque limit
@@ -24,10 +24,10 @@ _LARGEST_LOAD = 0.5  # of the torque limit
 
 
 class ObservedLoad:
-    """The load of an arm.
+    """Observer of the load of an arm.
 
     Attributes:
-        load: torque (n,) [N m] that the model lacks.
+        load: torque (n,) [N m] beyond the model.
     """
 
     def __init__(self, n: int, rates: tuple[float, float]) -> None:
@@ -41,7 +41,10 @@ class ObservedLoad:
         self.load[:] = self._residual[:] = load
 
     def update(self, unmodelled: Vector, limit: Vector, dt: float) -> None:
-        """Take what the model lacked (n,) [N m] in the last `dt` [s], of torques up to `limit`."""
+        """Advance by `dt` [s] with the torque beyond the model (n,) [N m] in it.
+
+        `limit` (n,) [N m] is the torque limit.
+        """
         first, second = (min(1.0, rate * dt) for rate in self._rates)
         self._residual += first * np.clip(unmodelled - self._residual, -limit, limit)
         self.load += second * (self._residual - self.load)

@@ -34,7 +34,7 @@ _LATELY = 0.1  # s
 
 
 class JointOscillation(NamedTuple):
-    """The oscillation of the joint that shows it most."""
+    """The oscillation of the joint with the largest fraction of its torque limit."""
 
     joint: str
     frequency: float  # Hz
@@ -51,7 +51,7 @@ class JointOscillation(NamedTuple):
 
 
 class OscillationCheck:
-    """Decides what follows from an oscillation of a law's arm.
+    """Decides whether an arm that oscillates stops.
 
     Attributes:
         last: the last oscillation that is warned of; None: none so far.
@@ -100,7 +100,7 @@ class OscillationCheck:
         return False
 
     def _worst(self, oscillating: NDArray[np.bool_]) -> JointOscillation | None:
-        """Return the oscillation of the worst of the joints that do (n,); None: none does."""
+        """Return the oscillation of the worst joint `oscillating` (n,); None: none does."""
         state = self._state
         limit = self._controller.settings.torque.limit
         torque = state.amplitude
@@ -115,7 +115,7 @@ class OscillationCheck:
         )
 
     def is_ongoing(self, t: float) -> bool:
-        """Whether the arm oscillates at t [s], which has been warned of."""
+        """Whether an oscillation that has been warned of still lasts at t [s]."""
         return t - self._reported < 2.0 * PATIENCE
 
     @property

@@ -37,7 +37,7 @@ _STABLE = 2.0  # x += -a x diverges for a >= 2
 
 
 def apply(controller: Controller, config: ControllerConfig) -> None:
-    """Replace the gains of a law."""
+    """Replace the gains of a law by those of a configuration."""
     controller.retune(law_of(config), settings_in_loop(config))
 
 

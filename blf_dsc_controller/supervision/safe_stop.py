@@ -37,7 +37,7 @@ class StopSpeed:
         self._speeding = 0.0  # s, for which the arm has been faster
 
     def observe(self, speed: float, gap: float) -> bool:
-        """Take the speed of a state; return whether this shows that the arm speeds up.
+        """Take the speed of a state; return whether the arm now speeds up.
 
         That is once it has been faster for long enough, and at most once in a stop.
 
@@ -81,13 +81,23 @@ class SafeStop:
         was_running: bool,
         oscillates: bool,
     ) -> None:
-        """Begin a stop at a speed [rad/s], the largest of a joint."""
+        """Begin a stop for a reason, at a speed [rad/s], the largest of a joint.
+
+        `was_running`: the law was in command.  `oscillates`: the arm did so.
+        """
         self._speed.begin(speed)
         self._swings.begin()
         load = self._hold.load.copy()
         if was_running:
-            self._continue_from_held()
-            load = self._load_at_stop(reason)
+            # the ramp begins at the torque that acts after a gap, also that of another node
+            acting = self._held.command()
+            if acting is not None:
+                self._hold.commanded[:] = acting
+            in_doubt = is_in_doubt(reason, Doubtful.MOTION)
+            if in_doubt and self._held.after_gap is None:
+                load = self._estimates.disturbance
+            else:
+                load = self._held.load()
         awaits = is_in_doubt(reason, Doubtful.EFFECT) and not oscillates
         self._hold.begin(
             load,
@@ -116,7 +126,7 @@ class SafeStop:
     def carried(self, safety: Safety, estimate: Vector) -> Vector | None:
         """Return the load (n,) [N m] besides an estimate (m,) that the safe torque carries.
 
-        None: it holds none, or the arm has not shown that it does.
+        None: it holds none, or has not yet proven to hold the arm.
         """
         if safety.torque != 'hold_gravity' or not self._hold.carries:
             return None
@@ -145,7 +155,7 @@ class SafeStop:
 
     @property
     def missing_effect(self) -> str:
-        """That the last change of the commands has moved nothing; empty if it may have."""
+        """What to do if the last change of the commands has moved nothing; empty if it may have."""
         change = self._hold.missed_change
         if change is None:
             return ''
@@ -156,15 +166,3 @@ class SafeStop:
             'brakes, activate the effort controller, or free the arm; a joint that sticks does so, '
             'too, if its drive gives less than it is sent'
         )
-
-    def _continue_from_held(self) -> None:
-        """Let the ramp begin at the torque that acts after a gap, also that of another node."""
-        held = self._held.command()
-        if held is not None:
-            self._hold.commanded[:] = held
-
-    def _load_at_stop(self, reason: Reason) -> Vector:
-        """Return the torque (n,) [N m] that holds the arm besides its model when the law stops."""
-        if is_in_doubt(reason, Doubtful.MOTION) and self._held.after_gap is None:
-            return self._estimates.disturbance
-        return self._held.load()

@@ -61,7 +61,7 @@ class SampleCheck:
         self.restart()
 
     def set_limits(self, safety: Safety) -> None:
-        """Apply these limits to the next samples."""
+        """Apply the limits of `safety` to the next samples."""
         self._safety = safety
         checks = self._controller.checks
         checks.velocity_limit[:] = safety.velocity_limit
@@ -120,6 +120,7 @@ class SampleCheck:
         return fault
 
     def _check_numbers(self) -> Fault | None:
+        """Return the fault of an estimate or a torque that is not finite."""
         state = self._controller.state
         demand = self._controller.signals.demand
         if not (
@@ -173,7 +174,7 @@ class SampleCheck:
         return Fault(Reason.NO_EFFECT, text)
 
     def _check_reach(self) -> Fault | None:
-        """Return the fault if efforts show that commands do not reach a moving arm.
+        """Return the fault if, by the efforts, commands do not reach a moving arm.
 
         The kept estimates are then those from before the error grew.
         """
@@ -201,6 +202,7 @@ class SampleCheck:
         )
 
     def _check_error(self) -> Fault | None:
+        """Return the fault of an error past `safety.error_ratio` times its bound; None: none is."""
         safety = self._safety
         if safety.error_ratio == 0.0 or self._controller.settings.has_barrier == 0:
             return None
@@ -220,20 +222,14 @@ class SampleCheck:
         )
         if (at_tool := self.tool_errors) is not None:
             text += f'; {in_words(at_tool)}'
-        full_text = self._with_cause(text)
-        if full_text == text:
-            full_text += self._imbalance(worst)
-        return Fault(Reason.OUTSIDE_BOUND, full_text)
-
-    def _with_cause(self, text: str) -> str:
-        """Return a text after what the arm suffers from, if it is known."""
-        cause = self._cause.text(self.saturated_time)
-        return '; '.join(filter(None, (cause, text)))
+        if cause := self._cause.text(self.saturated_time):
+            return Fault(Reason.OUTSIDE_BOUND, f'{cause}; {text}')
+        return Fault(Reason.OUTSIDE_BOUND, text + self._imbalance(worst))
 
     def _imbalance(self, joint: int) -> str:
         """Return what may be wrong if a joint leaves against the torque that it is sent.
 
-        A weak drive and a load look alike, unless efforts show what the drive gives.
+        A weak drive and a load look alike, unless efforts are what the drive gives.
         """
         controller = self._controller
         sample = controller.sample

@@ -33,7 +33,7 @@ def _measure(
 
 
 class SensorNoise:
-    """What the positions of an arm show of their sensor, as the law measures it.
+    """Noise and steps of the positions of an arm, measured as the law does.
 
     Attributes:
         state: noise and steps of the positions.

@@ -146,7 +146,10 @@ class Starting:
         self._acting = torque.copy()
 
     def check_support(self, measurement: Vector) -> None:
-        """Refuse to start if nothing shows what holds a live arm."""
+        """Refuse to start if it is unknown what holds a live arm.
+
+        `measurement` is [q, dq, effort] (3 n,).
+        """
         command = self._command
         if not command.commanding:
             try:
@@ -155,7 +158,7 @@ class Starting:
                 self.refuse(error)
 
     def refuse(self, error: StartError | MotionError) -> None:
-        """Stop before the start, for a reason."""
+        """Stop before the start, because of an error."""
         self.error = error
         self._command.stop(Reason.START_REJECTED, str(error))
 
@@ -165,9 +168,9 @@ class Starting:
         self._command.states.restart()
 
     def start(self, reading: Reading) -> bool:
-        """Resume the running reference if possible, otherwise start at t = 0.
+        """Take command: resume the running reference if possible, else start at t = 0.
 
-        Return whether the law is in command from this state on.
+        Return whether the law is in command from this state on; else `error` says why not.
         """
         command, law = self._command, self._command.controller
         reference, config = command.reference, command.config
@@ -182,7 +185,9 @@ class Starting:
                 motion = reference.plan_start(config, reading, again=again)
             law.reference_vector = motion.vector
             self._begin_elsewhere(reading.q)
-            self._begin_at_acting(reading.q)
+            if self._acting is not None:
+                self._begin_with_load(command.held.load_of(self._acting, reading.q))
+                law.take_over(self._acting, reading.q)
             if self._load is not None:
                 self._begin_with_load(self._load)
             if commanded is None:
@@ -237,13 +242,6 @@ class Starting:
             and (np.abs(q - last_position) > law.bound_at(0.0)).any()
         ):
             law.begin(Start.ELSEWHERE)
-
-    def _begin_at_acting(self, q: Vector) -> None:
-        """Let the law begin with the torque that another node holds the arm by, if any."""
-        if self._acting is None:
-            return
-        self._begin_with_load(self._command.held.load_of(self._acting, q))
-        self._command.controller.take_over(self._acting, q)
 
     def _begin_with_load(self, load: Vector) -> None:
         """Let d^3 begin with a load (n,) [N m]."""

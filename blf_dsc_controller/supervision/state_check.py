@@ -22,7 +22,7 @@ Vector = NDArray[np.float64]
 _PUBLISHER_PERIOD = 0.015  # s: joint_state_publisher has 10 Hz by default, Franka's 30
 # states in a row with the stamp of the one before that are ignored
 _IGNORED_REPEATS = 3
-_CLOCK_MOTION = 0.02  # rad/s: a slower motion shows no time
+_CLOCK_MOTION = 0.02  # rad/s: a slower motion does not measure time
 _CLOCK_RATIO = 0.5  # of the time by the stamps
 _CLOCK_SPEED_RATIO = 0.5  # of the speed: an arm whose clock was set keeps its own
 _MISSED_TIME = 1.0  # s, over which missed states are averaged
@@ -35,7 +35,7 @@ _NO_VELOCITY = 'if the hardware measures none, set safety.velocity to estimated'
 
 
 def rate_mismatch(period: float, sample_time: float) -> str:
-    """Return what to do about joint states that come every `period` [s]."""
+    """Return what to do about joint states every `period` [s] instead of `sample_time` [s]."""
     received = f'joint states come every {period:.3g} s, but sample_time is {sample_time:g} s: '
     if period > _PUBLISHER_PERIOD and sample_time < _PUBLISHER_PERIOD:
         return (
@@ -136,6 +136,7 @@ class StateCheck:
         return self._repeats <= _IGNORED_REPEATS
 
     def _check_repeats(self) -> Fault:
+        """Return SKIP for one of a few states with the stamp of the one before, else the fault."""
         if self.ignores(is_copy=True):
             return SKIP
         text = (
@@ -145,6 +146,7 @@ class StateCheck:
         return Fault(Reason.STAMP_REPEATED, text)
 
     def _count_missed(self, safety: Safety, missed: int) -> Fault | None:
+        """Average the fraction of missed states; return the fault if it is too large."""
         retained = 1.0 - min(1.0, self._sample_time / _MISSED_TIME)
         self.missed += missed
         self.missed_fraction *= retained
@@ -244,8 +246,8 @@ class StateCheck:
     def braked(self, asked: float, joint: int, motion: Motion, speeds: Vector) -> Fault:
         """Return the fault of a law that has asked for too much for so long [s].
 
-        `joint` was braked most; `speeds` (2, n) [rad/s] are the highest that are allowed
-        downwards and upwards.
+        `joint` was braked most, in this `motion`; `speeds` (2, n) [rad/s] are the highest that are
+        allowed downwards and upwards.
         """
         unit = self._units[joint].of('rad/s')
         down, up = speeds[:, joint]

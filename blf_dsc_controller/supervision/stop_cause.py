@@ -21,7 +21,7 @@ _SATURATED = 0.05  # s: brakes that close in motion leave the bound sooner
 
 
 def chatter_of(controller: Controller, config: ControllerConfig) -> str:
-    """Return what to do about a torque that changes in each sample; empty if it does not."""
+    """Return what to do about a torque that changes much in each sample; empty if it does not."""
     checks = controller.checks
     limit = controller.settings.torque.limit
     steps = np.sqrt(checks.effect.chatter)
@@ -45,7 +45,7 @@ def chatter_of(controller: Controller, config: ControllerConfig) -> str:
 
 
 class StopCause:
-    """Finds why an arm may be about to stop."""
+    """Finds the cause of a stop that is about to follow."""
 
     def __init__(
         self,
@@ -95,6 +95,6 @@ class StopCause:
                 'tolerates, or lower the gains'
             )
         remedies = 'follow a slower reference, carry less, or give the true limit as torque.limit'
-        if self._controller.checks.effect.compares[0] == 0.0:  # no effort shows it
+        if self._controller.checks.effect.compares[0] == 0.0:  # no effort proves it
             remedies += '; a drive that gives less than it is sent demands more, too'
         return f'{demands}: {remedies}'

@@ -55,9 +55,9 @@ class Reason(str, Enum):
 class Doubtful(Flag):
     """What was not in order before a stop, so that the torque without the law rests on less."""
 
-    MOTION = auto()  # the last motion of the law: it shows no load
+    MOTION = auto()  # the last motion of the law: no load follows from it
     ESTIMATES = auto()  # those since the error grew, which have wound up
-    EFFECT = auto()  # that commands reach the arm: it has to show that first
+    EFFECT = auto()  # that commands reach the arm: its motion has to prove that first
 
 
 DOUBTFUL: dict[Reason, Doubtful] = {

@@ -34,7 +34,7 @@ class TorqueWatchdog:
     said that its silence is meant (`stand_down`).  While it commands, nothing else may hold
     the arm, so only a torque of the controller ends that.
 
-    The gravity is that of the initial estimate, and what it lacks (a payload, say) is
+    The gravity is that of the initial estimate, and what is missing in it (a payload, say) is
     observed from the motion and the controller's torques all along, as in a safe stop.
 
     Attributes:
@@ -201,6 +201,7 @@ class TorqueWatchdog:
         self._commanded_at = inf
 
     def _take_over_if_silent(self, now: float) -> None:
+        """Begin to command if the controller is silent at this time [s] but joint states go on."""
         silence = now - self._commanded_at
         state_progress = (self.stamp - self._commanded_stamp) * 1e-9
         is_silent = silence > self._timeout and state_progress > 0.5 * self._timeout

@@ -42,7 +42,8 @@ class WatchedJournal:
         """Take an event; `is_engaged`: the watchdog or a controller commands."""
         if event.type is EventType.CONFIGURE:
             return self._configure(event, is_engaged=is_engaged)
-        if self._is_of_next(event):
+        is_next = event.number == self._next_number and event.commands == 0
+        if self._next is not None and is_next:
             return self._take_of_next(event)
         if event.type is EventType.PARAMETERS and self.parameters:
             self.parameters = self.parameters | event.content['parameters']
@@ -63,10 +64,6 @@ class WatchedJournal:
             return Meaning.NOTHING
         self.adopt_next()
         return Meaning.BACK
-
-    def _is_of_next(self, event: Event) -> bool:
-        is_next = event.number == self._next_number and event.commands == 0
-        return self._next is not None and is_next
 
     def _take_of_next(self, event: Event) -> Meaning:
         self._next_number += 1
