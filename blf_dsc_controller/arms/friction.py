@@ -10,8 +10,8 @@ Some of friction differs between them on purpose:
   at rest if it were steeper; `identify` only looks back, and has half of that.
 - At a reversal, the contacts of `identification.sliding` yield over a distance first.  The law
   follows the velocity of its reference, which has no memory, and measures each reversal.
-- Load and quadratic friction are `identify`'s alone: they are identifiable in half a minute of motion,
-  not in one window of the learning.
+- Load and quadratic friction are `identify`'s alone: half a minute of motion identifies them, one
+  window of the learning does not.
 - Simulated plants have friction of their own: a truth that is independent of what looks for it.
 """
 

@@ -75,7 +75,7 @@ compile_methods(
 
 
 def regressors_at(model: ArmModel, q: Array, dq: Array, v: Array, a: Array) -> Array:
-    """Return H (k, n, p) of k states (k, n), as in (19): H P = M(q) a + C(q, dq) v + G(q)   [N m]."""
+    """Return H (k, n, p) of (19) at k states (k, n): H P = M(q) a + C(q, dq) v + G(q)   [N m]."""
     H = np.zeros((*q.shape, model.p))
     q, dq, v, a = (np.ascontiguousarray(array) for array in (q, dq, v, a))
     _fill_regressors(model, q, dq, v, a, H)
