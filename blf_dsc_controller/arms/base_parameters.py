@@ -149,7 +149,7 @@ def deviations(J: np.ndarray, relative: float, centre: float) -> np.ndarray:
 
     Columns are directions: one that scales all, three of the centre of mass, six of the spread.
 
-    Arguments:
+    Args:
         J: pseudo-inertia (4, 4) of a body.
         relative: standard deviation of mass and spread, relative to them.
         centre: standard deviation of the centre of mass [m].

@@ -58,7 +58,7 @@ def project(estimate: Array, rate: Array, gain: Array, radius: float) -> None:
 
     It is removed on and outside the sphere |w| = omega_a, if v points outwards.
 
-    Arguments:
+    Args:
         estimate: P^ (p,), which is w.
         rate: v = P^' (p,) [1/s times the units of P], modified in place.
         gain: diagonal of Gamma (p,).
@@ -84,7 +84,7 @@ def retract(estimate: Array, gain: Array, radius: float) -> None:
     Newton's method on 1 / length finds nu: exact after one step for equal gains, monotone
     otherwise.
 
-    Arguments:
+    Args:
         estimate: P^ (p,), modified in place; unchanged inside the ball, or if not finite.
         gain: diagonal of Gamma (p,).
         radius: omega_a.
@@ -161,7 +161,7 @@ def adapt(
     `workspace.rate` has eps or W eps (m,), and afterwards theta^'.  `workspace.tracked` is left
     with theta^ as the tracking error alone would have advanced it.
 
-    Arguments:
+    Args:
         estimate: theta^ (m,), modified in place and kept in its range [lower, upper].
         H: regressor (n, m) of what is learned.
         xi2: velocity error (n,) [rad/s].

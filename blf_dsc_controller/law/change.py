@@ -120,7 +120,7 @@ def compare_with_rows(
     Rows come each `row_interval` samples, else this returns False.  theta of the rows so far is
     solved for anew ten times a second.
 
-    Arguments:
+    Args:
         row: [X | u] (n, m + 1).
         square_weight: mean square weight of the row's joints, w^2 of `innovation`.
         unmodelled: mean square torque of a joint that no column describes [(N m)^2].

@@ -30,7 +30,7 @@ QUIET, EXPLAINED, TOUCHED = range(3)
 class Settings(NamedTuple):
     """The parameters `contact.*`, but for the bandwidth of r."""
 
-    enabled: int  # 1: r is found, and whether it is a contact
+    enabled: int  # 1: r is computed, and contacts are detected
     threshold: float  # h
     loads: int  # 1: what a load in the tip explains is not a contact
     freezes: int  # 1: nothing is learned while something touches the arm
@@ -209,7 +209,7 @@ def next_phase(
 ) -> int:
     """Return the phase that follows: QUIET, EXPLAINED or TOUCHED.
 
-    Arguments:
+    Args:
         phase: the phase so far.
         distance: of r from zero, in standard deviations.
         remaining: of r from what a load explains.

@@ -195,7 +195,7 @@ class Controller:
 
     @property
     def can_tare(self) -> bool:
-        """Whether the external torque is found, and the arm has rested for long enough."""
+        """Whether the external torque is computed, and the arm has rested for long enough."""
         if not self.settings.contact.enabled:
             return False
         return bool(self.state.external.resting[0] >= self.tare_rest)

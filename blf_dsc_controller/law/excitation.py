@@ -235,7 +235,7 @@ def accept_window(
     A window that is not full, or has an unusually large residual, is pulled to the anchor:
     Phi + a R, b + a R theta_anchor, in the workspace of the window.
 
-    Arguments:
+    Args:
         sliding: the window, whose workspace has Phi, b and their factor.
         prior: P^(0) and R.
         q: position (n,) [rad] at which the inertia must be positive definite.
@@ -381,7 +381,7 @@ def update_excitation(
 ) -> None:
     """Compute lambda_min of the window; once it has settled, latch it if it suffices, by (27).
 
-    Arguments:
+    Args:
         prior: P^(0) and R, in whose metric the eigenvalue is.
         model: the arm, whose inertia the solution must keep positive.
         q: position (n,) [rad] at time t [s].

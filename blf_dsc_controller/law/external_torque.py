@@ -226,7 +226,7 @@ def residual_variance(
 def tare(state: State, changes: float) -> None:
     """Take r for zero from now on: the arm rests, and nothing touches it.
 
-    `changes` is how many changes of the arm have been found so far; the next one ends the tare.
+    `changes` is how many changes of the arm have been detected so far; the next one ends the tare.
     """
     state.tared[0] = 1.0
     state.tare_changes[0] = changes

@@ -41,7 +41,7 @@ CORRELATION = 0.2  # s, of the residual
 REFRESH = 0.1  # s, from one solution to the next
 LASTING = 2.0  # s, in which a floor of s^2 falls to 1 / e
 MEMORY = 0.1  # s of motion, over which the last rows are averaged
-DETECTION_TIME = 0.15  # s, by which a change of the arm is found
+DETECTION_TIME = 0.15  # s, within which a change of the arm is detected
 # times s^2: friction is no noise, and reaches what the noise of a sensor never would
 _ALARM_SQUARE = 8.0
 # s^2 before any row, of the square of the torque that is unmodelled; counts as so many
@@ -109,7 +109,7 @@ def normalized_square(
 ) -> float:
     """Return e^T C^-1 e / n [(N m)^2] of a row, the mean square of its normalized innovation.
 
-    Arguments:
+    Args:
         X: row (n, m), overwritten.
         e: innovation (n,) [N m], overwritten.
         factor: Cholesky factor of A (m, m).
@@ -141,7 +141,7 @@ def update(
 ) -> bool:
     """Add a row with its normalized square [(N m)^2]; return whether the arm has changed.
 
-    Arguments:
+    Args:
         square: e^T C^-1 e / n of the row.
         square_weight: w^2 of the row.
         unmodelled: mean square torque that no column describes [(N m)^2].

@@ -14,7 +14,7 @@ Everything that a law keeps from one sample to the next is in `State`, so that a
 controller is saved, restored, replayed and compared as one vector.  A law of a file
 keeps its values in `state.memory`, whose parts `MEMORY` of the file names; they are
 zero at the start.  One that calls `learning.observe` and `learning.adapt` says so by
-`learns = True`: its estimate is that of latched windows, so that contacts can be found.
+`learns = True`: its estimate is that of latched windows, so that contacts can be detected.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def keep_consistent(
 ) -> None:
     """Keep the same as those from before the error grew: of the smallest recent error.
 
-    Arguments:
+    Args:
         ratio: largest |xi1| / k of the sample.
         is_sound: the arm does not oscillate, and r of `load_observer` is not in doubt.
         begins: it is the first sample.

@@ -164,7 +164,7 @@ def load_torque(settings: Settings, state: State, i: int, observed: float) -> fl
 def take_over(
     settings: Settings, state: State, i: int, observed: float, observed_before: float
 ) -> None:
-    """Raise the limit of r by what is learned no longer.
+    """Raise the limit of |r| by the torque that is learned no longer.
 
     `observed` [N m] is the torque beyond the model and the bias, and `observed_before` [N m] the
     same with the estimate of before.

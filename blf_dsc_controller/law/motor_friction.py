@@ -38,7 +38,7 @@ _EMPTY_ROWS = 0.1  # of that: rows of zeros before the first
 class Settings(NamedTuple):
     """Which rows are used, and the smallest weight of the prior."""
 
-    size: int  # entries of theta that are found: P, and columns before those of Coulomb friction
+    size: int  # entries of theta that are solved for: P, and columns before those of Coulomb friction
     filter_pole: float  # of both poles of a row, rad/s
     length: int  # rows in a window
     period: float  # T, s
@@ -117,7 +117,7 @@ def row_friction(
 ) -> float:
     """Return g - D d_0 of joint i [N m], the friction in a weighted `row` [X | D | u] (n, m + 1).
 
-    Arguments:
+    Args:
         weight: by which the row of the joint is multiplied.
         rotors: P_r (p,).
         initial: theta (m,) with d_0.

@@ -102,7 +102,7 @@ def watch(
 ) -> None:
     """Update the half waves by the errors and torques of the last interval, `dt` [s].
 
-    Arguments:
+    Args:
         limit: torque limit (n,) [N m].
         error: e (n,) [rad].
         torque: tau (n,) [N m].
@@ -236,7 +236,7 @@ def end_half_wave(
 ) -> None:
     """Count the half wave of joint i that has ended if it is one of an oscillation.
 
-    Arguments:
+    Args:
         travel: its height in p [rad].
         is_clear: it is larger than noise and steps of the sensor.
         strong: smallest amplitude of its torque [N m].

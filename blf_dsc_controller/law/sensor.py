@@ -105,7 +105,7 @@ def compare_velocities(
 ) -> bool:
     """Update with a reading [q, dq, ...]; return whether a velocity contradicts the positions.
 
-    Arguments:
+    Args:
         half_waves: oscillation of the joints: a lag explains more of a fast one.
         sample_time: usual time between readings [s].
         dt: time since the last reading [s].

@@ -58,7 +58,7 @@ def virtual_control(
     sinc.  Its barrier part falls to zero at the bound, where only mu acts; beyond, it would change
     sign and is set to zero.
 
-    Arguments:
+    Args:
         xi1: error [rad].
         bound: k(t) [rad].
         barrier_gain: K [1/s].

@@ -145,7 +145,7 @@ def saturate(
 
     `workspace.cuts` says which limit cut it.
 
-    Arguments:
+    Args:
         last: last command (n,) [N m].
         has_last: whether there is one, `dt` [s] ago; else the rate is not limited.
     """
