@@ -59,7 +59,7 @@ def test_load_is_that_of_joint_least_squares_with_all_priors():
     grown = 5.0 / 20.0  # of the variance of changed friction
     state.complete[0], state.age[0], state.innovation.noise[0] = 1.0, 5.0, 0.04**2
     payload.solve(SETTINGS, state, work, PRIOR, period)
-    payload.describe(SETTINGS, state, work, period)
+    payload.fill_estimate(SETTINGS, state, work, period)
 
     H = np.eye(K + SINCE)
     H[:M, :M] = PRIOR.information

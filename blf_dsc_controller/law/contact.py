@@ -80,7 +80,7 @@ def is_touched(state: State) -> bool:
 
 
 @inner
-def absorb(
+def kalman_update(
     columns: Array,
     e: Array,
     noise: float,
@@ -160,7 +160,7 @@ def filter_load(state: State, workspace: Workspace, white: Array, dt: float) -> 
             prior = 1.0 if a == b else 0.0
             state.load_covariance[a, b] += gain * (prior - state.load_covariance[a, b])
             workspace.load_covariance[a, b] = state.load_covariance[a, b]
-    square = absorb(
+    square = kalman_update(
         workspace.columns,
         white,
         1.0,
@@ -168,7 +168,7 @@ def filter_load(state: State, workspace: Workspace, white: Array, dt: float) -> 
         workspace.load_covariance,
         workspace.gain,
     )
-    absorb(
+    kalman_update(
         workspace.columns,
         white,
         _CORRELATION_TIME / dt,

@@ -38,7 +38,7 @@ _EMPTY_ROWS = 0.1  # of that: rows of zeros before the first
 class Settings(NamedTuple):
     """Which rows are used, and the smallest weight of the prior."""
 
-    size: int  # entries of theta that are solved for: P, and columns before those of Coulomb friction
+    size: int  # entries of theta to solve for: P, and columns before those of Coulomb friction
     filter_pole: float  # of both poles of a row, rad/s
     length: int  # rows in a window
     period: float  # T, s

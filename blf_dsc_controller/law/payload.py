@@ -188,7 +188,7 @@ def refresh(
     if rows % max(1, round(innovation.REFRESH / period)) == 0:
         solve(settings, state, workspace, prior, period)
         if not is_first(state):
-            describe(settings, state, workspace, period)
+            fill_estimate(settings, state, workspace, period)
 
 
 @inner
@@ -335,7 +335,7 @@ def end_part(
     if not is_first(state):
         move_rows(state, OLDER, NEWER)
         if state.rows[NEWER] >= fewest:
-            compare_with_nothing(settings, state, workspace, prior, period)
+            compare_with_empty(settings, state, workspace, prior, period)
         discard(state, OLDER)
     elif state.rows[BEFORE] >= fewest:
         state.complete[0] = 1.0
@@ -348,7 +348,7 @@ def end_part(
 
 
 @inner
-def compare_with_nothing(
+def compare_with_empty(
     settings: Settings, state: State, workspace: Workspace, prior: Prior, period: float
 ) -> None:
     """Take the newer rows for those of an empty tip if it held nothing, or less than before.
@@ -356,7 +356,7 @@ def compare_with_nothing(
     Nothing: a mass within 2 deviations of zero.  Less: a mass below minus 4 deviations.
     """
     solve(settings, state, workspace, prior, period)
-    describe(settings, state, workspace, period)
+    fill_estimate(settings, state, workspace, period)
     mass = state.load[MASS]
     deviation = state.load[DEVIATION]
     is_full = state.rows[BEFORE] >= settings.window
@@ -491,7 +491,7 @@ def solve(
 
 
 @inner
-def describe(
+def fill_estimate(
     settings: Settings, state: State, workspace: Workspace, period: float
 ) -> None:
     """Write mass and centre of the load to `state.load`, and their standard deviations.

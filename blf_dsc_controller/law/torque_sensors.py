@@ -53,7 +53,7 @@ class State(NamedTuple):
     joint: Cell  # that has it
     # N m, of the last interval behind L: the torque commanded
     command: Annotated[Array, 'n * observer.enabled']
-    lasted: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
+    off_time: Annotated[Array, 'n * observer.enabled']  # s, since efforts are off
     oscillation: oscillation.State  # of r
 
 
@@ -62,7 +62,7 @@ class Workspace(NamedTuple):
 
     # N m, efforts less commands
     differences: Annotated[Array, 'n * observer.enabled']
-    clear: Annotated[Array, 'n * observer.enabled']  # N m, of a wave of r
+    threshold: Annotated[Array, 'n * observer.enabled']  # N m, of a wave of r
     zeros: Annotated[Array, 'n * observer.enabled']
 
 
@@ -102,14 +102,14 @@ def watch_oscillation(
     `torque` is r (n,) [N m], `limit` (n,) [N m] the torque limit.
     """
     for i in range(torque.size):
-        workspace.clear[i] = _OSCILLATION_TORQUE * limit[i]
+        workspace.threshold[i] = _OSCILLATION_TORQUE * limit[i]
     oscillation.watch(
         state.oscillation,
         workspace.zeros,
         torque,
         torque,
         workspace.zeros,
-        workspace.clear,
+        workspace.threshold,
         dt,
     )
     for i in range(torque.size):
@@ -120,7 +120,7 @@ def watch_oscillation(
 @inner
 def leave_out_oscillating(state: State, arm: oscillation.State) -> None:
     """Leave r out for good if the `arm` oscillates."""
-    for i in range(state.lasted.size):
+    for i in range(state.off_time.size):
         if oscillation.oscillates(arm, i):
             note_fault(state, OSCILLATING, i)
 
@@ -143,8 +143,8 @@ def watch_following(
     for i in range(limit.size):
         differs = abs(workspace.differences[i]) > _OFF_TORQUE * limit[i]
         is_off = is_off or differs
-        state.lasted[i] = state.lasted[i] + dt if differs and follows else 0.0
-        if state.lasted[i] > _OFF_TIME:
+        state.off_time[i] = state.off_time[i] + dt if differs and follows else 0.0
+        if state.off_time[i] > _OFF_TIME:
             note_fault(state, OFF, i)
     return is_off
 
