@@ -93,7 +93,7 @@ def check_error(
 
 @inner
 def may_oscillate(checks: Checks) -> bool:
-    """Whether a joint may oscillate: it has shown two half waves in a row or more."""
+    """Whether a joint may oscillate: it has made two half waves in a row or more."""
     is_any = False
     for i in range(checks.oscillation.waves.size):
         is_any = is_any or checks.oscillation.waves[i] >= oscillation.SOME

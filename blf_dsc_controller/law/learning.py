@@ -215,7 +215,7 @@ def detect_change(
 
     Somebody may also have announced it; then nothing that was learned before is in doubt.  If the
     window was latched before it was full, the estimate returns to the one before;
-    of friction, only what reversals have shown of late is taken back.
+    of friction, only the evidence of the last reversals is taken back.
     """
     excitation_settings, latch, row = settings.excitation, state.latch, signals.row.Xu
     sliding = Window(settings.window, state.window, signals.scratch.window)

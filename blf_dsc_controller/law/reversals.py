@@ -109,9 +109,9 @@ def begin(settings: Settings, state: State) -> None:
 
 
 @inner
-def beyond(x: float, band: float) -> float:
+def beyond(x: float, dead_zone: float) -> float:
     """Return z(x), by how much x is outside of [-band, band]."""
-    return x - clip(x, -band, band)
+    return x - clip(x, -dead_zone, dead_zone)
 
 
 @inner
