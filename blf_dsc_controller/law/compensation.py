@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array
-from blf_dsc_controller.law import columns, feedback, friction
+from blf_dsc_controller.law import columns, friction
 from blf_dsc_controller.law.state import Settings, Signals, State
 
 
@@ -43,9 +43,10 @@ def fill_model(settings: Settings, state: State, signals: Signals) -> None:
     v, a = state.alpha2, signals.dalpha2
     if gains.decoupled == 1:
         v, a = signals.dqr, signals.ddqr
-    feedback.fill_acceleration(
-        gains, signals.feedback, a, signals.xi2, settings.joint_inertia
-    )
+    for i in range(settings.n):
+        a_f[i] = a[i] - gains.damping_rate * signals.xi2[i]
+        if gains.follows_inertia == 1:
+            a_f[i] += signals.feedback.restoring[i] / settings.joint_inertia[i]
     settings.model.regressors(signals.q, signals.dq, v, a_f, H, row.Yp, row.Yr)
     for i in range(settings.n):
         signals.model_torque[i] = 0.0

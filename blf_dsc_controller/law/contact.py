@@ -90,8 +90,8 @@ def kalman_update(
 ) -> float:
     """Update z (k,) and its covariance (k, k) by e = columns z + white noise of variance `noise`.
 
-    A Kalman filter whose entries of e (n,) come one after the other.  `columns` is (n, k), `work` (k,)
-    scratch.  Returns the sum of the squared innovations, each over its variance.
+    A Kalman filter whose entries of e (n,) come one after the other.  `columns` is (n, k),
+    `workspace` (k,) scratch.  Returns the sum of the squared innovations, each over its variance.
     """
     size = z.size
     square = 0.0

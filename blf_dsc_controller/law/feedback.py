@@ -74,18 +74,3 @@ def joint_torque(
     torque = settings.gain[i] * damped
     torque += robust * clip(xi2 / layer, -1.0, 1.0)
     return float(-torque)
-
-
-@inner
-def fill_acceleration(
-    settings: Settings, workspace: Workspace, wanted: Array, xi2: Array, inertia: Array
-) -> None:
-    """Compute a_f (n,) [rad/s^2] from the acceleration a (n,) that is `wanted`, as above.
-
-    `inertia` is m (n,) [kg m^2].
-    """
-    out = workspace.acceleration
-    for i in range(xi2.size):
-        out[i] = wanted[i] - settings.damping_rate * xi2[i]
-        if settings.follows_inertia == 1:
-            out[i] += workspace.restoring[i] / inertia[i]

@@ -17,8 +17,8 @@ The rows before are those of the first window, or of less if they contradict eac
 estimated, too.  Where later rows contradict the solution, something else is held.  If
 what was held until then is clearly less than nothing, the arm held a load before: what
 is lightest is taken for nothing.  If it was nothing, its rows are added to those before
-until they make a window.  Rows are kept apart for `innovation.DETECTION_TIME`, and then once more, so
-that those of a change that has not been detected yet can be discarded.
+until they make a window.  Rows are kept apart for `innovation.DETECTION_TIME`, and then
+once more, so that those of a change that has not been detected yet can be discarded.
 
 Rows of slow joints count little, since they may stick.  Friction must not be taken for a load,
 nor a load for friction.  What the columns of theta do not describe of it are unknowns, too, each
