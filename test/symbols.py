@@ -22,7 +22,7 @@ _PARTS = {
         'excitation_threshold=sigma learning_start change_detection starts_full '
         'residual_floor'
     ),
-    'adaptation': 'weight=kappa radius adaptation_gain=Gamma variance least most',
+    'adaptation': 'weight=kappa radius adaptation_gain=Gamma variance lower=least upper=most',
 }
 _FIELDS = {
     symbol or field: (part, field)
