@@ -55,6 +55,7 @@ def for_law(
 
 @functools.cache
 def _compiled_with(compiled: Callable[..., Any], law: type) -> Callable[..., Any]:
+    """Return a kernel compiled with a law as the type of its first argument."""
     mine = kernel(getattr(compiled, 'py_func', compiled), law)
     tell_mistakes(mine, law)
     return mine

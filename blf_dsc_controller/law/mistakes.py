@@ -95,6 +95,7 @@ def _line_of(source: ast.Module, is_it: Callable[[ast.AST], bool]) -> int | None
 
 
 def _line_with(source: ast.Module, name: str) -> int | None:
+    """Return the first line in a function that has a name or an attribute."""
     return _line_of(
         source,
         lambda node: name in (getattr(node, 'id', ''), getattr(node, 'attr', '')),
@@ -104,6 +105,7 @@ def _line_with(source: ast.Module, name: str) -> int | None:
 def _unknown_attribute(
     law: type, _source: ast.Module, match: re.Match[str]
 ) -> _Mistake:
+    """Say which attribute of an argument, the law or an array does not exist."""
     name, owner = match.groups()
     memory = getattr(sys.modules[law.__module__], 'MEMORY', None)
     layouts = _ARGUMENTS | ({'memory': memory} if memory else {})
@@ -123,6 +125,7 @@ def _unknown_attribute(
 
 
 def _unknown_gain(law: type, name: str) -> str:
+    """Say what may be meant by `self.name`, which is no gain of the law."""
     near = get_close_matches(name, getattr(law, '_fields', ()), 1)
     if near:
         return f'{law.__name__} has no gain {name}: did you mean self.{near[0]}?'
@@ -137,6 +140,7 @@ def _unknown_gain(law: type, name: str) -> str:
 
 
 def _unknown_field(argument: str, layout: type, name: str) -> str:
+    """Say what may be meant by a field that an argument does not have."""
     for other, fields in _ARGUMENTS.items():
         if name in getattr(fields, '_fields', ()):
             return f'{argument} has no {name}: it is {other}.{name}'
@@ -147,6 +151,7 @@ def _unknown_field(argument: str, layout: type, name: str) -> str:
 
 
 def _undefined(law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
+    """Say of a name that is not defined whether it is a gain."""
     name = match[1]
     is_gain = name in getattr(law, '_fields', ())
     remedy = f'write self.{name}' if is_gain else 'define it at the top, or import it'
@@ -154,6 +159,7 @@ def _undefined(law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
 
 
 def _uncompiled(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
+    """Say of a function or an object of Python that kernels cannot use it."""
     name, kind = match.groups()
     if kind == 'function':
         return (
@@ -164,6 +170,7 @@ def _uncompiled(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mista
 
 
 def _impossible(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
+    """Say of an expression that its shapes or types do not fit."""
     call = ' '.join(match[1].split())
     return (
         f'{call}: these shapes or types do not fit: compute entry by entry, with [i]',
@@ -172,6 +179,7 @@ def _impossible(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mista
 
 
 def _allocates(_law: type, source: ast.Module, _match: re.Match[str]) -> _Mistake:
+    """Say that a law creates an array, a list or a dictionary."""
     line = _line_of(source, lambda node: isinstance(node, _CREATES))
     return (
         'a law must not create arrays or lists, as numpy and expressions of arrays do: compute '
@@ -180,6 +188,7 @@ def _allocates(_law: type, source: ast.Module, _match: re.Match[str]) -> _Mistak
 
 
 def _set(_law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
+    """Say of an assigned attribute that only entries of arrays can be written."""
     name = match[1]
     line = _line_of(
         source,
@@ -196,6 +205,7 @@ def _set(_law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
 
 
 def _memory(_law: type, _source: ast.Module, _match: re.Match[str]) -> _Mistake:
+    """Say when `memory_of` takes the settings."""
     return (
         "memory_of takes settings only where MEMORY has a length of the arm, such as 'n': with "
         'cells alone, write memory_of(state.memory)'
@@ -203,10 +213,12 @@ def _memory(_law: type, _source: ast.Module, _match: re.Match[str]) -> _Mistake:
 
 
 def _not_in_module(_law: type, source: ast.Module, match: re.Match[str]) -> _Mistake:
+    """Say of a module that it does not have a name."""
     return f'{match[1]} has no {match[2]}', _line_with(source, match[2])
 
 
 def _other(_law: type, _source: ast.Module, match: re.Match[str]) -> _Mistake:
+    """Say what else numba reports."""
     return f'it cannot be compiled: {match[1].strip()}', None
 
 

@@ -55,6 +55,7 @@ def keep(start: Start, before: State, state: State) -> None:
 
 
 def _copy(before: object, target: object) -> None:
+    """Copy the arrays of a part of the state, and of the parts in it."""
     if isinstance(before, tuple) and isinstance(target, tuple):
         for source, destination in zip(before, target, strict=True):
             _copy(source, destination)

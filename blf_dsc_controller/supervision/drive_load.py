@@ -78,6 +78,7 @@ class DriveLoads:
         self._requested = load
 
     def _begin_use(self) -> None:
+        """Use the load from now on; raise BlfDscError if the drives add no weight."""
         if self._robot.drive_compensates == 'none':
             raise BlfDscError(
                 'robot.drive_compensates: got none: these drives add no weight, so no load '

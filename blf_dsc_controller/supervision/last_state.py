@@ -132,6 +132,7 @@ class LastState:
         self.age += period
 
     def _forget_motion(self) -> None:
+        """Take the motion for unknown: v and dq are zero until the next state."""
         if self._known is None:
             self._known = self.dq.copy()
         self.dq[:] = self.slow[:] = 0.0

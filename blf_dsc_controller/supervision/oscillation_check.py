@@ -134,6 +134,7 @@ class OscillationCheck:
 
     @property
     def _remedy(self) -> str:
+        """What to do about an oscillation: which gains to lower, or what may be wrong."""
         config = self._config
         too_stiff = 'the gains are too high for this arm or its base'
         if config.observes_load and fault_of(self._controller) == NONE:

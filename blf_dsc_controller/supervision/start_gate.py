@@ -68,6 +68,7 @@ class StartGate:
         return self.state
 
     def _decide(self) -> None:
+        """Open or refuse by the measured intervals: another rate by a factor of 1.5 is refused."""
         often, period = 1e-9 * np.quantile(np.diff(self._stamps), _TYPICAL)
         T = self._sample_time
         self.state = GateState.OPEN

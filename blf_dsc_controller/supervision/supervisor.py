@@ -124,6 +124,7 @@ class Supervisor:
         self._set(self.phase, self.reason, '; '.join(filter(None, (self.text, text))))
 
     def _set(self, phase: Phase, reason: Reason, text: str) -> None:
+        """Set phase, reason and text, and what follows from them."""
         self.phase = phase
         self.reason = reason
         self.text = text

@@ -58,6 +58,7 @@ class WatchedJournal:
             self._next = None
 
     def _configure(self, event: Event, *, is_engaged: bool) -> Meaning:
+        """Keep the parameters of a new controller; adopt them unless another commands."""
         self._next = event.content['parameters']
         self._next_number = event.number + 1
         if is_engaged:
@@ -66,6 +67,7 @@ class WatchedJournal:
         return Meaning.BACK
 
     def _take_of_next(self, event: Event) -> Meaning:
+        """Take an event of the controller that has not started yet."""
         self._next_number += 1
         if event.type is EventType.START:
             self.adopt_next()
