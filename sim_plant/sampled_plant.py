@@ -56,6 +56,7 @@ class Plant:
         self._truth = np.zeros(settings.p + 3 * self.joints)
         self._seed = seed
         self._noise = np.zeros(4 * self.joints)
+        self._drawn = drawn(self._settings)
         self.rng = generator(seed)
         if settings.springs > 0:
             self._now.acting.sample[0] = -1.0
@@ -119,7 +120,7 @@ class Plant:
     def measure(self) -> np.ndarray:
         """Return [q, dq, effort] (3n,) of this sample, overwritten by the next call."""
         if is_due(self._settings, self._now):
-            self.rng.standard_normal(out=self._noise[drawn(self._settings)])
+            self.rng.standard_normal(out=self._noise[self._drawn])
         self._run(*self._arguments(OBSERVE, self._truth))
         return self._measurement
 
@@ -132,6 +133,7 @@ class Plant:
         self.arm = settings.arm
         self.settings = pack(settings)
         self._settings, self._now = plant_views(self.arm, self.settings, self.state)
+        self._drawn = drawn(self._settings)
         self._now.acting.sample[0] = -1.0
 
     def truth(self) -> np.ndarray:

@@ -75,6 +75,28 @@ def test_same_pose_without_velocities_beside_the_arm_does_not_throw_it():
     assert record.speed[-1].max() < 0.1
 
 
+class Late:
+    """States that arrive some samples late, from the first one on that it gets."""
+
+    def __init__(self, samples):
+        self._waiting = []
+        self._samples = samples
+
+    def __call__(self, state):
+        self._waiting.append(state)
+        return [self._waiting.pop(0)] if len(self._waiting) > self._samples else []
+
+
+@pytest.mark.parametrize(('preset', 'samples'), [('fr3', 40), ('panda', 20)])
+def test_stop_by_states_that_come_late_brakes_the_arm(preset, samples):
+    """The law cannot hold it, and the damping of its stop kept it moving at up to 5 rad/s."""
+    arm = Scenario(preset, {'safety.torque': 'hold_gravity'})
+    arm.run(1.5)
+    record = arm.run(3.5, spoil=Late(samples))
+    assert record.stop < 1000
+    assert record.speed[-1].max() < 0.3
+
+
 def test_states_of_another_are_named():
     arm, _, _ = played('fr3', Play('of another', 0.5, 3, 5, 1), moves=False)
     assert arm.controller.phase is blf.Phase.SAFE_STOP

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.arms.model import ArmModel, inertia_matrices, regressors_at
 from blf_dsc_controller.numerics.algebra import inverse, product
+from blf_dsc_controller.supervision.comparison import limit_torque
 from blf_dsc_controller.supervision.observed_load import OBSERVER, ObservedLoad
 
 Array = NDArray[np.float64]
@@ -78,14 +79,14 @@ class Motion(NamedTuple):
 def limited(torque: Array, last: Array | None, limit: Array, step: Array) -> Array:
     """Return a torque (n,) [N m], finite, within its `limit` and a `step` from the `last` (n,).
 
-    Instead of one that is not finite the last one stays, and zero without any.  The level
-    takes precedence, for example if it is lowered below the last torque.
+    Instead of one that is not finite the last one stays, and zero without any: see
+    `limit_torque`.
     """
-    if not np.isfinite(torque).all():
-        torque = np.zeros(limit.size) if last is None else last
-    if last is not None:
-        torque = _between(last - step, torque, last + step)
-    return _between(-limit, torque, limit)
+    leaves = np.array(torque)
+    if last is None:
+        last, step = np.zeros(torque.size), np.full(torque.size, np.inf)
+    limit_torque(leaves, last, limit, step)
+    return leaves
 
 
 class Envelope:
@@ -123,8 +124,6 @@ class Envelope:
         `estimate` (p,) is of the parameters of the model, `dt` [s] the time since the last one.
         """
         self._asking = max(0, self._asking - 1)
-        if not self.body.brakes:
-            return whole
         still = self._at_rest_or_moving(now.q, now.dq, estimate)
         (M,) = inertia_matrices(
             self.body.model, self.body.parameters, now.q[np.newaxis]

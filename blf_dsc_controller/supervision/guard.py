@@ -178,16 +178,22 @@ class Guard(InCommand):
         Return the fault of a law that has asked for more for too long.
         """
         controller, envelope = self.controller, self.envelope
+        fault = self._brake(torque, dt) if envelope.body.brakes else None
+        last = self.hold.commanded if controller.samples > 0 else None
+        limits = envelope.limits
+        controller.replace_torque(limited(torque, last, limits.torque, limits.step))
+        return fault
+
+    def _brake(self, torque: Vector, dt: float) -> Fault | None:
+        """Change the law's torque (n,) [N m] where it makes a joint too fast."""
+        controller, envelope = self.controller, self.envelope
         signals, added = controller.signals, controller.signals.saturation.added
         now = Motion(signals.q, signals.dq, signals.xi1, signals.dqr)
         whole = torque + added
         estimate = self.estimates.estimate[: controller.settings.p]
-        last = self.hold.commanded if controller.samples > 0 else None
         braked = envelope.brake(now, whole, estimate, dt)
-        leaves = torque if braked is whole else braked - added
-        leaves = limited(leaves, last, envelope.limits.torque, envelope.limits.step)
-        if (leaves != torque).any():
-            controller.replace_torque(leaves)
+        if braked is not whole:
+            torque[:] = braked - added
         asking = envelope.asking * self.config.sample_time
         if asking <= LONGEST:
             return None

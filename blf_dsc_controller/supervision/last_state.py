@@ -22,7 +22,9 @@ from blf_dsc_controller.supervision.recent_motion import is_gap
 
 Vector = NDArray[np.float64]
 
-_REMEMBERED_NS = 250_000_000  # ns, for which the next gap may be as long as one before
+_REMEMBERED_NS = (
+    250_000_000  # ns after a gap, for which the next may be as long as one before
+)
 _LONGEST_GAP = 0.25  # s: after a longer one the arm is braked all the same
 
 
@@ -36,8 +38,8 @@ class LastState:
         slow: v (n,) [rad/s], the velocity to damp.
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         age: time without a trusted state [s]; infinite before the first.
-        gap: longest time [s] between two states of the last quarter of a second, in which
-            states were missing, at most 0.25 s; 0 if none were.
+        gap: longest time [s] between two states in which states were missing, at most 0.25 s;
+            0 once none were for a quarter of a second.
         stamp: of the last state [ns]; -1 before the first.
         speed: of each joint (n,) [rad/s], as measured with the law, and beside it as the last
             two positions showed it.
@@ -51,8 +53,7 @@ class LastState:
         self.ddq: Vector | None = None
         self.age = inf
         self.gap = 0.0
-        self._gap_ended = 0  # ns, stamp of the state after it
-        self._resumed = 0  # ns, likewise after the last one
+        self._resumed = 0  # ns, stamp of the state after the last gap
         self.stamp = -1
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
@@ -144,11 +145,10 @@ class LastState:
         `period` [s] is the usual time between two states.
         """
         gap = (stamp - self.stamp) * 1e-9
+        if stamp - self._resumed > _REMEMBERED_NS:
+            self.gap = 0.0
         if gap > LONG_GAP * period:
             self._resumed = stamp
-        if stamp - self._gap_ended > _REMEMBERED_NS:
-            self.gap = 0.0
-        if self.stamp >= 0 and gap > max(self.gap, LONG_GAP * period):
-            self.gap = min(gap, _LONGEST_GAP)
-            self._gap_ended = stamp
+            if self.stamp >= 0:
+                self.gap = max(self.gap, min(gap, _LONGEST_GAP))
         self.stamp = stamp

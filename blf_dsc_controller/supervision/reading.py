@@ -24,6 +24,14 @@ from blf_dsc_controller.law.repeats import BRIDGED
 from blf_dsc_controller.law.sensor import State as Sensor
 from blf_dsc_controller.law.sensor import restart
 from blf_dsc_controller.run import NANOSECOND
+from blf_dsc_controller.supervision.comparison import (
+    FAR,
+    MOVES,
+    NEW,
+    NOT_FINITE,
+    OUT_OF_REACH,
+    compare_state,
+)
 from blf_dsc_controller.supervision.last_state import LastState
 from blf_dsc_controller.supervision.recent_motion import is_gap
 from blf_dsc_controller.supervision.supervisor import Fault
@@ -37,10 +45,6 @@ ALONE = 0.5
 # of a sample time: of two states in less, one is a copy, or of another sender, and their
 # difference shows no acceleration
 _AT_ONCE = 0.5
-_MOVED_STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
-_FINEST_STEP = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
-
-
 _REPEAT_MOTION = 3e-4  # rad in a sample: three counts of an encoder of 16 bits
 # ns without states, after which the arm is at rest, as at the start
 _PAUSE_NS = 1_000_000_000
@@ -152,6 +156,7 @@ class Readings:
         self._read = np.full(2 * n, nan)  # q and dq as last read
         self._new_at = -1  # ns, stamp of the first state with these
         self.set_limits(config.safety)
+        self._says(0, np.zeros(3 * n))  # compiled before the first state
 
     def set_limits(self, safety: Safety) -> None:
         """Take these for the largest speeds of the joints from the next state on."""
@@ -165,25 +170,27 @@ class Readings:
         """Return the next state, of a stamp [ns], with [q, dq, effort] (3 n,) as measured.
 
         `begins`: the law waits for a state to start from, which need not come from the last.
-        Differenced velocities are written to `measurement`.
         """
         gap = (stamp - self._seen) * NANOSECOND
         is_after_gap = is_gap(gap, self._sample_time)
         if gap < 0.0 or is_after_gap:
             restart(self.sensor)
         counted, wrapped = self._wraps.count(measurement, gap, self.fastest)
-        found = self._doubt(stamp, counted)
-        if found is not Doubt.NOT_FINITE:
+        found = self._says(stamp, counted)
+        doubt = self._doubt(stamp, found)
+        if not found & NOT_FINITE:
             self._at[:] = counted[: self._at.size]
         self._arrived = stamp
-        if begins and found is Doubt.OUT_OF_REACH:
-            restart(self.sensor)
-        doubt = None if begins and found is not Doubt.NOT_FINITE else found
+        continues = doubt is None
+        if begins and not found & NOT_FINITE:
+            if doubt is Doubt.OUT_OF_REACH:
+                restart(self.sensor)
+            doubt = None
         if doubt is None:
-            self._trust(stamp, counted)
+            self._trust(stamp, counted, is_new=bool(found & NEW))
             if begins and wrapped is not None:
                 self._wraps.restart()
-        return Reading(stamp, counted, gap, is_after_gap, found is None, doubt, wrapped)
+        return Reading(stamp, counted, gap, is_after_gap, continues, doubt, wrapped)
 
     def follow(self, reading: Reading) -> None:
         """Let a trusted reading beside the law be the last one."""
@@ -232,60 +239,60 @@ class Readings:
         """Largest speed of a joint [rad/s], as the positions show it."""
         return float(np.abs(self.velocity).max())
 
-    def _trust(self, stamp: int, measurement: Vector) -> None:
+    def _trust(self, stamp: int, measurement: Vector, *, is_new: bool) -> None:
         self._before, self._seen = self._seen, stamp
         self._wraps.trust(measurement[: self._at.size])
         if self._velocity is not None:
             self._velocity.replace(stamp, measurement)
-        if not self._equals(measurement):
+            is_new = not (measurement[: self._read.size] == self._read).all()
+        if is_new:
             self._read[:] = measurement[: self._read.size]
             self._new_at = stamp
 
-    def _doubt(self, stamp: int, measurement: Vector) -> Doubt | None:
+    def _says(self, stamp: int, measurement: Vector) -> int:
+        """Return what a state says beside the ones before it: see `compare_state`.
+
+        Stamps jitter, and clocks are set back: a sample time counts as one at least.
+        """
+        T = self._sample_time
+        step = max(T, (stamp - self._arrived) * NANOSECOND)
+        elapsed = max(T, (stamp - self.last.stamp) * NANOSECOND)
+        age = (stamp - self._new_at) * NANOSECOND
+        return compare_state(
+            measurement,
+            self._read,
+            self._at,
+            self.last.q,
+            self.last.speed,
+            self.fastest,
+            self.sensor.resolution,
+            step,
+            elapsed,
+            age,
+        )
+
+    def _doubt(self, stamp: int, found: int) -> Doubt | None:
         """Return why a state is not trusted; None: it comes from the last one.
 
         Since the last trusted state, a joint may have gone on twice as fast as it was then, and
         since the last of all states twice as fast as its limit.  So of two senders whose states
         alternate, the one that was trusted is, however rare its states are.  Once all states have
-        followed from each other for ALONE, they are trusted again.  Stamps jitter, and clocks are
-        set back: a sample time counts as one at least.
+        followed from each other for ALONE, they are trusted again.
         """
         last, T = self.last, self._sample_time
-        q = measurement[: last.q.size]
-        if not np.isfinite(q).all():
+        if found & NOT_FINITE:
             return Doubt.NOT_FINITE
-        elapsed = (stamp - last.stamp) * NANOSECOND
-        step = max(T, (stamp - self._arrived) * NANOSECOND)
-        limit = 2.0 * self.fastest * step + self._least_step
-        if (np.abs(q - self._at) > limit).any():
+        if found & FAR:
             self._alone_since = stamp
         if last.age == inf:
             return None
+        elapsed = (stamp - last.stamp) * NANOSECOND
         if elapsed == 0.0:
             return Doubt.COPY
-        if self._is_repeated(stamp, measurement):
+        age = (stamp - self._new_at) * NANOSECOND
+        if age >= BRIDGED * T and found & MOVES and not found & NEW:
             return Doubt.REPEATED
-        reach = limit + 2.0 * last.speed * max(T, elapsed)
         is_alone = (stamp - self._alone_since) * NANOSECOND >= ALONE
-        if not is_alone and (np.abs(q - last.q) > reach).any():
+        if found & OUT_OF_REACH and not is_alone:
             return Doubt.OUT_OF_REACH
         return Doubt.COPY if 0.0 < elapsed < _AT_ONCE * T else None
-
-    def _is_repeated(self, stamp: int, measurement: Vector) -> bool:
-        """Whether a state is an old reading for too long, of an arm that it says moves."""
-        n = self.last.q.size
-        age = (stamp - self._new_at) * NANOSECOND
-        if age < BRIDGED * self._sample_time or not self._equals(measurement):
-            return False
-        moved = np.abs(measurement[n : 2 * n]) * age
-        return bool((moved > self._least_step).any())
-
-    @property
-    def _least_step(self) -> Vector:
-        """Motion (n,) [rad] that the steps of the sensor show."""
-        return np.asarray(
-            _MOVED_STEPS * np.maximum(self.sensor.resolution, _FINEST_STEP)
-        )
-
-    def _equals(self, measurement: Vector) -> bool:
-        return bool((measurement[: self._read.size] == self._read).all())

@@ -52,7 +52,7 @@ class RecentMotion:
         self._stamps = np.zeros(self.size, dtype=np.int64)
         self._states = np.zeros((self.size, 2 * n))
         self._torques = np.zeros((self.size, n))
-        self._count = 0
+        self._count = self._last_stamp = 0
 
     def restart(self) -> None:
         """Begin with the next sample."""
@@ -60,11 +60,11 @@ class RecentMotion:
 
     def take(self, stamp: int, measurement: Array, torque: Array) -> None:
         """Take a state [q, dq, ...] with its stamp [ns], and its torque (n,) [N m]."""
-        elapsed = 1e-9 * (stamp - self._stamps[(self._count - 1) % self.size])
+        elapsed = 1e-9 * (stamp - self._last_stamp)
         if elapsed <= 0.0 or is_gap(elapsed, self._sample_time):
             self.restart()
         at = self._count % self.size
-        self._stamps[at] = stamp
+        self._stamps[at] = self._last_stamp = stamp
         self._states[at] = measurement[: self._states.shape[1]]
         self._torques[at] = torque
         self._count += 1

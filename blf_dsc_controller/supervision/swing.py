@@ -15,6 +15,9 @@ so that 1/(tau omega)^2 of its damping damps it well.  So does the load observer
 acceleration of a joint that is lighter than its model by m multiplies the observer's gain.
 Where this is more than delay and rates bear, it shakes the joint as well.
 
+States that come late make a joint swing more slowly, at a gain that is then too high by itself:
+of such a gain at most half stays, whatever the delay is.
+
 A swing is a half wave of v, from one turning point to the next and through zero, that is
 more than half as high as the one before, twice in a row.  Noise and steps of the sensor
 make none.  The springs of an elastic arm and of its base may also ring by themselves, which
@@ -44,6 +47,7 @@ _SWING_SIGMAS = 10.0
 _SWING_STEPS = 5.0
 # of the damping: a fifth of the inertia, behind a drive with a torque loop of gain 4
 _LEAST_DAMPING = 0.04
+_GAIN_MARGIN = 0.5  # of a gain at which a joint swings
 _LONGEST_SWING = pi * FILTER  # s, half period at omega = 1/tau
 
 
@@ -105,7 +109,8 @@ class Swing:
             self._end_half_waves(ends, travel, travel > least)
             self._farthest[ends] = v[ends]
             self._farthest_at[ends] = self._since[ends]
-        returns = (self._steady > _LONGEST_SWING) & (np.abs(v) > 0.5 * least)
+        steady_for = np.maximum(_LONGEST_SWING, 2.0 * self._half)
+        returns = (self._steady > steady_for) & (np.abs(v) > 0.5 * least)
         if returns.any():
             self.share[returns] = np.minimum(1.0, 2.0 * self.share[returns])
             self._steady[returns] = 0.0
@@ -128,9 +133,9 @@ class Swing:
         lasts = ends & is_clear & returns & (self._half > 0.0)
         lasts &= travel > _SWING_RATIO * self._travel
         self._lasting[ends] = np.where(lasts, self._lasting + 1.0, 0.0)[ends]
-        swings = lasts & (self._lasting >= _SWINGS_IN_A_ROW) & (half < _LONGEST_SWING)
-        borne = np.maximum(_LEAST_DAMPING, self.share * (half / _LONGEST_SWING) ** 2)
-        self.share[swings] = borne[swings]
+        swings = lasts & (self._lasting >= _SWINGS_IN_A_ROW)
+        less = np.minimum(_GAIN_MARGIN, (half / _LONGEST_SWING) ** 2)
+        self.share[swings] = np.maximum(_LEAST_DAMPING, self.share * less)[swings]
         self.has_swung |= swings
         self._lasting[swings] = 0.0
         self._travel[ends] = travel[ends]

@@ -43,8 +43,8 @@ class Wraps:
     ) -> tuple[Vector, Fault | None]:
         """Count turns on in a measurement [q, dq, effort] (3n,); return it, and its fault.
 
-        It is the given one unless a turn has been counted.  `gap` [s] is the time since
-        the last trusted state, `fastest` (n,) [rad/s] the largest speed of each joint.
+        The next call overwrites it.  `gap` [s] is the time since the last trusted state,
+        `fastest` (n,) [rad/s] the largest speed of each joint.
         """
         n = self._last.size
         q = measurement[:n] + self._offset if self._is_off else measurement[:n]
@@ -55,18 +55,16 @@ class Wraps:
         if not hypot(*step.tolist()) <= pi:
             fault = self._count_on(measurement, step, gap, fastest)
             q = measurement[:n] + self._next
-        if not self._is_off and self._next is self._offset:
-            return measurement, fault
         self._counted[:] = measurement
         self._counted[:n] = q
         return self._counted, fault
 
     def trust(self, q: Vector) -> None:
-        """Count on from the state that was counted last, at q (n,) [rad]."""
+        """Count on from the state that was counted last, at finite q (n,) [rad]."""
         if self._next is not self._offset:
             self._offset = self._next
             self._is_off = bool(self._offset.any())
-        np.copyto(self._last, q, where=np.isfinite(q))
+        self._last[:] = q
 
     def _count_on(
         self, measurement: Vector, step: Vector, gap: float, fastest: Vector
