@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from nights import at_night
 from scenario import carrying
 from watched_arm import PERIOD, TIMEOUT, WatchedArm
 
@@ -40,7 +41,10 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(('preset', 'watched', 'given'), CASES)
+@pytest.mark.parametrize(
+    ('preset', 'watched', 'given'),
+    [*CASES[1::3], *at_night(*CASES[::3], *CASES[2::3])],
+)
 def test_controller_that_goes_on_after_a_hang_makes_no_joint_faster(
     preset, watched, given
 ):
@@ -63,7 +67,7 @@ def test_controller_that_goes_on_after_a_hang_makes_no_joint_faster(
         assert excess(least, arm.run(0.6)) < SLACK, queued
 
 
-@pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
+@pytest.mark.parametrize('preset', ['ur5e_driver', *at_night('fr3')])
 def test_arm_that_nobody_commands_goes_on_as_its_reference_until_the_watchdog_brakes_it(
     preset,
 ):
