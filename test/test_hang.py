@@ -124,6 +124,19 @@ def test_controller_that_hung_takes_the_resting_arm_over_as_the_watchdog_holds_i
     assert after.speed.max() < 0.08
 
 
+def test_controller_that_hangs_as_soon_as_it_is_started_again_makes_no_joint_faster():
+    """While the watchdog brakes, before anything is known of the load that it observed."""
+    arm = loaded('fr3', PATIENT)
+    before = arm.run(2.0).since(-200).speed.max(axis=0)
+    arm.run(0.15, hangs=True)
+    assert arm.speed.max() > 0.3
+    arm.restart(acting=arm.taken[-1])
+    arm.run(2.0 * arm.T)
+    assert arm.is_running, arm.text
+    for record in (arm.run(0.3, hangs=True), arm.run(0.6)):
+        assert excess(before, record) < SLACK
+
+
 def test_arm_near_its_reference_returns_to_it_after_a_gap_at_the_torque_that_acts():
     """The reference begins where the arm is, and the command at what its effort shows."""
     arm = loaded('fr3', PATIENT)
