@@ -12,3 +12,10 @@ def at_night(*cases):
         )
         for case in cases
     ]
+
+
+def one_by_day(of, cases):
+    """Return one in `of` cases, the first among them, for every run, and the others by night."""
+    cases = [*cases]
+    others = (case for k, case in enumerate(cases) if k % of)
+    return [*cases[::of], *at_night(*others)]

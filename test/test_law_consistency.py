@@ -198,7 +198,7 @@ def rms_error(preset, duration, begin, law=None, arm=None):
     return np.sqrt((run.error[run.time > begin] ** 2).sum(axis=1).mean())
 
 
-@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'fr3_direct'])
+@pytest.mark.parametrize('preset', ['panda', *at_night('ur5e', 'fr3_direct')])
 def test_joints_with_gains_of_their_own_learn_before_the_first_window_is_full(preset):
     """The errors of the first 5 s used to be those without learning."""
     errors = [rms_error(preset, 5.0, 2.0, law) for law in ({}, OFF)]

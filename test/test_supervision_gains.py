@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from nights import at_night
 from paper_case import NO_DISTURBANCE, P, configured, run
 from scenario import carrying
 
@@ -372,10 +373,10 @@ def test_softer_loop_has_larger_errors_and_stops_as_fast():
     assert soft.safety.damping == stiff.safety.damping
 
 
-@pytest.mark.parametrize(('preset', 'n'), ARMS)
+@pytest.mark.parametrize(('preset', 'n'), [ARMS[0], *at_night(ARMS[1])])
 @pytest.mark.parametrize(
     'sample_time',
-    [0.001, *(pytest.param(T, marks=pytest.mark.nightly) for T in (0.002, 0.004))],
+    [0.001, *at_night(0.002, 0.004)],
 )
 def test_expected_peak_at_a_pick_up_is_that_of_the_simulated_arm(
     preset, n, sample_time

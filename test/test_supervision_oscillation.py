@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 import yaml
+from nights import at_night
 from scenario import Scenario
 
 import blf_dsc_controller as blf
@@ -58,7 +59,8 @@ EVENTS = {
     'events.duration': [2.5, 0.1],
     'events.force': [0.0, 0.0, 0.0, 30.0, 15.0, -20.0],  # N, of the push
 }
-FROM_URDF = ('panda', 'ur5e', 'ur5e_driver', 'fr3', 'fr3_direct', 'openarm', 'widowx')
+FROM_URDF = ['panda', 'ur5e_driver', 'openarm']
+FROM_URDF += at_night('ur5e', 'fr3', 'fr3_direct', 'widowx')
 
 
 @pytest.mark.parametrize('preset', FROM_URDF)
