@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from plant_driver import PlantDriver
 from plants import rigid_gears
+from recorded_run import limited_files
 
 import blf_dsc_controller as blf
 from blf_dsc_controller.cli.main import main
@@ -374,3 +375,12 @@ def test_the_command_says_how_it_ended(address, code, printed, tmp_path, capsys)
         assert 'connected to the simulated arm' in output.err
         assert 'largest error' in output.out
         assert_replays(tmp_path / 'bag')
+
+
+def test_the_command_says_that_the_recording_is_not_whole(tmp_path, capsys):
+    """The robot was controlled to the end, but what was wanted is not there."""
+    with limited_files(tmp_path / 'disk', 10_000) as disk:  # 20 states or so
+        assert command(disk, 'plant', duration=0.3) == 1
+    printed = capsys.readouterr().out
+    assert 'the duration is over' in printed
+    assert f'only a part: {disk / "bag"} cannot be written any further' in printed
