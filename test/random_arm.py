@@ -179,6 +179,15 @@ def truth_of(chain, seed):
     )
 
 
+def holding(truth, mass, centre=(0.0, 0.0, 0.0)):
+    """Return the truth of a Panda with a ball [kg] in its tip, `centre` [m] from there."""
+    T = PANDA_CHAIN.tip_placement.copy()
+    T[:3, 3] += T[:3, :3] @ centre
+    bodies = truth.inertias.copy()
+    bodies[-1] += inertia_of(T @ (mass * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
+    return truth._replace(inertias=bodies)
+
+
 class Reference(NamedTuple):
     """Sums of sinusoids: offset + sum amplitude sin(frequency t + phase)."""
 

@@ -19,6 +19,7 @@ from random_arm import (
     PANDA_TEXT,
     PERIOD,
     changed,
+    holding,
     is_covered,
     measured,
     pinocchio_model,
@@ -34,7 +35,7 @@ from scipy.integrate import solve_ivp
 
 from blf_dsc_controller import BlfDscError, load_loop, simulate
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.content import NameMap
@@ -426,11 +427,7 @@ def is_the_load(found):
 
 @pytest.fixture(scope='module')
 def loaded():
-    bodies = TRUTH.inertias.copy()
-    T = PANDA_CHAIN.tip_placement.copy()
-    T[:3, 3] += T[:3, :3] @ CENTRE
-    bodies[-1] += inertia_of(T @ (LOAD * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
-    return moved(20.0, 5, TRUTH._replace(inertias=bodies))
+    return moved(20.0, 5, holding(TRUTH, LOAD, CENTRE))
 
 
 def test_load_that_is_picked_up_is_found_and_weighed(

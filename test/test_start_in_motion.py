@@ -117,20 +117,6 @@ def test_wrist_of_an_arm_that_is_reset_in_motion_does_not_fall_with_its_load(pre
     assert excess(before, arm.run(0.08)) < SLACK['hold']
 
 
-@pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
-def test_first_torque_in_motion_continues_the_one_that_acts(preset):
-    """Within the rate limit of the file; without it the first one jumps."""
-    arm = arm_of(preset)
-    arm.run(1.5)
-    arm.controller.stop()
-    last = arm.run(0.05).torque[-1]
-    arm.controller.reset()
-    first = arm.run(arm.T).torque[0]
-    assert arm.is_running
-    step = np.array(arm.config.torque.rate_limit) * arm.T
-    assert np.all(np.abs(first - last) <= step * (1.0 + 1e-9))
-
-
 def test_restarted_controller_says_that_the_arm_still_moves():
     """Its first torque is a step for drives that got none before."""
     arm = arm_of('fr3')
