@@ -95,9 +95,8 @@ changes: $(READY)-monte-carlo ## Simulate 14,000 randomly changing arms, each wi
 bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
 	@$(RUN) -m benchmark bench $(GROUPS)
 
-soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds, and 200 faults in motion
+soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds
 	@$(RUN) test/soak.py --minutes "$(MINUTES)"
-	@$(RUN) test/soak_motion.py --episodes 200 --busy 10
 
 docs: $(READY)-docs ## Build the documentation site, into out/docs; dead links are errors
 	@$(RUN) -m sphinx -q -W --keep-going -n doc out/docs && \

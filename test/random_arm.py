@@ -11,10 +11,13 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio
 
+from blf_dsc_controller import PlantConfig
 from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.writer import BagWriter
-from blf_dsc_controller.compiled.jit import inner, kernel
+from blf_dsc_controller.compiled.jit import kernel
+from blf_dsc_controller.configuration.schema import build
+from blf_dsc_controller.identification.corrected_urdf import corrected_urdf
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.messages import topics
@@ -23,6 +26,7 @@ from blf_dsc_controller.messages.codecs import (
     JointStateEncoder,
 )
 from sim_plant.arm import rigid_arm, rigid_bodies
+from sim_plant.plant import plant_of
 
 CONFIG = Path(__file__).parents[1] / 'config'
 PANDA = tuple(f'panda_joint{i}' for i in range(1, 8))
@@ -40,20 +44,25 @@ def words(numbers):
     return ' '.join(repr(float(number)) for number in numbers)
 
 
-def link(name, random):
-    """Return a link with the inertia of a random cloud of points, which is always physical."""
-    if random is None:
-        return f'<link name="{name}" />'
+def cloud(random):
+    """Return mass, centre and inertia of a random cloud of points, which is always physical."""
     points = random.normal(size=(5, 3)) * random.uniform(0.02, 0.2, 3)
     mass = random.uniform(0.2, 4.0)
     second = (points - points.mean(0)).T @ (points - points.mean(0)) * mass / 5.0
-    I = np.trace(second) * np.eye(3) - second
+    return mass, points.mean(0), np.trace(second) * np.eye(3) - second
+
+
+def link(name, random):
+    """Return a link that is a random cloud of points, or one without a body."""
+    if random is None:
+        return f'<link name="{name}" />'
+    mass, centre, I = cloud(random)
     entries = zip(
         ('ixx', 'ixy', 'ixz', 'iyy', 'iyz', 'izz'), I[np.triu_indices(3)], strict=True
     )
     return (
         f'<link name="{name}"><inertial>'
-        f'<origin xyz="{words(points.mean(0))}" rpy="{words(random.uniform(-3, 3, 3))}" />'
+        f'<origin xyz="{words(centre)}" rpy="{words(random.uniform(-3, 3, 3))}" />'
         f'<mass value="{mass!r}" />'
         f'<inertia {" ".join(f"""{key}="{float(value)!r}" """ for key, value in entries)} />'
         '</inertial></link>'
@@ -137,7 +146,6 @@ def chain_of(name):
 PANDA_CHAIN = chain_of('panda')
 GRAVITY = (0.0, 0.0, -9.81)
 PERIOD = 0.001  # s
-_SPRING_STEPS = 8  # in a period: springs of light wrists ring at 2 kHz
 
 
 class Truth(NamedTuple):
@@ -169,6 +177,15 @@ def truth_of(chain, seed):
         0.02 * efforts * random.uniform(0.5, 1.5, efforts.size),
         0.02 * efforts * random.uniform(0.5, 1.5, efforts.size),
     )
+
+
+def holding(truth, mass, centre=(0.0, 0.0, 0.0)):
+    """Return the truth of a Panda with a ball [kg] in its tip, `centre` [m] from there."""
+    T = PANDA_CHAIN.tip_placement.copy()
+    T[:3, 3] += T[:3, :3] @ centre
+    bodies = truth.inertias.copy()
+    bodies[-1] += inertia_of(T @ (mass * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
+    return truth._replace(inertias=bodies)
 
 
 class Reference(NamedTuple):
@@ -262,70 +279,30 @@ def shake(chain, truth, reference, duration):
     return states
 
 
-@inner
-def _add(total, first, second, factor):
-    """Write first + factor second."""
-    for j in range(total.shape[0]):
-        for i in range(total.shape[1]):
-            total[j, i] = first[j, i] + factor * second[j, i]
-
-
-@inner
-def _spring_rate(arm, rotors, stiffness, torque, stage, rate):
-    """Write the rate (4, n) of positions and velocities (4, n) of motors and links."""
-    for i in range(rotors.size):
-        turn = stage[2, i] - stage[3, i]
-        spring = stiffness[i] * (stage[0, i] - stage[1, i] + 1e-4 * turn)
-        rate[0, i] = stage[2, i]
-        rate[1, i] = stage[3, i]
-        rate[2, i] = (torque[i] - spring) / rotors[i]
-        rate[3, i] = spring
-    arm.accelerate(0.0, stage[1], stage[3], rate[3], rate[3])
-
-
-@kernel
-def _shake_elastic(arm, rotors, stiffness, motion, gains, work, states):
-    """Follow `motion` (N, 3, n) by PD of motors, whose springs drive the links of the arm.
-
-    Fill states (N, 3, n) of the motors.  The rows of `work` (17, n) are zero at first.
-    """
-    now = work[:4]  # positions of motors and links, and their velocities
-    stage = work[4:8]
-    rate = work[8:12]
-    step = work[12:16]
-    torque = work[16]
-    h = PERIOD / _SPRING_STEPS
-    for i in range(rotors.size):
-        now[0, i] = now[1, i] = motion[0, 0, i]
-        now[2, i] = now[3, i] = motion[0, 1, i]
-    for k in range(motion.shape[0]):
-        for i in range(rotors.size):
-            states[k, 0, i] = now[0, i]
-            states[k, 1, i] = now[2, i]
-            states[k, 2, i] = torque[i]
-            error = motion[k, 0, i] - now[0, i]
-            torque[i] = gains[i] * (30.0 * error + 3.0 * (motion[k, 1, i] - now[2, i]))
-        for _ in range(_SPRING_STEPS):
-            step[:] = 0.0
-            for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
-                _add(stage, now, rate, share * h)
-                _spring_rate(arm, rotors, stiffness, torque, stage, rate)
-                _add(step, step, rate, weight * h / 6.0)
-            _add(now, now, step, 1.0)
-
-
-def shake_elastic(chain, truth, stiffness, reference, duration):
-    """Return states (N, 3, n) of motors without friction, behind springs (n,) [N m/rad]."""
-    arm = rigid_arm(
-        rigid_bodies(chain, GRAVITY, truth.inertias, np.zeros_like(truth.rotors))
-    )
-    times = np.arange(round(duration / PERIOD)) * PERIOD
-    gains = np.array([min(joint.effort, 100.0) for joint in chain.joints]) / 4.0
-    n = len(chain.joints)
-    states = np.zeros((times.size, 3, n))
-    work = np.zeros((17, n))
-    motion = reference.at(times)
-    _shake_elastic(arm, truth.rotors, stiffness, motion, gains, work, states)
+def shake_elastic(truth, stiffness, reference, duration):
+    """Return states (N, 3, n) of a Panda's motors without friction, behind springs [N m/rad]."""
+    none = np.zeros(len(PANDA))
+    text = corrected_urdf(PANDA_TEXT, PANDA_CHAIN, truth.inertias, none, none, 'true')
+    motion = reference.at(np.arange(round(duration / PERIOD)) * PERIOD)
+    given = {
+        'robot.urdf': text,
+        'robot.tip': 'panda_hand_tcp',
+        'robot.rotor_inertia': truth.rotors.tolist(),
+        'joint.stiffness': stiffness.tolist(),
+        'sensor.side': 'motor',
+        'disturbance.viscous': none.tolist(),
+        'disturbance.coulomb': none.tolist(),
+        'initial.position': motion[0, 0].tolist(),
+        'initial.velocity': motion[0, 1].tolist(),
+    }
+    arm = plant_of(build(PlantConfig, given))
+    gains = np.array([min(joint.effort, 100.0) for joint in PANDA_CHAIN.joints]) / 4.0
+    states, torque = np.zeros_like(motion), none
+    for state, (q, dq, _) in zip(states, motion, strict=True):
+        position, velocity, _ = arm.measure().reshape(3, -1)
+        state[:] = position, velocity, torque
+        torque = gains * (30.0 * (q - position) + 3.0 * (dq - velocity))
+        arm.step(torque)
     return states
 
 

@@ -109,18 +109,6 @@ def test_states_of_another_shape_are_errors_and_change_nothing(given, problem):
     assert controller.phase is blf.Phase.STARTING
 
 
-def test_faults_stop_it_with_a_reason_and_a_safe_torque():
-    controller = blf.ArmController(LOOP.controller)
-    plant = plant_of(LOOP.plant)
-    run(controller, plant, LOOP.plant, 100)
-    q, dq, _ = plant.measure().reshape(3, -1)
-    torque = controller.update(1.1, [math.nan, q[1]], dq)
-    assert controller.phase is blf.Phase.SAFE_STOP
-    assert 'the positions are not finite' in controller.reason
-    assert torque is not None
-    assert np.isfinite(torque).all()
-
-
 def test_law_takes_what_it_commanded_for_efforts_that_are_not_given():
     """No effort is not one of 0 N m: the law would learn that its commands do not arrive."""
     config = blf.change(LOOP.controller, {'robot.effort': 'commanded'})

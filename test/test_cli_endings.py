@@ -284,15 +284,6 @@ def test_full_disk_before_a_loop_begins_is_one_line_and_leaves_no_file(
     is_full(BEFORE_THEIR_LOOP[name], folder, tmp_path)
 
 
-def test_full_disk_ends_the_recording_of_a_drive_and_not_the_drive(given, tmp_path):
-    folder = shutil.copytree(given, tmp_path / 'here')
-    with limited_files(tmp_path / 'disk', 100):  # bytes
-        ended = Ended(BEFORE_THEIR_LOOP['drive'].split(), folder)
-    assert ended.code == 1
-    assert 'controlling simulated: Ctrl-C ends' in ended.lines
-    assert not any('Traceback' in line or 'Errno' in line for line in ended.lines)
-
-
 @pytest.mark.parametrize('name', sorted(COMMANDS.keys() - {'doctor'}))
 def test_full_disk_is_one_line_and_leaves_no_file(given, tmp_path, name):
     folder = shutil.copytree(given, tmp_path / 'here')

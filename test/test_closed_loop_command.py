@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nights import at_night
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 
@@ -258,9 +259,7 @@ def test_interrupted_before_the_loop_began_a_run_leaves_nothing_and_may_be_repea
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    'mode', ['lockstep', pytest.param('realtime', marks=pytest.mark.nightly)]
-)
+@pytest.mark.parametrize('mode', ['lockstep', *at_night('realtime')])
 def test_full_disk_ends_the_run_and_tells_how_to_recover_the_bag(tmp_path, mode):
     config = tmp_path / 'patient.yaml'
     config.write_text(PATIENT)

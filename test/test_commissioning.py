@@ -78,9 +78,15 @@ def sliding():
 
 
 @cache
+def seen():
+    """Return the run of the simulated arm around POSTURE, without friction but viscous."""
+    return simulated.measured(planned(), ARM)
+
+
+@cache
 def found():
-    """Return what the simulated arm shows, without friction but viscous."""
-    return result_of(CONFIG, simulated.measured(planned(), ARM))
+    """Return what it shows."""
+    return result_of(CONFIG, seen())
 
 
 def result_of(config, *runs, **options):
@@ -262,7 +268,7 @@ def refused(match, *runs, names=()):
 
 
 def test_what_is_no_commissioning_is_refused():
-    run, config = simulated.measured(planned(), ARM)
+    run, config = seen()
     refused('not the motion of a commissioning', (run, CONFIG))
     reversed_ = replace(run, joints=run.joints[::-1]), config
     refused('run is of the joints joint2, joint1, the', reversed_)
@@ -280,8 +286,7 @@ def test_what_is_no_commissioning_is_refused():
 
 def test_damping_lags_where_gains_gain_by_it_and_the_true_loop_has_the_margin():
     """Encoders beyond gears that give way, and heavy motors."""
-    run = simulated.measured(planned(), ARM)
-    without = result_of(CONFIG, run, lags=()).choice
+    without = result_of(CONFIG, seen(), lags=()).choice
     choice = found().choice
     assert not without.gains.damping_lag.any()
     assert choice.gains.damping_lag.any()
@@ -333,7 +338,7 @@ def test_loop_of_ones_own_has_the_same_motions_and_gains():
     motion, other = commissioning.motions
     assert motion.config == planned().config
     np.testing.assert_array_equal(other.posture, (0.8, 0.5))
-    result = commissioning.result([simulated.measured(motion, ARM)])
+    result = commissioning.result([seen()])
     expected = found().parameters()
     assert result.parameters() == expected
     assert result.config.feedback.joint_damping == expected['feedback.joint_damping']
@@ -345,8 +350,7 @@ def test_loop_of_ones_own_has_the_same_motions_and_gains():
 
 def test_gains_without_the_margin_are_no_parameters():
     """No loop has a modulus margin above 1: its gain vanishes at high frequencies."""
-    run = simulated.measured(planned(), ARM)
-    result = blf.Commissioning(CONFIG, margin=1.1).result([run])
+    result = blf.Commissioning(CONFIG, margin=1.1).result([seen()])
     assert not result.has_margin
     with pytest.raises(BlfDscError, match=r'no gains have the modulus margin of 1\.1'):
         result.parameters()
@@ -355,8 +359,7 @@ def test_gains_without_the_margin_are_no_parameters():
 def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
     # of the second, more digits than those of a bound that is widened
     tight = change(CONFIG, {'barrier.bound': [5e-4, 0.3049]})
-    run = simulated.measured(planned(), ARM)
-    result = result_of(tight, run)
+    result = result_of(tight, seen())
     bound = result.parameters()['barrier.bound']
     errors = expected_errors(result.config, settings_of_config(result.config))
     needed = np.maximum(errors.unmodelled, errors.pick_up)
@@ -364,7 +367,7 @@ def test_bound_is_wide_enough_for_what_the_gains_allow_and_never_narrowed():
     assert bound[0] == pytest.approx(1.1 * needed[0], rel=0.05)  # two digits
     assert bound[1] == 0.3049
     wide = change(CONFIG, {'barrier.bound': [0.3, 0.3]})
-    assert 'barrier.bound' not in result_of(wide, run).parameters()
+    assert 'barrier.bound' not in result_of(wide, seen()).parameters()
 
 
 @cache

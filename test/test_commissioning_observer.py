@@ -59,6 +59,7 @@ ARM = build(
 )
 
 
+@cache
 def measured(springs=STIFF):
     """Return the run of an arm with these springs, and its configuration."""
     motion = blf.Commissioning(CONFIG).motion(POSTURE)

@@ -78,6 +78,17 @@ def gains_of(path):
     return np.array([feedback.joint_stiffness, feedback.joint_damping])
 
 
+def travel(bag):
+    """Return how far the tool goes from where it began [m].
+
+    Its reference travels 10 mm at most; the arm is softly held and exceeds it little.
+    """
+    run = blf.read_run(bag)
+    chain = read_content(bag).controller_config().robot.chain(run.joints)
+    tips = frames(chain, run.position)[-1][:, :3, 3]
+    return np.linalg.norm(tips - tips[0], axis=1).max()
+
+
 def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(whole, capsys):
     """In the time that a real one is given, in which the arm stays where it is."""
     arm = whole
@@ -96,11 +107,7 @@ def test_robot_is_measured_posture_by_posture_and_its_bags_give_the_same(whole, 
         # it began at rest where the move ended: no error, and no jump of the torque
         assert np.abs(run.error[0]).max() < 1e-6
         assert np.abs(run.torque[0]).max() < 0.01  # N m, of 60
-        chain = read_content(bag).controller_config().robot.chain(run.joints)
-        tips = frames(chain, run.position)[-1][:, :3, 3]
-        middle = frames(chain, run.position[0])[-1][:3, 3]
-        # the reference travels 10 mm at most; the arm is softly held and exceeds it little
-        assert np.linalg.norm(tips - middle, axis=1).max() < 0.015
+        assert travel(bag) < 0.015
         np.testing.assert_allclose(run.position[0], posture, atol=0.01)
     assert blf.verify(bags[0]).difference is None
     again = arm.with_name('again.yaml')
@@ -262,13 +269,7 @@ def test_softly_held_arm_that_sticks_slides_and_ends_where_it_began(arm):
         *('move_1', 'weak_posture_1', 'again_weak_posture_1', 'posture_1')
     }
     run = blf.read_run(folder / 'posture_1')
-    chain = (
-        read_content(folder / 'posture_1').controller_config().robot.chain(run.joints)
-    )
-    tips = frames(chain, run.position)[-1][:, :3, 3]
-    middle = frames(chain, run.position[0])[-1][:3, 3]
-    # the reference travels 10 mm at most; as without friction
-    assert np.linalg.norm(tips - middle, axis=1).max() < 0.015
+    assert travel(folder / 'posture_1') < 0.015  # as without friction
     assert np.abs(run.velocity[-1]).max() < 0.01  # rad/s, at rest
 
 

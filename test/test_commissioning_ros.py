@@ -17,7 +17,6 @@ from rclpy.parameter import Parameter
 from ros_rig import PATIENCE
 
 import blf_dsc_controller as blf
-from blf_dsc_controller import BlfDscError
 from blf_dsc_controller.cli import commission
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.commissioning import postures, proof
@@ -26,8 +25,6 @@ from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.drive import ros as drive_ros
 from blf_dsc_controller.drive.loop import End
-from blf_dsc_controller.messages import topics
-from blf_dsc_controller.messages.codecs import Float64MultiArrayEncoder
 from blf_dsc_controller.nodes.driven_node import DrivenNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
@@ -208,27 +205,6 @@ def test_a_driver_that_is_gone_is_told(rig, takes, told, monkeypatch):
         rig.measured(NEAR)
     assert caught.value.end is End.LOST
     assert not (rig.bags / 'posture_1').exists()
-
-
-def test_somebody_who_also_commands_ends_it(rig):
-    def command():
-        rig.ros.publisher(topics.COMMANDS)
-        rig.ros.until(lambda: rig.node.count_publishers(rig.node.commands) == 2)
-        rig.node.on_second()  # it looks every second
-
-    rig.during('move', command)
-    with pytest.raises(EndedError, match='another node publishes torques on') as caught:
-        rig.measured(NEAR)
-    assert caught.value.end is End.STOPPED
-    assert calm(rig)
-
-
-def test_nothing_starts_beside_another_commander(rig):
-    other = rig.ros.publisher(topics.COMMANDS)
-    torque = Float64MultiArrayEncoder(2).encode(np.zeros(2))
-    rig.always = lambda: other.publish(torque)
-    with pytest.raises(BlfDscError, match='move 1: another node commands torques on'):
-        rig.measured(NEAR)
 
 
 @pytest.mark.parametrize(

@@ -100,10 +100,10 @@ def files_of(name, folder):
 
 
 def commission(name, folder, capsys):
-    """Commission a simulated arm by the command; return what it wrote and printed."""
+    """Commission a simulated arm, where it starts; return what the command wrote and printed."""
     out = folder / 'commissioned.yaml'
-    config = files_of(name, folder)
-    assert main(['commission', '--config', str(config), '--out', str(out)]) == 0
+    words = ['commission', '--config', str(files_of(name, folder)), '--out', str(out)]
+    assert main([*words, '--posture', *map(str, ARMS[name]['start'])]) == 0
     sections = yaml.safe_load(out.read_text())
     values = {}
     for section in sections.values():

@@ -23,6 +23,7 @@ import numba
 import numpy as np
 import pytest
 from command import OLDER, finished
+from nights import at_night
 from numba.core.errors import UnsupportedError
 from planted import Planted
 from random_arm import random_urdf
@@ -482,7 +483,7 @@ PROCESSORS = {
 )
 @pytest.mark.parametrize(
     'processor',
-    ['older', *NEWER, pytest.param('oldest', marks=pytest.mark.nightly)],
+    ['older', *NEWER, *at_night('oldest')],
 )
 def test_every_processor_computes_the_same_bits(processor):
     """With the versions of libm, BLAS and numpy's loops for other processors, and their code."""

@@ -179,6 +179,7 @@ def test_lost_commands_neither_stop_the_drives_nor_cost_the_bound(robot):
     assert found.ratio < 0.6
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures('blank_pictures')
 def test_every_own_shell_line_of_the_page_is_executed(
     launched,  # noqa: F811

@@ -16,6 +16,7 @@ import pytest
 from adversary_law import KINDS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nights import at_night
 from scenario import Scenario
 
 import blf_dsc_controller as blf
@@ -123,7 +124,7 @@ NIGHTLY = ['recommended', 'fr3', 'fr3_direct', 'openarm', 'yam', 'panda_rigid']
 
 @pytest.mark.parametrize(
     'preset',
-    [*PRESETS, *(pytest.param(each, marks=pytest.mark.nightly) for each in NIGHTLY)],
+    [*PRESETS, *at_night(*NIGHTLY)],
 )
 def test_arm_in_order_is_never_braked(preset):
     arm = Scenario(preset)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from nights import at_night
 from scenario import carrying
 from watched_arm import PERIOD, TIMEOUT, WatchedArm
 
@@ -40,7 +41,10 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(('preset', 'watched', 'given'), CASES)
+@pytest.mark.parametrize(
+    ('preset', 'watched', 'given'),
+    [*CASES[1::3], *at_night(*CASES[::3], *CASES[2::3])],
+)
 def test_controller_that_goes_on_after_a_hang_makes_no_joint_faster(
     preset, watched, given
 ):
@@ -63,7 +67,7 @@ def test_controller_that_goes_on_after_a_hang_makes_no_joint_faster(
         assert excess(least, arm.run(0.6)) < SLACK, queued
 
 
-@pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
+@pytest.mark.parametrize('preset', ['ur5e_driver', *at_night('fr3')])
 def test_arm_that_nobody_commands_goes_on_as_its_reference_until_the_watchdog_brakes_it(
     preset,
 ):
@@ -118,6 +122,19 @@ def test_controller_that_hung_takes_the_resting_arm_over_as_the_watchdog_holds_i
     after = arm.run(0.6)
     assert arm.reason == 'stamp jump'
     assert after.speed.max() < 0.08
+
+
+def test_controller_that_hangs_as_soon_as_it_is_started_again_makes_no_joint_faster():
+    """While the watchdog brakes, before anything is known of the load that it observed."""
+    arm = loaded('fr3', PATIENT)
+    before = arm.run(2.0).since(-200).speed.max(axis=0)
+    arm.run(0.15, hangs=True)
+    assert arm.speed.max() > 0.3
+    arm.restart(acting=arm.taken[-1])
+    arm.run(2.0 * arm.T)
+    assert arm.is_running, arm.text
+    for record in (arm.run(0.3, hangs=True), arm.run(0.6)):
+        assert excess(before, record) < SLACK
 
 
 def test_arm_near_its_reference_returns_to_it_after_a_gap_at_the_torque_that_acts():

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pinocchio
 import pytest
+from friction_laws import with_friction
 from random_arm import (
     FIELDS,
     GRAVITY,
@@ -18,6 +19,7 @@ from random_arm import (
     PANDA_TEXT,
     PERIOD,
     changed,
+    holding,
     is_covered,
     measured,
     pinocchio_model,
@@ -25,6 +27,7 @@ from random_arm import (
     recording_of,
     reference_of,
     shake,
+    shake_elastic,
     truth_of,
     write_states,
 )
@@ -32,7 +35,7 @@ from scipy.integrate import solve_ivp
 
 from blf_dsc_controller import BlfDscError, load_loop, simulate
 from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.inertia import inertia_of, pseudo_inertia
+from blf_dsc_controller.arms.inertia import pseudo_inertia
 from blf_dsc_controller.arms.model import regressors_at
 from blf_dsc_controller.arms.urdf import read_chain
 from blf_dsc_controller.bags.content import NameMap
@@ -45,6 +48,7 @@ from blf_dsc_controller.identification.from_files import identify_bag, read_reco
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import problems_of
 from blf_dsc_controller.identification.sliding import sliding_direction
+from blf_dsc_controller.identification.summary import notes_of
 from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.simulation.loop import write_bag
 
@@ -423,11 +427,7 @@ def is_the_load(found):
 
 @pytest.fixture(scope='module')
 def loaded():
-    bodies = TRUTH.inertias.copy()
-    T = PANDA_CHAIN.tip_placement.copy()
-    T[:3, 3] += T[:3, :3] @ CENTRE
-    bodies[-1] += inertia_of(T @ (LOAD * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
-    return moved(20.0, 5, TRUTH._replace(inertias=bodies))
+    return moved(20.0, 5, holding(TRUTH, LOAD, CENTRE))
 
 
 def test_load_that_is_picked_up_is_found_and_weighed(
@@ -527,3 +527,71 @@ def test_contacts_that_yield_at_reversals_are_found(plain):
     assert total(found) < 0.005
     found_friction = found.parts.terms[2, 1] - TRUTH.coulomb[1]
     assert found_friction == pytest.approx(5.0, rel=0.05)
+
+
+# What is said of doubtful recordings.
+
+
+def mentions(found, words):
+    return any(words in note for note in notes_of(found))
+
+
+def test_recording_without_faults_has_neither_problems_nor_these_notes(simple):
+    assert not list(problems_of(simple, 'torque'))
+    for words in (
+        *('is long', 'has an offset', 'hardly needs', 'predicts worse'),
+        *('more than the model has terms for', 'cannot be known', 'not explained'),
+    ):
+        assert not mentions(simple, words)
+
+
+@pytest.mark.parametrize(
+    ('milliseconds', 'late'), [(20, 'torques'), (-20, 'positions')]
+)
+def test_long_delay_is_named_with_what_is_late(plain, milliseconds, late):
+    samples = round(1e-3 * milliseconds / PERIOD)
+    states = plain.copy()
+    states[:, 2] = np.roll(plain[:, 2], samples, axis=0)
+    found = identified(states[abs(samples) : -abs(samples)])
+    assert found.values[-1] == pytest.approx(1e-3 * milliseconds, abs=2e-3)
+    assert mentions(found, f'{milliseconds} ms is long: are the {late} filtered')
+
+
+def test_offset_for_which_a_urdf_has_no_place_is_named(plain):
+    states = plain.copy()
+    states[:, 2, 4] += 1.5
+    found = identified(states)
+    assert mentions(found, f'{PANDA[4]} has an offset of 1.5 N m')
+    assert not mentions(found, f'{PANDA[1]} has an offset')
+
+
+@pytest.mark.parametrize('what', ['gain', 'elasticity'])
+def test_intervals_hold_where_the_arm_is_not_as_its_model_says(what):
+    """Torques of sensors whose gains are up to 20 % off, and motors behind springs.
+
+    Without the wider model, 30 and 64 % of the intervals hold; of 95 %, ten less allow for chance.
+    """
+    truth = truth_of(PANDA_CHAIN, 0)
+    zero = np.zeros(7)
+    smooth = truth._replace(viscous=zero, coulomb=zero)
+    random = np.random.default_rng(0)
+    if what == 'gain':
+        motion = moved(20.0, 0, smooth)
+    else:
+        stiffness = random.uniform(1e4, 3e4, 7)
+        reference = reference_of(PANDA_CHAIN, 0)
+        motion = shake_elastic(smooth, stiffness, reference, 20.0)
+    states = with_friction('Coulomb', motion, truth.viscous, truth.coulomb, 0)
+    if what == 'gain':
+        states[:, 2] *= random.uniform(0.8, 1.2, 7)
+    found = identify_arm(
+        recording_of(measured(states, 0)[::10], period=10 * PERIOD), AT_TIP
+    )
+    off = np.abs(found.parts.terms[0] - truth.rotors)
+    held = [*is_covered(found, truth), *(off < 1.96 * found.deviations.terms[0])]
+    assert np.mean(held) >= 0.85
+    words = {
+        'gain': 'KNOWN UP TO THESE GAINS ONLY',
+        'elasticity': 'are elastic behind',
+    }[what]
+    assert mentions(found, words)

@@ -39,7 +39,7 @@ def numbered(stem, unit=''):
 def written(path, names, columns, delimiter=',', decimal='.', before='', **how):
     """Write a table; a name that is None is that of text cells."""
     table = np.column_stack(columns)
-    rows = [[f'{value:.9g}' for value in row] for row in table]
+    rows = [[f'{value:.17g}' for value in row] for row in table]
     lines = [delimiter.join(row).replace('.', decimal) for row in rows]
     header = [delimiter.join(names)] if names else []
     path.write_text('\n'.join([*([before] if before else []), *header, *lines]), **how)

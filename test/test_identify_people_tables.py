@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from random_arm import UR5E
-from test_identify_foreign_tables import EPOCH, TAU, TIME, Q, is_read
+from test_identify_foreign_tables import EPOCH, TAU, TIME, Q, is_read, written
 
 ZERO = np.zeros_like(Q)
 WHOLE_SECONDS = np.floor(EPOCH + TIME)
@@ -99,20 +99,6 @@ TABLES = {
 }
 
 
-def written(path, names, columns, delimiter=',', end='\n', encoding='utf-8', **how):
-    rows = np.column_stack(columns)
-    decimal = how.get('decimal', '.')
-    lines = [
-        delimiter.join(f'{value:.17g}'.replace('.', decimal) for value in row)
-        for row in rows
-    ]
-    head = delimiter.join(
-        how.get('quote', '') + name + how.get('quote', '') for name in names
-    )
-    path.write_bytes(end.join([head, *lines]).encode(encoding))
-    return path
-
-
 @pytest.mark.parametrize('form', TABLES)
 def test_tables_of_people_are_read_as_they_are(tmp_path, form):
     is_read(written(tmp_path / 'a.csv', *TABLES[form]))
@@ -124,11 +110,15 @@ def test_tables_of_people_are_read_as_they_are(tmp_path, form):
         {'delimiter': ';', 'decimal': ','},
         {'delimiter': '\t'},
         {'delimiter': ' '},
-        {'end': '\r\n', 'encoding': 'utf-8-sig'},
+        {'newline': '\r\n', 'encoding': 'utf-8-sig'},
         {'encoding': 'utf-16'},
-        {'quote': '"'},
     ],
     ids=str,
 )
 def test_files_of_people_are_read_however_they_are_separated(tmp_path, how):
     is_read(written(tmp_path / 'a.csv', *TABLES['numbers from 0'], **how))
+
+
+def test_names_in_quotes_are_read(tmp_path):
+    names, columns = TABLES['numbers from 0']
+    is_read(written(tmp_path / 'a.csv', [f'"{name}"' for name in names], columns))

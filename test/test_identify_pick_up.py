@@ -8,6 +8,7 @@ import pytest
 from random_arm import (
     PANDA_CHAIN,
     PANDA_TEXT,
+    holding,
     measured,
     recording_of,
     reference_of,
@@ -15,7 +16,6 @@ from random_arm import (
     truth_of,
 )
 
-from blf_dsc_controller.arms.inertia import inertia_of
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identify import identify_arm
 from blf_dsc_controller.identification.problems import is_usable, problems_of
@@ -30,19 +30,15 @@ DURATION = 40.0  # s
 FIND = float('nan')
 
 
-def arm_with(mass):
-    bodies = TRUTH.inertias.copy()
-    T = PANDA_CHAIN.tip_placement
-    bodies[-1] += inertia_of(T @ (mass * np.diag((2e-4, 2e-4, 2e-4, 1.0))) @ T.T)
-    return TRUTH._replace(inertias=bodies)
-
-
 @pytest.fixture(scope='module')
 def motions():
     """States (2, N, 3, n) of one motion without and with a load."""
     reference = reference_of(PANDA_CHAIN, 2)
     return np.stack(
-        [shake(PANDA_CHAIN, arm_with(m), reference, DURATION) for m in (0.0, MASS)]
+        [
+            shake(PANDA_CHAIN, holding(TRUTH, m), reference, DURATION)
+            for m in (0.0, MASS)
+        ]
     )
 
 

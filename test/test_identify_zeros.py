@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from nights import at_night
 from random_arm import (
     PANDA,
     PANDA_TEXT,
@@ -70,8 +71,8 @@ def added(problem):
     ('n', 'offsets'),
     [
         (4, {4: QUARTER}),
-        (7, {2: -QUARTER, 6: QUARTER}),
         (4, {2: QUARTER, 4: QUARTER}),
+        *at_night((7, {2: -QUARTER, 6: QUARTER})),
     ],
 )
 def test_zeros_that_are_quarter_turns_off_are_named_and_not_applied(n, offsets):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from nights import at_night
 from paper_case import (
     BOUND,
     CHANGED,
@@ -34,14 +35,13 @@ SENSORS = {
 }
 
 
-CASES = [
-    (name, sensors)
-    for k, name in enumerate(ROWS)
-    for sensors in ('ideal', list(SENSORS)[1 + k % 3])
-]
+REAL = [(name, list(SENSORS)[1 + k % 3]) for k, name in enumerate(ROWS)]
+IDEAL = [(name, 'ideal') for name in ROWS]
 
 
-@pytest.mark.parametrize(('name', 'sensors'), CASES)
+@pytest.mark.parametrize(
+    ('name', 'sensors'), [*REAL[::2], *at_night(*REAL[1::2], *IDEAL)]
+)
 def test_bound_holds_when_the_arm_changes(name, sensors):
     """Nor is the error larger than 1.3 times that without learning, or 0.25 mrad after a ramp.
 
@@ -198,14 +198,14 @@ def rms_error(preset, duration, begin, law=None, arm=None):
     return np.sqrt((run.error[run.time > begin] ** 2).sum(axis=1).mean())
 
 
-@pytest.mark.parametrize('preset', ['panda', 'ur5e', 'fr3_direct'])
+@pytest.mark.parametrize('preset', ['panda', *at_night('ur5e', 'fr3_direct')])
 def test_joints_with_gains_of_their_own_learn_before_the_first_window_is_full(preset):
     """The errors of the first 5 s used to be those without learning."""
     errors = [rms_error(preset, 5.0, 2.0, law) for law in ({}, OFF)]
     assert errors[0] < 0.9 * errors[1]
 
 
-@pytest.mark.parametrize('begin', [2.5, 2.6, 2.9])
+@pytest.mark.parametrize('begin', [2.5, *at_night(2.6, 2.9)])
 def test_load_that_is_held_for_a_moment_of_the_first_window_leaves_no_friction(begin):
     """Its pick-up was in a reversal, and looked like up to 3 N m of friction.
 

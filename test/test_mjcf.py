@@ -11,7 +11,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
-from random_arm import CONFIG, PANDA, UR5E
+from random_arm import CONFIG, PANDA, UR5E, cloud, words
 
 from blf_dsc_controller import (
     BlfDscError,
@@ -29,19 +29,12 @@ OPENARM = 'package://openarm_mujoco/v2/openarm_bimanual.xml'
 FR3 = 'package://franky_sim/assets/fr3.xml'
 
 
-def words(numbers):
-    return ' '.join(repr(float(number)) for number in numbers)
-
-
 def inertial(random):
-    """Return the inertia of a random cloud of points, which is always physical."""
-    points = random.normal(size=(5, 3)) * random.uniform(0.02, 0.2, 3)
-    mass = random.uniform(0.2, 4.0)
-    second = (points - points.mean(0)).T @ (points - points.mean(0)) * mass / 5.0
-    I = np.trace(second) * np.eye(3) - second
+    """Return the inertia of a random cloud of points."""
+    mass, centre, I = cloud(random)
     entries = (I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2])
     return (
-        f'<inertial pos="{words(points.mean(0))}" mass="{mass!r}" '
+        f'<inertial pos="{words(centre)}" mass="{mass!r}" '
         f'fullinertia="{words(entries)}"/>'
     )
 

@@ -7,6 +7,7 @@ import os
 
 import numpy as np
 import pytest
+from nights import at_night
 from scipy import stats
 
 from benchmark.studies import path_of
@@ -183,10 +184,7 @@ FIRST = {
     'name',
     [
         'monte_carlo_panda',
-        *(
-            pytest.param(name, marks=pytest.mark.nightly)
-            for name in ('monte_carlo_events', 'monte_carlo_ur5e')
-        ),
+        *at_night('monte_carlo_events', 'monte_carlo_ur5e'),
     ],
 )
 def test_learning_breaks_no_bound_that_is_kept_without_it(name):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -20,23 +22,11 @@ FIRST = np.array([1.9, 1.4])  # rad
 STEP = np.array([0.004, -0.004])  # rad in 20 ms, 0.2 rad/s
 
 
-class Quiet:
-    """A log that nobody reads."""
-
-    def info(self, message):
-        pass
-
-    def warning(self, message, *, throttle_duration_sec=0.0):
-        pass
-
-    error = warning
-
-
 @pytest.fixture
 def rig():
     """An arm on its reference, whose controller takes motions."""
     rig = Rig({'limits.acceleration': [6.0, 6.0]})
-    rig.inputs = MotionInput(2, lambda: rig.guard, lambda _: False, Quiet())
+    rig.inputs = MotionInput(2, lambda: rig.guard, lambda _: False, Mock())
     rig.step(50)
     return rig
 
@@ -79,7 +69,7 @@ def test_sender_is_followed_again_once_it_has_paused_or_after_a_reset(rig):
 
 def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig):
     """Of a busy computer: planning took longer than the lead."""
-    inputs = MotionInput(2, lambda: rig.guard, lambda _: True, Quiet())
+    inputs = MotionInput(2, lambda: rig.guard, lambda _: True, Mock())
     reports = []
     made = []
 
@@ -105,7 +95,7 @@ def test_a_plan_that_is_ready_too_late_is_made_again_for_twice_as_long_ahead(rig
 
 def test_a_stop_ends_the_motion_that_waits_for_another_to_be_planned(rig):
     """Else the arm would go there after the next motion, of which nobody thinks any more."""
-    inputs = MotionInput(2, lambda: rig.guard, lambda _: True, Quiet())
+    inputs = MotionInput(2, lambda: rig.guard, lambda _: True, Mock())
     reasons = []
 
     def follow(positions):

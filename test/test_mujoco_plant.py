@@ -12,6 +12,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('mujoco', reason='needs MuJoCo: pip install mujoco')
 
 import mujoco
+from nights import at_night
 from plants import commands
 from scenario import START, Scenario
 from test_plant_sampled import ALL_KINDS
@@ -168,9 +169,9 @@ def test_what_mujoco_has_not_is_an_error_with_a_remedy(monkeypatch):
     ('name', 'settled', 'peak'),
     [
         ('panda_rigid', 0.2, 2.3),
-        pytest.param('ur5e_rigid', 0.55, 1.6, marks=pytest.mark.nightly),
-        pytest.param('openarm', 0.36, 6.4, marks=pytest.mark.nightly),
-        pytest.param('widowx', 0.58, 39.0, marks=pytest.mark.nightly),
+        *at_night(
+            ('ur5e_rigid', 0.55, 1.6), ('openarm', 0.36, 6.4), ('widowx', 0.58, 39.0)
+        ),
     ],
 )
 def test_errors_with_dry_friction_are_as_documented(name, settled, peak):

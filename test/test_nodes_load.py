@@ -16,11 +16,10 @@ pytest.importorskip('rclpy', reason='needs ROS 2')
 
 import interfaces
 from geometry_msgs.msg import Inertia, Vector3
-from ros_rig import LIMIT, RosRig, activate, cleanup, configure, deactivate
+from ros_rig import LIMIT, activate, cleanup, configure, deactivate
 from std_srvs.srv import Trigger
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.configuration.nodes import CONTROLLER as LAW
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.messages import topics
@@ -28,8 +27,6 @@ from blf_dsc_controller.messages.journal import EventType, decode
 from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
-from blf_dsc_controller.nodes.process import drain
-from blf_dsc_controller.nodes.recorder_node import BagRecorderNode
 from sim_plant.settings import plant_settings
 
 PACKAGES = ('ur_msgs', 'franka_msgs')
@@ -108,35 +105,6 @@ class Arm:
         )
 
 
-def test_load_is_told_to_the_service_in_steps_that_no_joint_notices(services, tmp_path):
-    """The arm of a UR's driver, which accepts it in motion."""
-    ros = RosRig()
-    recorder = ros.add(BagRecorderNode, output=str(tmp_path / 'bag'))
-    arm = Arm(ros, services['ur'], wait_for_subscribers=1)
-    guard = arm.law.guard
-    arm.run_until(9.5)
-    assert guard.controller.state.payload.load[0] == pytest.approx(2.0, abs=0.1)
-    masses = [request.mass for request in arm.requests]
-    assert len(masses) > 10
-    assert (np.diff(masses) > 0.0).all()
-    assert masses[-1] == pytest.approx(2.0, abs=0.1)
-    last = arm.requests[-1]
-    ball = 0.4 * last.mass * (0.75 * last.mass / (np.pi * 1000.0)) ** (2.0 / 3.0)
-    assert last.ixx == last.iyy == last.izz == pytest.approx(ball, rel=1e-6)
-    assert guard.supervisor.running
-    assert guard.samples.ratio.max() < 0.6
-    deactivate(ros, arm.plant)
-    ros.until(lambda: guard.journal.stamp == arm.plant.stamp)
-    for node in (arm.plant, arm.law):
-        drain(node.publishers)
-    recorder.close()
-    ros.close()
-    events = [event for _, event in read_content(tmp_path / 'bag').events]
-    loads = [event.content['mass'] for event in events if event.type == 'drive load']
-    assert loads == pytest.approx(masses, abs=1e-6)
-    assert blf.verify(tmp_path / 'bag').difference is None
-
-
 def test_driver_that_refuses_is_asked_once(services, ros):
     """As that of a Franka does while a controller is active: it is asked at rest."""
     arm = Arm(ros, services['franka'], accepts=False)
@@ -151,16 +119,24 @@ def test_driver_that_refuses_is_asked_once(services, ros):
     assert arm.law.guard.supervisor.running
 
 
-def told_two_kilograms(ros, services):
-    """Run an arm whose drives have been told what it picked up."""
+def test_load_is_told_in_steps_that_no_joint_notices_and_left_to_the_drives(
+    services, ros
+):
+    """By a UR's driver, which accepts it in motion.
+
+    After a reset the law knows of no load: nor may its commands take away what the drives add.
+    """
     arm = Arm(ros, services['ur'])
-    arm.run_until(8.5)
-    assert arm.law.declaration.in_force.mass == pytest.approx(2.0, abs=0.1)
-    return arm
-
-
-def begins_again(ros, arm):
-    """Reset the law, and check that neither it nor the drives carry the load twice."""
+    arm.run_until(9.5)
+    masses = [request.mass for request in arm.requests]
+    assert len(masses) > 10
+    assert (np.diff(masses) > 0.0).all()
+    assert masses[-1] == pytest.approx(2.0, abs=0.1)
+    assert arm.law.declaration.in_force.mass == pytest.approx(masses[-1])
+    last = arm.requests[-1]
+    ball = 0.4 * last.mass * (0.75 * last.mass / (np.pi * 1000.0)) ** (2.0 / 3.0)
+    assert last.ixx == last.iyy == last.izz == pytest.approx(ball, rel=1e-6)
+    assert arm.law.guard.samples.ratio.max() < 0.6
     ros.reset(arm.law)
     guard = arm.law.guard
     ros.until(lambda: guard.reference.time < 8.0)
@@ -168,13 +144,6 @@ def begins_again(ros, arm):
     assert guard.supervisor.running, guard.supervisor.text
     # if the commands took away what the drives add, it would be 0.2
     assert guard.samples.ratio.max() < 0.1
-
-
-def test_law_that_begins_again_leaves_the_load_to_the_drives(services, ros):
-    """After a reset it knows of no load: nor may its commands take away what the drives add."""
-    arm = told_two_kilograms(ros, services)
-    begins_again(ros, arm)
-    guard = arm.law.guard
     assert deactivate(ros, arm.law)
     ros.until(lambda: guard.is_settled)
     assert cleanup(ros, arm.law)

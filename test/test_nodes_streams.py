@@ -7,6 +7,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from nights import at_night
 
 pytest.importorskip('rclpy', reason='needs ROS 2')
 pytest.importorskip('ruckig', reason='needs ruckig')
@@ -76,7 +77,7 @@ def chunks_of(law, k, period):
         inputs(law).take_trajectory(trajectory(*chunk))
 
 
-@pytest.mark.parametrize('send', [positions_of, points_of, chunks_of])
+@pytest.mark.parametrize('send', [positions_of, chunks_of, *at_night(points_of)])
 def test_stream_is_followed_as_far_behind_as_the_arm_brakes_without_a_jump(ros, send):
     """At 50 Hz, 55 ms behind at most 0.2 rad/s, from which the arm brakes in 35 ms on average.
 

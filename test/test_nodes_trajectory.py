@@ -80,47 +80,6 @@ def phase(law):
     return law.guard.supervisor.phase
 
 
-def test_two_tone_trajectory_is_tracked_within_the_bound_and_replaced_twice(ros):
-    references = ros.listen(topics.REFERENCE)
-    errors = ros.listen(topics.TRACKING_ERROR)
-    # Planned in a thread, it is followed the later, the busier the computer: then in
-    # less time.
-    limit = 8.0  # rad/s^2
-    brisk = {'limits__acceleration': [limit, limit], 'telemetry__decimation': 1}
-    arm, law = ros.loop(None, brisk | PLANNED['on'])
-    ros.run(arm, 200)
-    shifts = ([0.0, 0.0], [0.1, -0.2], [-0.15, 0.1])
-    orders = (JOINTS, JOINTS[::-1], JOINTS)
-    for shift, joints, fields in zip(shifts, orders, (3, 2, 3), strict=True):
-        message = trajectory(joints, np.array(shift), duration=3.0, fields=fields)
-        assert send(ros, law, message) == ''
-        ros.run(arm, 1800)
-    begin = law.guard.reference.start_stamp
-    last = [1e-9 * (law.guard.reference.last_stamp - begin)]
-    ros.run(arm, 3500)
-
-    assert inputs(law).accepted == 3
-    assert inputs(law).rejected == 0
-    # The last of the three has ended, and its last point is held.
-    reference = law.guard.controller.reference_at(last[0] + 3.4)
-    np.testing.assert_allclose(
-        reference, [two_tones(3.95, np.array(shifts[2]))[0], [0, 0], [0, 0]]
-    )
-    assert law.guard.samples.ratio.max() < 1.0
-    assert np.max([np.abs(message.position) for message in errors]) < 2e-3
-    positions = np.array([message.position for message in references])
-    velocities = np.array([message.velocity for message in references])
-    # At most the limit over a millisecond: no jump where one trajectory replaces
-    # another.
-    assert np.abs(np.diff(velocities, axis=0)).max() < 1.025e-3 * limit
-    np.testing.assert_allclose(
-        np.diff(positions, axis=0),
-        0.5e-3 * (velocities[1:] + velocities[:-1]),
-        atol=1e-8,
-    )
-    assert phase(law) is blf.Phase.TRACKING
-
-
 def test_long_chunk_is_followed_from_the_sample_that_was_promised_on(ros):
     """2,000 points, decoded and planned beside the loop: every sample comes, none is late."""
     references = ros.listen(topics.REFERENCE)

@@ -84,33 +84,26 @@ OF_PLANT = {
 
 @pytest.mark.parametrize('case', CASES)
 def test_value_of_another_unit_or_arm_is_refused_and_can_be_insisted_on(case):
-    arm, name, value, words, large = CASES[case]
-    with pytest.raises(ConfigurationError) as caught:
-        build(ControllerConfig, arm | {name: value})
-    (problem,) = caught.value.problems
-    assert re.match(
-        rf'{name}: got .*{words}.*; if it is meant, list {name} in', problem
-    )
-    insisting = build(ControllerConfig, arm | {name: value, 'insist': [name]})
-    assert insisting.insist == (name,)
-    build(
-        ControllerConfig,
-        arm | {name: [*map(float, np.ravel(large))] if np.ndim(large) else large},
-    )
+    is_refused(ControllerConfig, *CASES[case])
 
 
 @pytest.mark.parametrize('case', OF_PLANT)
 @pytest.mark.parametrize('arm', [{}, UR5E])
 def test_value_of_a_simulated_arm_likewise(case, arm):
-    name, value, words, large = OF_PLANT[case]
+    is_refused(PlantConfig, arm, *OF_PLANT[case])
+
+
+def is_refused(config, arm, name, value, words, large):
     with pytest.raises(ConfigurationError) as caught:
-        build(PlantConfig, arm | {name: value})
+        build(config, arm | {name: value})
     (problem,) = caught.value.problems
     assert re.match(
         rf'{name}: got .*{words}.*; if it is meant, list {name} in', problem
     )
-    build(PlantConfig, arm | {name: value, 'insist': [name]})
-    build(PlantConfig, arm | {name: large})
+    insisting = build(config, arm | {name: value, 'insist': [name]})
+    assert insisting.insist == (name,)
+    given = [*map(float, np.ravel(large))] if np.ndim(large) else large
+    build(config, arm | {name: given})
 
 
 @settings(max_examples=25)

@@ -58,13 +58,13 @@ def test_error_in_a_recording_comes_alone_before_anything_else_is_said(piped):
 
 
 def test_commission_says_each_run_and_what_follows_in_a_pipe(piped):
-    lines = piped('commission --config arm.yaml')
+    lines = piped('commission --config arm.yaml --posture 0.2')
     in_order(
         lines,
         'posture 1: ',
-        'simulating 4 runs of 10.5 s, at some ten times real time',
-        'run 1 of 4',
-        'run 4 of 4',
+        'simulating 2 runs of 10.5 s, at some ten times real time',
+        'run 1 of 2',
+        'run 2 of 2',
         'choosing the gains by what was measured: some ten seconds',
         'hinge',
         'hinge',

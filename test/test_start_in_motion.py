@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import re
+from itertools import product
 
 import numpy as np
 import pytest
+from nights import at_night, one_by_day
 from scenario import Scenario, carrying, changed, every
 
 import blf_dsc_controller as blf
@@ -49,9 +51,10 @@ ARMS = {
 }
 
 
-@pytest.mark.parametrize('reference', ['sinusoids', 'hold'])
-@pytest.mark.parametrize('back', ['start', 'reset'])
-@pytest.mark.parametrize('preset', ARMS)
+@pytest.mark.parametrize(
+    ('preset', 'back', 'reference'),
+    one_by_day(3, product(ARMS, ('start', 'reset'), ('sinusoids', 'hold'))),
+)
 def test_arm_that_is_taken_over_in_motion_gets_no_faster_than_it_is_asked_to(
     preset, back, reference
 ):
@@ -70,7 +73,7 @@ def test_arm_that_is_taken_over_in_motion_gets_no_faster_than_it_is_asked_to(
     assert excess(leaving, after) < SLACK[reference]
 
 
-@pytest.mark.parametrize('seconds', [6.25, 6.3, 6.35, 6.4, 3.7])
+@pytest.mark.parametrize('seconds', [6.3, 3.7, *at_night(6.25, 6.35, 6.4)])
 def test_arm_that_forgets_its_load_in_motion_gets_no_faster_than_it_is_asked_to(
     seconds,
 ):
@@ -112,20 +115,6 @@ def test_wrist_of_an_arm_that_is_reset_in_motion_does_not_fall_with_its_load(pre
     before = arm.run(4.5).since(-200)
     arm.controller.reset()
     assert excess(before, arm.run(0.08)) < SLACK['hold']
-
-
-@pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
-def test_first_torque_in_motion_continues_the_one_that_acts(preset):
-    """Within the rate limit of the file; without it the first one jumps."""
-    arm = arm_of(preset)
-    arm.run(1.5)
-    arm.controller.stop()
-    last = arm.run(0.05).torque[-1]
-    arm.controller.reset()
-    first = arm.run(arm.T).torque[0]
-    assert arm.is_running
-    step = np.array(arm.config.torque.rate_limit) * arm.T
-    assert np.all(np.abs(first - last) <= step * (1.0 + 1e-9))
 
 
 def test_restarted_controller_says_that_the_arm_still_moves():
@@ -185,7 +174,7 @@ def left_in_motion(preset, leave, gap, seconds):
     return before, arm.run(1.0, spoil=every(gap))
 
 
-@pytest.mark.parametrize('gap', [0.03, 0.11])
+@pytest.mark.parametrize('gap', [0.11, *at_night(0.03)])
 @pytest.mark.parametrize('preset', ['panda', 'fr3', 'ur5e'])
 def test_ramp_of_a_deactivation_lasts_as_long_while_states_have_gaps(preset, gap):
     """It counted states: the arm accelerated on, to 28, 8.8 and 9.3 rad/s."""

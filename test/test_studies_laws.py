@@ -32,6 +32,7 @@ from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.studies import laws
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize('name', tuning.TASKS)
 def test_committed_gains_beat_the_middle_of_their_ranges(name):
     """By at least a decade of the search's objective, whose value is stated in their file."""
@@ -68,6 +69,7 @@ def found(report):
     return json.loads((report / 'results.json').read_text(encoding='utf-8'))
 
 
+@pytest.mark.nightly
 def test_claims_and_laws_are_printed_and_figures_drawn(report, found):
     printed = (report.parent / 'printed.txt').read_text()
     for claim in found['claims']:
@@ -77,6 +79,7 @@ def test_claims_and_laws_are_printed_and_figures_drawn(report, found):
     assert len(list(report.glob('*.png'))) == 5
 
 
+@pytest.mark.nightly
 def test_verdicts_follow_from_the_runs_of_the_report(found):
     """Those verdicts about which the mathematics leaves no doubt."""
     verdicts = {row['says']: row['verdict'] for row in found['claims']}
@@ -95,6 +98,7 @@ def test_verdicts_follow_from_the_runs_of_the_report(found):
         assert bool(row['condition']) or row['verdict'] != ONLY_IF
 
 
+@pytest.mark.nightly
 def test_saved_configurations_are_those_that_ran(report, found):
     """Running one case of a sweep again from its file reproduces the number in the report."""
     name = case_name('delay', 'comparison', 1.0)
@@ -148,6 +152,7 @@ def test_every_parameter_named_on_the_page_of_gains_exists():
     assert set(wanted) <= known_names()
 
 
+@pytest.mark.nightly
 def test_table_of_the_laws_matches_the_presets(found):
     """Columns as `make paper` writes them: joint1 / joint2. README has some of the rows."""
     row = r'^\| `(\w+)`[^|]*\| ([\d.]+) / ([\d.]+) \| ([\d.]+) / ([\d.]+) \| ([\d.]+)?'

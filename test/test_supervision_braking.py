@@ -39,24 +39,6 @@ def test_braking_takes_energy_out_of_any_motion(settings, seed):
     assert np.linalg.eigvalsh(D).min() > 0.0
 
 
-def test_joints_with_one_rate_brake_each_by_itself(settings):
-    draw = np.random.default_rng(0)
-    q, v = draw.uniform(-1.5, 1.5, (2, settings.n))
-    M = inertia(settings, q)
-    D = braking_matrix(settings, 8.0 * np.diagonal(M), q)
-    np.testing.assert_allclose(np.linalg.solve(M, D @ v), 8.0 * v, rtol=1e-9)
-
-
-def test_slower_joint_in_front_acts_on_a_faster_one_as_its_own_braking_does(settings):
-    """The torque on the wrist that the deceleration of the shoulder asks for, and no more."""
-    q = np.linspace(-0.5, 0.5, settings.n)
-    M = inertia(settings, q)
-    rate = np.linspace(5.0, 30.0, settings.n)  # 1/s, shoulder to wrist
-    D = braking_matrix(settings, rate * np.diagonal(M), q)
-    np.testing.assert_allclose(D[1:, 0], 5.0 * M[1:, 0])
-    np.testing.assert_allclose(D[0, 1:], 5.0 * M[0, 1:])
-
-
 @pytest.mark.parametrize('gap', [0.03, 0.05, 0.11])
 @pytest.mark.parametrize('seed', range(3))
 def test_damping_that_is_held_for_a_gap_reverses_no_motion_of_the_model(

@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from nights import at_night
 
 from blf_dsc_controller import (
     ConfigurationError,
@@ -199,10 +200,9 @@ def test_adaptation_integrates_no_faster_than_the_disturbance_estimate():
 @pytest.mark.parametrize(
     ('preset', 'changes', 'moving', 'picked'),
     [
-        ('fr3_direct', {}, 1.0, 25.0),
         ('fr3_direct', {'joint.stiffness': [1e4] * 7}, 1.0, 25.0),
-        ('ur5e', {}, 5.0, 15.0),
         ('ur5e', {'sensor.side': 'motor', 'joint.stiffness': [1e4] * 6}, 5.0, 15.0),
+        *at_night(('fr3_direct', {}, 1.0, 25.0), ('ur5e', {}, 5.0, 15.0)),
     ],
 )
 def test_gains_of_the_presets_hold_on_elastic_joints(preset, changes, moving, picked):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from nights import one_by_day
 from scenario import Scenario
 
 import blf_dsc_controller as blf
@@ -87,7 +88,7 @@ ARMS = {
 IN_FLIGHT = 0.2  # s, with what swings until it is found
 
 
-@pytest.mark.parametrize('arm', ARMS)
+@pytest.mark.parametrize('arm', one_by_day(3, ARMS))
 def test_stop_of_an_arm_that_nobody_foresaw_brakes_it(arm, tmp_path):
     """Random arms whose motors have down to a fifth of the guess, behind any gears.
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fault_table import MILLISECOND, Rig
+from nights import at_night
 from scenario import Scenario, changed
 
 import blf_dsc_controller as blf
@@ -22,9 +23,8 @@ ALL_REVERSED = changed(dq=lambda dq: -dq)
     ('spoil', 'at', 'travel'),
     [
         (STUCK, 0.0, 0.25),
-        (STUCK, 2.0, 0.5),
-        (REVERSED, 0.0, 0.25),
         (REVERSED, 2.0, 0.5),
+        *at_night((STUCK, 2.0, 0.5), (REVERSED, 0.0, 0.25)),
     ],
 )
 def test_fr3_with_a_wrong_velocity_of_joint_2_comes_to_rest(spoil, at, travel):

@@ -16,9 +16,9 @@ SLOW = 0.02  # rad/s
 
 
 def arm_of(preset, given=None):
-    """Return an arm that its controller has held with its load for 3 s."""
+    """Return an arm that its controller has held with its load for 1.5 s."""
     arm = Scenario(preset, HOLD | (given or {}), plant=LOAD)
-    arm.run(3.0)
+    arm.run(1.5)
     return arm
 
 

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
+from nights import at_night, one_by_day
 from scenario import Scenario, changed, frozen
 
 import blf_dsc_controller as blf
@@ -84,18 +86,22 @@ class Echo:
         self._plant.step(torque)
 
 
-@pytest.mark.parametrize(('late', 'lag'), [(0, 0.0), (2, 0.0), (1, 0.005)])
-@pytest.mark.parametrize('pole', [150.0, 300.0])
-@pytest.mark.parametrize('stiffness', [1e4, 1.4e4, 5e4])
+ECHOES = (0, 0.0), (2, 0.0), (1, 0.005)  # samples late, lag [s]
+
+
+@pytest.mark.parametrize(
+    ('stiffness', 'pole', 'echo'),
+    one_by_day(4, product((1e4, 1.4e4, 5e4), (150.0, 300.0), ECHOES)),
+)
 def test_panda_whose_efforts_are_commands_goes_on_without_the_observer_or_stops(
-    stiffness, pole, late, lag
+    stiffness, pole, echo
 ):
     """Of currents of motors, efforts are commands behind a lag."""
-    arm = Scenario('panda', {POLE: pole}, plant=Echo(stiffness, late, lag))
+    arm = Scenario('panda', {POLE: pole}, plant=Echo(stiffness, *echo))
     assert_ends_well(arm, arm.run(3.5))
 
 
-@pytest.mark.parametrize('pole', [150.0, 300.0])
+@pytest.mark.parametrize('pole', [300.0, *at_night(150.0)])
 @pytest.mark.parametrize('preset', ['panda', 'fr3', 'fr3_direct'])
 def test_arm_with_encoders_at_the_motors_goes_on_without_the_observer_or_stops(
     preset, pole

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenario import Scenario, carrying, repeated
+from watched_arm import WatchedArm
 
 import blf_dsc_controller as blf
-from blf_dsc_controller.supervision.torque_watchdog import TorqueWatchdog
 
 HOLD = {'reference.type': 'hold'}
 
@@ -154,20 +154,9 @@ def test_clock_that_is_set_by_an_hour_leaves_the_rate_limit_of_a_torque(torque):
 @pytest.mark.parametrize('bad', [np.inf, np.nan, 1e300])
 def test_watchdog_holds_a_resting_arm_after_a_command_that_is_none(bad):
     """It commanded 87 N m for 0.1 s after one `inf`."""
-    config = blf.load_loop('fr3').controller
-    watchdog = TorqueWatchdog(config, 0.05)
-    n = len(config.joints)
-    state = np.concatenate(
-        (blf.load_loop('fr3').plant.initial.position, np.zeros(2 * n))
-    )
-    torques = []
-    for k in range(150):
-        now = k * config.sample_time
-        watchdog.take_state(10**9 + k * config.sample_time_ns, state, now)
-        if k < 50:
-            watchdog.take_torque(np.full(n, bad if k == 49 else 0.0), now)
-        torque = watchdog.poll(now)
-        if torque is not None:
-            torques.append(torque.copy())
-    assert torques
-    assert np.abs(torques).max() < 1.0
+    arm = WatchedArm('fr3', HOLD)
+    arm.run(0.2)
+    arm.line.take_torque(np.full(arm.n, bad), arm.now)
+    arm.run(0.2, hangs=True)
+    assert arm.taken
+    assert np.abs(arm.taken).max() < 1.0

@@ -21,6 +21,7 @@ from ros_rig import JOINTS, PATIENCE, START, FakeClock, PatientClock, values
 from std_msgs.msg import String
 
 import blf_dsc_controller as blf
+from blf_dsc_controller.configuration.nodes import CONTROLLER, dump
 from blf_dsc_controller.configuration.schema import build, flatten
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.messages import topics
@@ -33,7 +34,6 @@ from blf_dsc_controller.nodes.controller_node import ControllerNode
 from blf_dsc_controller.nodes.plant_node import PlantNode
 from blf_dsc_controller.nodes.watchdog_node import WatchdogNode
 from blf_dsc_controller.supervision.model_torque import gravity_torque
-from sim_plant.plant import plant_of
 
 FR3 = CONFIG / 'fr3.yaml'
 UR5E = CONFIG / 'ur5e_driver.yaml'
@@ -106,60 +106,13 @@ def test_arm_in_motion_comes_to_rest_beside_a_dead_process(ros, controller, end)
     ros.until(lambda: not watchdog.watchdog.active, PATIENCE)
 
 
-@pytest.mark.parametrize('held', [0.0, 5.0], ids=['restarted afterwards', 'watching'])
-def test_watchdog_continues_from_the_torque_that_the_drive_holds(
-    ros, monkeypatch, held
-):
-    """At most 1 N m away, as an FR3 demands.
-
-    If it was restarted after the controller had died, it cannot know it: that of the
-    model is sent at once.
-    """
-    monkeypatch.setattr(sys, 'argv', ['node', '--ros-args', '--params-file', str(FR3)])
-    config = blf.load_loop(FR3).plant
-    plant = plant_of(config)
-    torque = np.append(held, np.zeros(6))
-    commands = ros.listen(topics.COMMANDS)
-    states = ros.publisher(topics.JOINT_STATES)
-    controller = ros.publisher(topics.COMMANDS)
-    watchdog = ros.add(
-        partial(WatchdogNode, steady=lambda: plant.elapsed_ns), {'armed': True}
-    )
-    ros.until(
-        lambda: (
-            states.get_subscription_count() and controller.get_subscription_count() == 2
-        )
-    )
-    encoder = JointStateEncoder(config.joints)
-    for k in range(100):
-        stamp = 10**9 + plant.elapsed_ns
-        if held and k < 30:
-            controller.publish(Float64MultiArrayEncoder(7).encode(torque))
-            ros.until(lambda k=k: len(commands) > k)
-        states.publish(encoder.encode(stamp, *plant.measure().reshape(3, -1)))
-        ros.until(lambda stamp=stamp: watchdog.watchdog.stamp == stamp)
-        plant.step(torque)
-    own = 30 if held else 0
-    ros.until(lambda: len(commands) > own)
-    assert watchdog.watchdog.active
-    # not 4 ms, at the limit of the torque's rate
-    assert watchdog._timer.period == pytest.approx(1e-3)
-    assert watchdog.watchdog.silence == pytest.approx(0.05, abs=0.01)
-    np.testing.assert_allclose(commands[own].data, torque, atol=1.01 if held else 0.1)
-    ros.executor.remove_node(watchdog)
-    ros.spin(0.1)
-    count = len(commands)
-    watchdog.close()  # the driver holds the last torque
-    ros.until(lambda: len(commands) > count)
-
-
 class ByHand:
     """A controller and an arm by hand, at 1 kHz of a clock of their own, beside a watchdog."""
 
-    def __init__(self, ros, config):
+    def __init__(self, ros, config, **parameters):
         self.ros = ros
         self.clock = FakeClock()
-        self.node = ros.add(partial(WatchdogNode, steady=self.clock))
+        self.node = ros.add(partial(WatchdogNode, steady=self.clock), parameters)
         self.config = config
         self._stamp = 10**9
         self._events = Journal()
@@ -239,6 +192,35 @@ class ByHand:
 
 
 HOLDING = {'safety.torque': 'hold_gravity'}
+
+
+@pytest.mark.parametrize('armed', [False, True], ids=['watching', 'restarted since'])
+def test_watchdog_continues_from_the_torque_that_the_drive_holds(
+    ros, armed, tmp_path, monkeypatch
+):
+    """At the limit of its rate.
+
+    If it was restarted after the controller had died, it cannot know it: that of the
+    model is sent at once.
+    """
+    limited = HOLDING | {'torque.rate_limit': [100.0, 100.0]}
+    dump(tmp_path / 'law.yaml', {CONTROLLER: limited})
+    words = ['node', '--ros-args', '--params-file', str(tmp_path / 'law.yaml')]
+    monkeypatch.setattr(sys, 'argv', words)  # as of the controller, for a restart
+    loop = ByHand(ros, build(blf.ControllerConfig, limited), armed=armed)
+    model, loop.holding = loop.holding, loop.holding + 3.0
+    if not armed:
+        loop.go_on(0.03, commands=True)
+    loop.torque()
+    first = next(each.data for each in loop._received if each.layout.dim)
+    np.testing.assert_allclose(first, model if armed else loop.holding, atol=0.11)
+    # not 4 ms, at which it watches
+    assert loop.node._timer.period == pytest.approx(1e-3)
+    ros.executor.remove_node(loop.node)
+    ros.spin(0.1)
+    count = len(loop._received)
+    loop.node.close()  # the driver holds the last torque
+    ros.until(lambda: len(loop._received) > count)
 
 
 @pytest.mark.parametrize(
