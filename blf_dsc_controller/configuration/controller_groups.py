@@ -67,7 +67,8 @@ class Safety:
     )
     velocity: Literal['measured', 'estimated'] = parameter(
         'measured',
-        'velocity as measured, or estimated from position differences, starting at rest',
+        'velocity as measured, or estimated from position differences, starting at rest: also where '
+        'a driver differences positions of encoders of 12 bits or fewer',
         read_only='the filters hold data that depend on it',
     )
     velocity_limit: PerJoint = positive(
