@@ -30,7 +30,7 @@ def braking_matrix(
     takes energy out of any motion, that of elastic joints included.  M0 is of the initial
     estimate; without one, D is diagonal.  `gap` [s] bounds it as `within_gap` does.
     """
-    M = _inertia(settings, q)
+    M = known_inertia(settings, q)
     if M is None:
         return np.diag(damping)
     rate = _limited_rate(damping / np.diagonal(M), gap)
@@ -46,7 +46,7 @@ def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Arra
     above 1/h, and what the coupling of the joints adds to that divides D.  Without a gap, `gap`
     is 0.
     """
-    M = _inertia(settings, q)
+    M = known_inertia(settings, q)
     if M is None:
         return damping
     inertia = np.diagonal(M)
@@ -54,7 +54,7 @@ def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Arra
     return np.diagonal(_without_reversal(tolerated, M, gap))
 
 
-def _inertia(settings: Settings, q: Array) -> Array | None:
+def known_inertia(settings: Settings, q: Array) -> Array | None:
     """Return M0 (n, n) [kg m^2] at q (n,) [rad]; None without a positive estimate."""
     M = inertia_matrices(
         settings.model, settings.initial_estimate[: settings.p], q[np.newaxis]

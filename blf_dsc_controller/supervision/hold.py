@@ -19,7 +19,7 @@ from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST
-from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
+from blf_dsc_controller.supervision.braking import braking_matrix, known_inertia, within_gap
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.envelope import limited
 from blf_dsc_controller.supervision.model_torque import gravity_torque, needed_torque
@@ -291,11 +291,23 @@ class Hold:
             return
         limit = self._settings.torque.limit
         lacking = self.commanded - needed
+        noise = self._noise_of_steps(dt)
         for each in (self._usual, self._calm):
-            each.update(lacking, limit, dt)
+            each.update(lacking, limit, dt, noise)
         is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
         is_calm |= not self._last.is_measured
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
+
+    def _noise_of_steps(self, dt: float) -> Vector | float:
+        """Return the torque (n,) [N m] of the accelerations that the steps of encoders show.
+
+        They are of differences of positions twice over `dt` [s]; 0 without a model.
+        """
+        M = known_inertia(self._settings, self._last.q)
+        if M is None or dt == 0.0:
+            return 0.0
+        noise: Vector = np.abs(M) @ (self._sensor.resolution / (dt * dt))
+        return noise
 
     def _begin_observing(self, load: Vector | float) -> None:
         for each in (self._usual, self._calm):

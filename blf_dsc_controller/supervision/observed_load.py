@@ -8,6 +8,10 @@ On a joint that is lighter than its model by m, the model's acceleration comes b
 times too large.  With the delay T of the torques it is stable while
 
     m T L1 L2 < L1 + L2
+
+A sample counts as no more than the torque limit, so that one wrong reading changes little, and as
+what the steps of the encoders explain, whose accelerations add up to nothing.  Limited to less,
+they would hide those of the arm, and its own damping would pass for a load.
 """
 
 from __future__ import annotations
@@ -40,13 +44,17 @@ class ObservedLoad:
         """Begin with a load (n,) [N m]."""
         self.load[:] = self._residual[:] = load
 
-    def update(self, unmodelled: Vector, limit: Vector, dt: float) -> None:
+    def update(
+        self, unmodelled: Vector, limit: Vector, dt: float, noise: Vector | float = 0.0
+    ) -> None:
         """Advance by `dt` [s] with the torque beyond the model (n,) [N m] in it.
 
-        `limit` (n,) [N m] is the torque limit.
+        `limit` (n,) [N m] is the torque limit, `noise` (n,) [N m] what the steps of the encoders
+        add to the torque of a sample.
         """
         first, second = (min(1.0, rate * dt) for rate in self._rates)
-        self._residual += first * np.clip(unmodelled - self._residual, -limit, limit)
+        widest = limit + noise
+        self._residual += first * np.clip(unmodelled - self._residual, -widest, widest)
         self.load += second * (self._residual - self.load)
         largest = _LARGEST_LOAD * limit
         np.clip(self.load, -largest, largest, out=self.load)
