@@ -97,6 +97,20 @@ def test_stop_by_states_that_come_late_brakes_the_arm(preset, samples):
     assert record.speed[-1].max() < 0.3
 
 
+@pytest.mark.parametrize('preset', ['panda', 'ur5e'])
+def test_velocities_differenced_from_coarse_encoders_throw_no_arm_that_leaves_command(
+    preset,
+):
+    """Of 12 bits: what a stop observed by them moved both at 3 to 6 rad/s for ever."""
+    sensor = {'sensor.resolution': 1.534e-3, 'sensor.velocity': 'differenced'}
+    arm = Scenario(preset, HOLD, plant=sensor)
+    before = arm.run(0.6)
+    arm.controller.stop()
+    record = arm.run(4.0)
+    assert record.speed.max() < before.speed.max() + 0.6
+    assert record.speed[-1].max() < 0.05
+
+
 def test_states_of_another_are_named():
     arm, _, _ = played('fr3', Play('of another', 0.5, 3, 5, 1), moves=False)
     assert arm.controller.phase is blf.Phase.SAFE_STOP

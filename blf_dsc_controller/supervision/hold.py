@@ -19,7 +19,11 @@ from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST
-from blf_dsc_controller.supervision.braking import braking_matrix, known_inertia, within_gap
+from blf_dsc_controller.supervision.braking import (
+    braking_matrix,
+    known_inertia,
+    within_gap,
+)
 from blf_dsc_controller.supervision.command_effect import CommandEffect
 from blf_dsc_controller.supervision.envelope import limited
 from blf_dsc_controller.supervision.model_torque import gravity_torque, needed_torque
