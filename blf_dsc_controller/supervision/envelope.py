@@ -104,7 +104,11 @@ class Envelope:
     def configure(self, limits: Limits, body: Body) -> None:
         """Use other limits from the next torque on."""
         self.limits, self.body = limits, body
-        self._still = np.zeros((1, limits.torque.size))
+        n = limits.torque.size
+        self._still = np.zeros((1, n))
+        limited(
+            np.zeros(n), None, limits.torque, limits.step
+        )  # compiled before the first torque
 
     def restart(self) -> None:
         """Begin with the next torque, of a law that has asked for nothing yet."""

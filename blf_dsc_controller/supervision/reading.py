@@ -160,7 +160,7 @@ class Readings:
 
     def set_limits(self, safety: Safety) -> None:
         """Take these for the largest speeds of the joints from the next state on."""
-        self.fastest = np.array(safety.velocity_limit)
+        self.fastest = np.array(safety.velocity_limit, dtype=np.float64)
 
     def count_turns_anew(self, config: ControllerConfig) -> None:
         """Count turns from the next state on, of joints that a configuration describes."""
