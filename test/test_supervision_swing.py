@@ -66,6 +66,16 @@ def test_joint_that_has_swung_is_braked_again_if_it_moves_on():
     assert abs(speeds[-1]) < 0.1
 
 
+def test_arm_that_a_hand_moves_to_and_fro_keeps_all_of_the_damping():
+    """Every 4 s at up to 0.3 rad/s: it would be missing once the arm falls."""
+    swing = Swing(1)
+    swing.begin()
+    for t in np.arange(0.0, 16.0, T):
+        v = np.array([0.3 * np.sin(0.5 * np.pi * t)])
+        swing.observe(v, np.zeros(1), np.zeros(1), T)
+        assert swing.share[0] == 1.0
+
+
 def test_steps_of_coarse_encoders_are_no_swing():
     """Of 0.38 mrad, in Damiao's frames: a differenced velocity comes in steps of 0.38 rad/s."""
     coarse = {'sensor.resolution': 3.8e-4, 'sensor.velocity': 'differenced'}

@@ -31,7 +31,8 @@ from blf_dsc_controller.numerics.algebra import cholesky_factor, cholesky_solve
 _ALARM_RATIO = 8.0
 # s from one change to the next.  A load that comes on may be detected twice so soon; rows that
 # change a third time are of no arm
-_SOON_TIME, _HASTY_TIME = 0.3, 2.0
+_SOON_TIME = 0.3
+_HASTY_CHANGES = 2.0  # in a row, each so soon after the one before
 
 
 class State(NamedTuple):
@@ -184,14 +185,14 @@ def count_change(
 ) -> None:
     """Count a change of the arm; forget window and latch.  The `estimate` (m,) becomes the anchor.
 
-    The third change that soon follows another is attributed to a torque that lasts: the rows'
-    noise is raised, so that learning goes on.  `dt` [s] is the sample time.
+    The third of three changes that soon follow one another is attributed to a torque that lasts:
+    the rows' noise is raised, so that learning goes on.  `dt` [s] is the sample time.
     """
     window_settings = sliding.settings
     age = sliding.state.rows[0] * window_settings.row_interval * dt
     state.changes[0] += 1.0
     state.hasty[0] = state.hasty[0] + 1.0 if age < _SOON_TIME else 0.0
-    if state.hasty[0] >= _HASTY_TIME:
+    if state.hasty[0] >= _HASTY_CHANGES:
         innovation.raise_noise(state.innovation)
     state.contradiction[0] = state.recent_residual[0]
     state.recent_residual[0] = 0.0

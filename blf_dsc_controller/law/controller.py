@@ -39,7 +39,7 @@ class Controller:
 
     Attributes:
         law: the law, with its own gains.
-        given_law: the same as kernels get it.
+        kernel_law: the same as kernels get it.
         settings: settings of the loop and the learning; views of `settings_vector`.
         state: views of `state_vector`, the whole state of the controller.
         signals: views of the values that the last update computed.
@@ -173,11 +173,11 @@ class Controller:
 
     def _take(self, measurement: Array) -> None:
         """Copy a measurement to where the kernels read it."""
-        kernel_law = np.shape(measurement)
-        if kernel_law != self._measurement.shape:
+        shape = np.shape(measurement)
+        if shape != self._measurement.shape:
             n = self.settings.n
             raise BlfDscError(
-                f'measurement: got an array of shape {kernel_law}, but {n} joints need ({3 * n},): '
+                f'measurement: got an array of shape {shape}, but {n} joints need ({3 * n},): '
                 'positions, velocities and torques, one after the other'
             )
         self._measurement[:] = measurement

@@ -128,7 +128,7 @@ def window_residual(running: Array, theta: Array) -> float:
 def find_spare_inertia(
     model: ArmModel, workspace: Workspace, q: Array, theta: Array, P0: Array
 ) -> None:
-    """Write M(q; theta - 0.1 P^(0)) (n, n) to `workspace.inertia`, lower triangle.
+    """Write M(q; theta - 0.1 P^(0)) (n, n) to `workspace.inertia`, upper triangle.
 
     theta (m,) is physical there if that is positive definite.  q (n,) [rad], P0 (p,).
     """

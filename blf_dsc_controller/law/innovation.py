@@ -192,7 +192,7 @@ def noise_estimate(
 ) -> float:
     """Return s^2 [(N m)^2]: the `mean` square of `count` rows, and an assumption that fades.
 
-    `unmodelled` [(N m)^2] is the assumption, which counts as 100 rows at first.
+    A tenth of `unmodelled` [(N m)^2] is assumed, which counts as 100 rows at first.
     """
     assumed_rows = _ASSUMED_ROWS * (1.0 - count / window_rows)
     assumed_fraction = assumed_rows / (assumed_rows + count)

@@ -392,7 +392,7 @@ def update_innovation(
     dqr: Array,
     period: float,
 ) -> bool:
-    """Compare a row (n, m + 1) with the solution; return whether the last ones contradict it."""
+    """Compare a row (n, m + 2 n + 1) with the solution; return whether the last contradict it."""
     e = workspace.torque
     x = state.solution
     add_load_columns(settings, not is_first(state), row, workspace.rows)

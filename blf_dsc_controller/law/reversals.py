@@ -110,7 +110,7 @@ def begin(settings: Settings, state: State) -> None:
 
 @inner
 def beyond(x: float, dead_zone: float) -> float:
-    """Return z(x), by how much x is outside of [-band, band]."""
+    """Return z(x), by how much x is outside of [-dead_zone, dead_zone]."""
     return x - clip(x, -dead_zone, dead_zone)
 
 
@@ -125,8 +125,8 @@ def add_row(
 ) -> bool:
     """Add a row of joint i, `dt` [s] after the last, to its present reversal.
 
-    Return whether this row is the first from which the reversal identifies its friction.  It
-    then gives c_1 as well.  k is k^.
+    Return whether this row is the first from which the reversal identifies its friction.  c_1
+    follows from this and each later one.  k is k^.
     """
     sums = state.evidence.present
     s, b, e, weight = row

@@ -63,20 +63,17 @@ def compare_state(
 
 
 @kernel
-def limit_torque(torque: Array, last: Array, limit: Array, step: Array) -> bool:
+def limit_torque(torque: Array, last: Array, limit: Array, step: Array) -> None:
     """Keep a torque (n,) [N m] finite, within its `limit`, and a `step` from the `last`.
 
     Where any is not finite, the last one stays.  The level takes precedence, for example if
-    it is lowered below the last torque.  Return whether that changes it.
+    it is lowered below the last torque.
     """
     is_finite = True
     for i in range(torque.size):
         is_finite = is_finite and isfinite(torque[i])
-    changes = False
     for i in range(torque.size):
         now = torque[i] if is_finite else last[i]
         now = min(max(now, last[i] - step[i]), last[i] + step[i])
         now = min(max(now, -limit[i]), limit[i])
-        changes = changes or now != torque[i]
         torque[i] = now
-    return changes

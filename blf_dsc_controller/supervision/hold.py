@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller_groups import Safety
+from blf_dsc_controller.law.sensor import FILTER
 from blf_dsc_controller.law.state import Settings
 from blf_dsc_controller.law.torque import added_torque
 from blf_dsc_controller.reference.approach import AT_REST
@@ -34,7 +35,8 @@ from blf_dsc_controller.supervision.swing import Swing
 Vector = NDArray[np.float64]
 
 FADE_TIME = 0.5
-"""Time [s] in which a load that is not sure fades while no state is trusted."""
+"""Time [s] in which a load that is not sure fades while no state is trusted, and what a law held
+the arm by when it is deactivated, without gravity."""
 
 _RESTED = 10.0 / OBSERVER[1]  # s at rest, in which the observed load settles
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
@@ -295,22 +297,25 @@ class Hold:
             return
         limit = self._settings.torque.limit
         lacking = self.commanded - needed
-        noise = self._noise_of_steps(dt)
+        noise = self._noise_of_steps()
         for each in (self._usual, self._calm):
             each.update(lacking, limit, dt, noise)
         is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
         is_calm |= not self._last.is_measured
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
 
-    def _noise_of_steps(self, dt: float) -> Vector | float:
+    def _noise_of_steps(self) -> Vector | float:
         """Return the torque (n,) [N m] of the accelerations that the steps of encoders show.
 
-        They are of differences of positions twice over `dt` [s]; 0 without a model.
+        They are of differences of velocities, and these of positions; 0 without a model.
         """
-        M = known_inertia(self._settings, self._last.q)
-        if M is None or dt == 0.0:
+        last = self._last
+        M = known_inertia(self._settings, last.q)
+        if M is None:
             return 0.0
-        noise: Vector = np.abs(M) @ (self._sensor.resolution / (dt * dt))
+        averaged = last.interval if last.is_measured else FILTER
+        acceleration = self._sensor.resolution / (last.interval * averaged)
+        noise: Vector = np.abs(M) @ acceleration
         return noise
 
     def _begin_observing(self, load: Vector | float) -> None:

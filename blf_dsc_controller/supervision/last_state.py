@@ -37,6 +37,7 @@ class LastState:
         is_measured: whether dq is as measured; else it is `slow`.
         slow: v (n,) [rad/s], the velocity to damp.
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
+        interval: time [s] since the state before, which ddq is over.
         age: time without a trusted state [s]; infinite before the first.
         gap: longest time [s] between two states in which states were missing, at most 0.25 s;
             0 once none were for a quarter of a second.
@@ -51,6 +52,7 @@ class LastState:
         self.dq = self.measurement[n : 2 * n]
         self.slow = np.zeros(n)
         self.ddq: Vector | None = None
+        self.interval = inf
         self.age = inf
         self.gap = 0.0
         self._resumed = 0  # ns, stamp of the state after the last gap
@@ -111,6 +113,7 @@ class LastState:
         is_known = is_next and is_usable == self.is_measured
         self.is_measured = is_usable
         self.ddq = (usable - self.dq) / elapsed if is_known else None
+        self.interval = elapsed
         self.q[:] = q
         self.dq[:] = usable
         self.age = 0.0
@@ -147,7 +150,7 @@ class LastState:
         gap = (stamp - self.stamp) * 1e-9
         if stamp - self._resumed > _REMEMBERED_NS:
             self.gap = 0.0
-        if gap > LONG_GAP * period:
+        if gap < 0.0 or gap > LONG_GAP * period:
             self._resumed = stamp
             if self.stamp >= 0:
                 self.gap = max(self.gap, min(gap, _LONGEST_GAP))

@@ -63,7 +63,7 @@ class Reading(NamedTuple):
     """A joint state, and what the ones before it say about it."""
 
     stamp: int  # ns
-    measurement: Vector  # [q, dq, effort] (3 n,) [rad, rad/s, N m]
+    measurement: Vector  # [q, dq, effort] (3 n,); the next state overwrites it
     gap: float  # s, since the last state that was not in doubt
     is_after_gap: bool  # whether this time is too long to compare the two
     continues: bool  # whether it comes from the last trusted state

@@ -21,8 +21,9 @@ of such a gain at most half stays, whatever the delay is.
 A swing is a half wave of v, from one turning point to the next and through zero, that is
 more than half as high as the one before, twice in a row.  Noise and steps of the sensor
 make none.  The springs of an elastic arm and of its base may also ring by themselves, which
-takes damping away that does them no good.  It comes back, twice as much after each pi tau
-in which a joint moves in one direction: what falls is braked, also while its springs ring.
+takes damping away that does them no good.  It comes back, twice as much each time that a joint
+has moved in one direction for pi tau, or twice its last half wave: what falls is braked, also
+while its springs ring.  What a hand moves to and fro is slower than any delay makes a joint.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ _SWING_STEPS = 5.0
 _LEAST_DAMPING = 0.04
 _GAIN_MARGIN = 0.5  # of a gain at which a joint swings
 _LONGEST_SWING = pi * FILTER  # s, half period at omega = 1/tau
+_SLOWEST_SWING = 0.6  # s, of a joint whose states come 0.25 s late
 
 
 class Swing:
@@ -109,7 +111,7 @@ class Swing:
             self._end_half_waves(ends, travel, travel > least)
             self._farthest[ends] = v[ends]
             self._farthest_at[ends] = self._since[ends]
-        steady_for = np.maximum(_LONGEST_SWING, 2.0 * self._half)
+        steady_for = np.clip(2.0 * self._half, _LONGEST_SWING, _SLOWEST_SWING)
         returns = (self._steady > steady_for) & (np.abs(v) > 0.5 * least)
         if returns.any():
             self.share[returns] = np.minimum(1.0, 2.0 * self.share[returns])
@@ -133,7 +135,7 @@ class Swing:
         lasts = ends & is_clear & returns & (self._half > 0.0)
         lasts &= travel > _SWING_RATIO * self._travel
         self._lasting[ends] = np.where(lasts, self._lasting + 1.0, 0.0)[ends]
-        swings = lasts & (self._lasting >= _SWINGS_IN_A_ROW)
+        swings = lasts & (self._lasting >= _SWINGS_IN_A_ROW) & (half < _SLOWEST_SWING)
         less = np.minimum(_GAIN_MARGIN, (half / _LONGEST_SWING) ** 2)
         self.share[swings] = np.maximum(_LEAST_DAMPING, self.share * less)[swings]
         self.has_swung |= swings
