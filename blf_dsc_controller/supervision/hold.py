@@ -104,7 +104,7 @@ class Hold:
         self.configure(settings, estimate, period)
         self._last, self._sensor = readings.last, readings.sensor
         self._start = np.zeros(n)
-        self._duration = self._elapsed = 0.0
+        self._duration = self._settling = self._elapsed = 0.0
         self._usual = ObservedLoad(n, OBSERVER)
         self._calm = ObservedLoad(n, _CALM_OBSERVER)
         self._oscillates = False
@@ -143,12 +143,14 @@ class Hold:
         load: Vector,
         *,
         ramp: float = 0.0,
+        settling: float = 0.0,
         source: Load = Load.OBSERVED,
         oscillates: bool = False,
     ) -> None:
         """Begin to hold, with this `load`, by a linear `ramp` [s] from the last torque.
 
-        The load of an arm that `oscillates` is observed more slowly.
+        The load of an arm that `oscillates` is observed more slowly.  `settling` is the time [s]
+        before which the arm does not count as settled.
         """
         self._begin_observing(load)
         self._known_load[:] = load
@@ -158,7 +160,7 @@ class Hold:
         self._source = source
         self._rested = 0.0
         self._start[:] = self.commanded
-        self._duration = ramp
+        self._duration, self._settling = ramp, settling
         self._elapsed = 0.0
 
     def yield_to_contact(self) -> None:
@@ -182,10 +184,9 @@ class Hold:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the ramp is over and the arm at rest, as far as its states show."""
-        is_over = self._elapsed >= self._duration
+        """Whether the torque has settled and the arm rests, as far as its states show."""
         return (
-            is_over
+            self._elapsed >= self._settling
             and self._last.age == 0.0
             and float(np.abs(self._last.dq).max()) < AT_REST
         )

@@ -113,7 +113,9 @@ class SafeStop:
         """
         self._swings.begin()
         ramp = FILTER if safety.torque == 'hold_gravity' else FADE_TIME
-        self._hold.begin(self._held.load(), ramp=ramp, source=Load.UNTIL_MOVED)
+        self._hold.begin(
+            self._held.load(), ramp=ramp, settling=FADE_TIME, source=Load.UNTIL_MOVED
+        )
 
     def begin_anew(self, load: Vector) -> None:
         """Begin the torque of a law that forgets what it has learned, with this load (n,) [N m]."""
