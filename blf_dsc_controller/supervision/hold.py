@@ -35,8 +35,7 @@ from blf_dsc_controller.supervision.swing import Swing
 Vector = NDArray[np.float64]
 
 FADE_TIME = 0.5
-"""Time [s] in which a load that is not sure fades while no state is trusted, and what a law held
-the arm by when it is deactivated, without gravity."""
+"""Time [s] in which a load that is not sure fades while no state is trusted."""
 
 _RESTED = 10.0 / OBSERVER[1]  # s at rest, in which the observed load settles
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
@@ -104,7 +103,7 @@ class Hold:
         self.configure(settings, estimate, period)
         self._last, self._sensor = readings.last, readings.sensor
         self._start = np.zeros(n)
-        self._duration = self._settling = self._elapsed = 0.0
+        self._duration = self._elapsed = 0.0
         self._usual = ObservedLoad(n, OBSERVER)
         self._calm = ObservedLoad(n, _CALM_OBSERVER)
         self._oscillates = False
@@ -143,14 +142,12 @@ class Hold:
         load: Vector,
         *,
         ramp: float = 0.0,
-        settling: float = 0.0,
         source: Load = Load.OBSERVED,
         oscillates: bool = False,
     ) -> None:
         """Begin to hold, with this `load`, by a linear `ramp` [s] from the last torque.
 
-        The load of an arm that `oscillates` is observed more slowly.  `settling` is the time [s]
-        before which the arm does not count as settled.
+        The load of an arm that `oscillates` is observed more slowly.
         """
         self._begin_observing(load)
         self._known_load[:] = load
@@ -160,7 +157,7 @@ class Hold:
         self._source = source
         self._rested = 0.0
         self._start[:] = self.commanded
-        self._duration, self._settling = ramp, settling
+        self._duration = ramp
         self._elapsed = 0.0
 
     def yield_to_contact(self) -> None:
@@ -184,9 +181,10 @@ class Hold:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the torque has settled and the arm rests, as far as its states show."""
+        """Whether the ramp is over and the arm at rest, as far as its states show."""
+        is_over = self._elapsed >= self._duration
         return (
-            self._elapsed >= self._settling
+            is_over
             and self._last.age == 0.0
             and float(np.abs(self._last.dq).max()) < AT_REST
         )
