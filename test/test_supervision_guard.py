@@ -100,6 +100,15 @@ def test_arm_that_leaves_command_rests_although_its_model_may_be_wrong(
     assert faster.max() < 0.05
 
 
+def test_arm_that_is_deactivated_stays_where_it_rests():
+    """A disturbance of 0.1 N m passed for another that moves it, and it fell by 1.6 rad."""
+    arm = arm_of(HOLDING)
+    arm.run(0.3)
+    arm.controller.stop()
+    rest = arm.run(2.0).q[-1]
+    assert np.abs(arm.run(6.0).q - rest).max() < 0.02
+
+
 def test_reset_of_a_stopped_arm_forgets_what_it_learned_and_drops_nothing():
     """Half of gravity was learned: the load that is carried on grows by what is forgotten."""
     arm = arm_of(HALF | HOLDING | {'two_link.learning_weight': 1.0}, QUIET)

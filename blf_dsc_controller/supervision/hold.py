@@ -111,7 +111,7 @@ class Hold:
         self._effect = CommandEffect(n)
         self._swing = Swing(n)
         self._source = Load.OBSERVED
-        self._rested = 0.0  # s, in a row
+        self._rested = self._moved = 0.0  # s, in a row, and since it has rested
 
     def configure(self, settings: Settings, estimate: Vector, period: float) -> None:
         """Use another model from the next torque on."""
@@ -155,7 +155,7 @@ class Hold:
         self._oscillates = oscillates
         self._swing.begin()
         self._source = source
-        self._rested = 0.0
+        self._rested = self._moved = 0.0
         self._start[:] = self.commanded
         self._duration = ramp
         self._elapsed = 0.0
@@ -253,14 +253,24 @@ class Hold:
         return torque
 
     def _keep_load_once_moved(self, dt: float) -> None:
-        """Observe the load of an arm that has left command until it has rested, and moves again."""
+        """Return to the load of an arm that has rested out of command, once another moves it.
+
+        It moves for longer then than its load takes to settle: a drift, with its load, ends before.
+        """
         if self._source is not Load.UNTIL_MOVED or self._last.age > 0.0:
             return
-        moves = float(np.abs(self._last.slow).max()) > AT_REST
-        if moves and self._rested > _RESTED:
+        if float(np.abs(self._last.slow).max()) <= AT_REST:
+            self._moved = 0.0
+            self._rested += dt if self._elapsed >= self._duration else 0.0
+            if self._rested > _RESTED:
+                self._known_load[:] = self.load
+            return
+        if self._rested > _RESTED or self._moved > 0.0:
+            self._moved += dt
+        self._rested = 0.0
+        if self._moved > _RESTED:
+            self.load[:] = self._known_load
             self._source = Load.KEPT
-        is_over = self._elapsed >= self._duration
-        self._rested = self._rested + dt if is_over and not moves else 0.0
 
     def _observe_if_answered(self, dt: float) -> None:
         """Observe the load as far as the arm answers to commands, or find that it does not."""
