@@ -35,15 +35,15 @@ from blf_dsc_controller.numerics.intervals import TWO_SIDED
 
 Vector = NDArray[np.float64]
 
-_NARROW = 0.05  # kg, half of the interval of a mass that is declared
-_FRACTION = 0.05  # or this part of the mass
+_NARROW = 0.05  # kg, half of the interval of a mass that is declared ...
+_NARROW_FRACTION = 0.05  # ... or of the mass, if that is more
 _CENTRE = 0.03  # m, likewise of its centre
 _STEP = 0.005  # of the torque limit
 
 
 def widest_interval(mass: ArrayLike) -> Vector:
     """Return half of the widest 95 % interval [kg] with which a mass [kg] is declared."""
-    return np.maximum(_NARROW, _FRACTION * np.abs(mass))
+    return np.maximum(_NARROW, _NARROW_FRACTION * np.abs(mass))
 
 
 class DriveLoads:
