@@ -45,7 +45,7 @@ from blf_dsc_controller.identification.ripple import (
     ripples_of,
 )
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
-from blf_dsc_controller.identification.selection import Selected, select
+from blf_dsc_controller.identification.selection import Selected, repeats, select
 from blf_dsc_controller.identification.stiffness import Compliance, compliance_of
 from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.wider_model import doubt
@@ -293,7 +293,9 @@ def ripples_left(problem: Problem, distances: Floats, fit: Fit) -> tuple[Ripples
     model = problem.parameters.model
     parts = max(1, min(PER_HOP, ROWS // moving.size))
     short = shortened(fit.rows, moving, model, distances, length, parts)
-    return ripples_of(short.with_load(fit.theta), fit.theta)
+    found = ripples_of(short.with_load(fit.theta), fit.theta)
+    again = repeats(fit.rows, problem.windows.fit)
+    return tuple(each._replace(repeats=again) for each in found)
 
 
 def _named(joints: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:
