@@ -216,9 +216,9 @@ def base_table(found: Identified) -> Iterator[str]:
     """Yield the base parameters before and after, and which of them the recording shows."""
     parameters = found.parameters
     K = base_matrix(parameters, len(found.chain.joints))[: len(parameters.combinations)]
-    before = K @ found.prior
+    before = K @ found.prior.mean
     after = K @ found.values
-    prior = np.einsum('ia,ab,ib->i', K, found.prior_covariance, K)
+    prior = np.sum((K @ found.prior.D) ** 2, axis=1)
     posterior = np.einsum('ia,ab,ib->i', K, found.covariance, K)
     yield 'base parameters (all that torques can show), in kg, kg m, kg m^2:'
     for k, name in enumerate(parameters.combinations):
