@@ -21,7 +21,7 @@ import numpy as np
 from blf_dsc_controller.arms.base_parameters import base_parameters
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.mounting import gravity_columns
+from blf_dsc_controller.identification.mounting import gravity_torques
 from blf_dsc_controller.identification.recording import TURN, Recording
 from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.run import Floats
@@ -105,11 +105,10 @@ class _Gravity:
         self, chain: Chain, g: Floats, q: Floats, u: Floats, friction: Floats
     ) -> None:
         """Take friction (k, c, n): c columns of each joint, which explain what they can."""
-        self._chain = chain
+        self._torques = gravity_torques(chain, g)
         self.as_is: Convention = (_AS_IS,) * q.shape[1]
         kinds = [joint.kind for joint in chain.joints]
         self.turning = [i for i, kind in enumerate(kinds) if kind != 'prismatic']
-        self._g = g
         self._q = q
         self._u = u
         # what friction does not explain of each joint, in units of its torque
@@ -122,7 +121,7 @@ class _Gravity:
         """Return the squares that remain if joints count in other ways."""
         if ways not in self._known:
             signs, offsets = signs_and_offsets(ways)
-            weight = gravity_columns(self._chain, signs * self._q + offsets) @ self._g
+            weight = self._torques(signs * self._q + offsets)
             left = (self._u - signs * weight) / self._scale
             explained = [Q.T @ own for Q, own in zip(self._bases, left.T, strict=True)]
             self._known[ways] = float(
