@@ -356,7 +356,11 @@ class TopicMessages:
         layouts = self.words(_LAYOUT, np.arange(self.size, dtype=np.int32))
         is_read = ~np.isin(layouts, [*problems, _UNREADABLE])
         number = np.flatnonzero(is_read).astype(np.int32)
-        foreign = [k for k, each in problems.items() if _is_foreign(each, names)]
+        foreign = [
+            k
+            for k, each in problems.items()
+            if isinstance(each, MissingJointError) and each.is_foreign(names)
+        ]
         is_bad = ~is_read & ~np.isin(layouts, foreign if number.size else [])
         errors = {
             k: self._unreadable.get(k) or problems[layouts[k]]
@@ -381,7 +385,3 @@ class TopicMessages:
             )
             raise UnreadableMessageError(self.name, 0, unnamed)
         return names
-
-
-def _is_foreign(problem: MessageError, names: Collection[str]) -> bool:
-    return isinstance(problem, MissingJointError) and problem.is_foreign(names)

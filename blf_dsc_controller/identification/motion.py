@@ -128,8 +128,8 @@ def checked(motion: Motion, tree: Tree) -> Motion:
 
 def _check_known(motion: Motion, group: Group) -> None:
     """Raise BlfDscError if a column has no numbers."""
-    known = extremes(group.values)
-    empty = np.flatnonzero(known.least > known.most)
+    least, most = extremes(group.values)
+    empty = np.flatnonzero(least > most)
     if empty.size:
         raise BlfDscError(
             f'{motion.path}: {group.names[int(empty[0])]} has no numbers: {motion.others}'
@@ -139,7 +139,8 @@ def _check_known(motion: Motion, group: Group) -> None:
 def _check_angles(motion: Motion, tree: Tree) -> None:
     """Raise BlfDscError if positions are far beyond what the joints can reach."""
     reach = np.where(tree.turning(motion.joints), tree.reaches(motion.joints), np.inf)
-    found = extremes(motion.q.values).largest * motion.q.factors
+    least, most = extremes(motion.q.values)
+    found = np.maximum(-least, most) * motion.q.factors
     beyond = np.flatnonzero(found > _BEYOND * np.maximum(reach, TURN))
     if beyond.size:
         k = int(beyond[0])

@@ -110,19 +110,19 @@ def ripples_of(
 
 def listed_cycles(ripples: Sequence[Ripples]) -> tuple[float, ...]:
     """Return the N of `learning.ripple_cycles`: of all joints, the few that disturb most."""
+    candidates = []
+    for own in ripples:
+        whole = sum(each.amplitude**2 for each in own.found) + 2.0 * own.torque**2
+        lobe = own.seen[0] / _PERIODS
+        candidates += [
+            _Candidate(each, each.amplitude**2 / whole, lobe) for each in own.found
+        ]
     groups: list[list[_Candidate]] = []
-    candidates = [
-        _Candidate(each, _worth(each, own), own.seen[0] / _PERIODS)
-        for own in ripples
-        for each in own.found
-    ]
     for each in sorted(candidates, key=lambda one: -one.worth):
-        for group in groups:
-            if _is_same(group[0], each):
-                group.append(each)
-                break
-        else:
-            groups.append([each])
+        same = next((group for group in groups if _is_same(group[0], each)), [])
+        if not same:
+            groups.append(same)
+        same.append(each)
     groups.sort(key=lambda group: -sum(each.worth for each in group))
     return tuple(map(_together, groups[:_LISTED]))
 
@@ -131,14 +131,8 @@ class _Candidate(NamedTuple):
     """A ripple that may be listed."""
 
     ripple: Ripple
-    worth: float
+    worth: float  # how much of what is left of its joint's torque it takes
     lobe: float  # of its joint
-
-
-def _worth(ripple: Ripple, own: Ripples) -> float:
-    """Return how much of what is left of a joint's torque a ripple takes."""
-    strengths = [each.amplitude**2 for each in own.found]
-    return ripple.amplitude**2 / (sum(strengths) + 2.0 * own.torque**2)
 
 
 def _is_same(one: _Candidate, other: _Candidate) -> bool:
@@ -307,14 +301,12 @@ class _Joint(NamedTuple):
         """Return the estimate for some N (k,)."""
         A, b = [], []
         for part in np.array_split(cycles, 1 + cycles.size * left.size // _AT_ONCE):
-            sine, cosine = np.moveaxis(self.columns(part), 1, 0)
-            weighted = self.weight * sine, self.weight * cosine
-            ss, sc, cc, se, ce = map(self.passes.sums, (
-                weighted[0] * sine, weighted[0] * cosine, weighted[1] * cosine,
-                weighted[0] * left, weighted[1] * left))  # fmt: skip
-            A.append(np.moveaxis(np.array(((ss, sc), (sc, cc))), (0, 1), (2, 3)))
-            b.append(np.stack((se, ce), axis=-1))
-        return _Estimate(np.concatenate(A), np.concatenate(b))
+            H = self.columns(part)
+            weighted = self.weight * H
+            A.append(self.passes.sums(weighted[:, :, None] * H[:, None]))
+            b.append(self.passes.sums(weighted * left))
+        of_passes = (np.moveaxis(np.concatenate(each), -1, 1) for each in (A, b))
+        return _Estimate(*of_passes)
 
     def fitted(
         self, cycles: Sequence[float], left: Floats, but: int | None = None

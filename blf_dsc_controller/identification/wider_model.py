@@ -70,6 +70,8 @@ class Doubt(NamedTuple):
 
 def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
     """Return the doubt in a fit to all motion with this prior."""
+    from scipy.special import stdtrit
+
     model = problem.parameters.model
     columns = left_out(fit.rows, model, prior.G, fit.values)
     z, H, spread = _wider_fit(problem, prior, fit, columns)
@@ -78,20 +80,13 @@ def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
     covariance = prior.D @ H[:k, :k] @ prior.D.T + np.outer(d, d)
     scaled = fit.values.copy()
     parts(scaled).delay[:] = 0.0
-    factor = _deviation_of_mean(spread, problem.rows.speed.size)
+    n = problem.rows.speed.size
+    factor = 0.0  # deviation of the mean of the gains; of a single one nothing is known
+    if n > 1:
+        factor = float(stdtrit(n - 1, _QUANTILE)) / TWO_SIDED * spread / np.sqrt(n)
     lost = _LOST * float(parts(fit.values).terms[LOAD_FRICTION].mean())
     covariance += (factor**2 + lost**2) * np.outer(scaled, scaled)
     return Doubt(covariance, _torques(problem, columns, z[k:]))
-
-
-def _deviation_of_mean(spread: float, n: int) -> float:
-    """Return the deviation of the mean of n values for a 95 % interval; 0 of a single one."""
-    from scipy.special import stdtrit
-
-    if n == 1:
-        return 0.0
-    t = float(stdtrit(n - 1, _QUANTILE)) / TWO_SIDED
-    return t * spread / float(np.sqrt(n))
 
 
 def _wider_fit(
@@ -114,7 +109,8 @@ def _wider_fit(
     narrow, _ = _solved(products, (kinds == len(KINDS)) * 1.0, deviation**2)
     sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
     z = np.zeros(kinds.size)
-    relative = _relative(kinds.size, gains)
+    relative = np.eye(kinds.size + 1)  # to columns of gains relative to their mean
+    relative[np.ix_(gains, gains)] -= 1.0 / gains.size
     for turn in range(_MOST_ROUNDS):
         about = _linearised(narrow, z, k, gains) @ relative
         linear = np.swapaxes(about, 1, 2) @ products @ about
@@ -130,13 +126,6 @@ def _wider_fit(
             break
     z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
     return z, H, float(sizes[KINDS.index('gain')])
-
-
-def _relative(size: int, of_gains: Indices) -> Floats:
-    """Return E (c, c): columns, times E, are of gains relative to their mean; c = size + 1."""
-    E = np.eye(size + 1)
-    E[np.ix_(of_gains, of_gains)] -= 1.0 / of_gains.size
-    return E
 
 
 def _linearised(narrow: Floats, z: Floats, k: int, of_gains: Indices) -> Floats:

@@ -312,7 +312,7 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         period=h,
         gravity=Samples(_at_rest(q[::every], model)),
         every=every,
-        speed=_fast(dq, ~near_gap),
+        speed=np.percentile(np.abs(dq[~near_gap]), 95.0, axis=0, overwrite_input=True),
         load=np.zeros((model.p, LOAD)),
         carried=Carried(),
         starts=starts,
@@ -397,11 +397,6 @@ def _smoothed(recording: Recording) -> tuple[Samples, Samples]:
 def smoothing_width(h: float) -> int:
     """Return the number of samples, one each h seconds, over which positions are smoothed."""
     return 2 * max(2, round(0.5 * SMOOTHING / h)) + 1
-
-
-def _fast(dq: Samples, chosen: Flags) -> Floats:
-    """Return the 95th percentile of each joint's speed (n,) in the chosen samples."""
-    return np.percentile(np.abs(dq[chosen]), 95.0, axis=0, overwrite_input=True)
 
 
 def _inertial(rows: Rows, model: SerialChain) -> Iterator[Floats]:
