@@ -112,7 +112,7 @@ def identify_arm(
         return found
     better = _better_convention(
         explained,
-        likely_conventions(recording, robot, unexplained.tolist()),
+        likely_conventions(first.problem, robot.gravity, unexplained.tolist()),
         lambda convention: trained(recording=converted(recording, convention)),
     )
     if better is None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,17 +166,15 @@ def joined(first: Recording, *others: Recording) -> tuple[Recording, list[float]
         grid = np.arange(0.0, times[-1], first.period)
         gap = np.interp(grid, times, other.gap) > 0.0
         gap[0] = True
-        twist = None
-        if together.twist is not None and other.twist is not None:
-            twist = interpolated(grid, times, other.twist)
-            twist = np.concatenate([together.twist, twist])
-        q = interpolated(grid, times, other.q)
-        torque = interpolated(grid, times, other.torque)
+        values: dict[str, Any] = {}
+        for name in ('q', 'torque', 'twist'):
+            before, after = getattr(together, name), getattr(other, name)
+            values[name] = None
+            if before is not None and after is not None:
+                values[name] = np.append(before, interpolated(grid, times, after), 0)
         together = together._replace(
-            q=np.concatenate([together.q, q]),
-            torque=np.concatenate([together.torque, torque]),
+            **values,
             gap=np.append(together.gap, gap),
-            twist=twist,
             source=f'{together.source}, {other.source}',
         )
     return together, begins
