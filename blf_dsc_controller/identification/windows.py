@@ -146,8 +146,7 @@ class Rows(NamedTuple):
         for c, name in enumerate(COLUMNS):
             X[:, joints, p + c * n + joints] = self.columns[name][windows]
         at = X.shape[2] - LOAD - COUPLING
-        if n > 1:
-            X[:, -2:, at : at + COUPLING] = self.coupling[windows]
+        X[:, -2:, at : at + COUPLING] = self.coupling[windows]
         with_load = self.carried.at(self.time[windows])
         X[with_load, :, -LOAD:] = inertial[with_load] @ self.load
         return X
