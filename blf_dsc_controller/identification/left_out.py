@@ -93,7 +93,8 @@ def _of_friction(rows: Rows, values: Floats) -> Iterator[tuple[str, Floats]]:
     coulomb = np.maximum(terms[COULOMB], least)
     speed = np.maximum(rows.speed, STILL)
     viscous = np.maximum(terms[VISCOUS], least / speed)
-    sliding = [_contact(rows, distance) for distance in DISTANCES]
+    contacts = (np.full(speed.size, distance) for distance in DISTANCES)
+    sliding = [rows.with_sliding(each).columns['Coulomb'] for each in contacts]
     for fading in _FADINGS:
         yield 'fading', coulomb * rows.stribeck(*fading)
     for a, b in pairwise(sliding):
@@ -112,11 +113,6 @@ def _of_torque(rows: Rows, theta: Floats) -> Iterator[tuple[str, Floats]]:
     loads = np.abs(rows.torques(everything, of_bodies))
     yield 'load', loads * rows.columns['Coulomb']
     yield 'gain', rows.torques(everything, theta)
-
-
-def _contact(rows: Rows, distance: float) -> Floats:
-    """Return the column (R, n) of Coulomb friction for a distance."""
-    return rows.with_sliding(np.full(rows.speed.size, distance)).columns['Coulomb']
 
 
 def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Floats:
