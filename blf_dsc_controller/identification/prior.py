@@ -31,15 +31,11 @@ from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.physical import Cones
 from blf_dsc_controller.identification.values import (
     COULOMB,
-    JOINT_TERMS,
     LOAD,
-    LOAD_FRICTION,
     OFFSET,
     OPTIONAL,
     POSITIVE,
-    QUADRATIC,
     ROTOR_INERTIA,
-    STRIBECK,
     VISCOUS,
     Parts,
     base_matrix,
@@ -190,15 +186,17 @@ def _of_terms(rotors: Floats, torque: Floats, speed: Floats) -> Floats:
     """Return the deviations (7, n) of JOINT_TERMS."""
     coulomb = _FRICTION * torque
     viscous = coulomb / speed
-    spread = np.zeros((len(JOINT_TERMS), torque.size))
-    spread[ROTOR_INERTIA] = np.maximum(rotors, torque / _ROTOR)
-    spread[VISCOUS] = viscous
-    spread[COULOMB] = coulomb
-    spread[LOAD_FRICTION] = _LOAD
-    spread[OFFSET] = _OFFSET * torque
-    spread[STRIBECK] = coulomb
-    spread[QUADRATIC] = viscous / speed
-    return spread
+    return np.array(
+        (
+            np.maximum(rotors, torque / _ROTOR),
+            viscous,
+            coulomb,
+            np.full_like(torque, _LOAD),
+            _OFFSET * torque,
+            coulomb,  # Stribeck
+            viscous / speed,  # quadratic
+        )
+    )
 
 
 def _pseudo_inertias(D: Floats) -> Floats:

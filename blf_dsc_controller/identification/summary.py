@@ -100,14 +100,9 @@ def load_table(found: Identified) -> Iterator[str]:
 
 def _mass_and_centre(values: Floats, deviations: Floats) -> Iterator[str]:
     """Yield mass [kg] and centre [mm] of values in kg and m (4,), with their intervals."""
-    for value, deviation, scale, digits in zip(
-        values,
-        deviations,
-        (1.0, 1e3, 1e3, 1e3),
-        ('.3f', '.1f', '.1f', '.1f'),
-        strict=True,
-    ):
-        yield interval(scale * value, scale * deviation, digits)
+    yield interval(values[0], deviations[0], '.3f')
+    for value, deviation in zip(1e3 * values[1:], 1e3 * deviations[1:], strict=True):
+        yield interval(value, deviation, '.1f')
 
 
 def bodies_table(found: Identified) -> str:
