@@ -102,7 +102,7 @@ class _Gravity:
         self._u = np.where(problem.reversed, -1.0, 1.0) * rows.u(0.0)[fit]
         # what friction does not explain of each joint, in units of its torque
         friction = np.moveaxis(rows.friction(fit, _FRICTION), 2, 0)
-        self._bases = [np.linalg.qr(columns)[0] for columns in friction]
+        self._bases = np.linalg.qr(friction)[0]  # (n, k, c)
         self._scale = np.maximum(np.linalg.norm(self._u, axis=0), 1e-9)
         self._known: dict[Convention, float] = {}
 
@@ -112,10 +112,8 @@ class _Gravity:
             signs, offsets = signs_and_offsets(ways)
             weight = self._torques(signs * self._q + offsets)
             left = (self._u - signs * weight) / self._scale
-            explained = [Q.T @ own for Q, own in zip(self._bases, left.T, strict=True)]
-            self._known[ways] = float(
-                np.sum(left**2) - sum(each @ each for each in explained)
-            )
+            explained = np.einsum('ikc,ki->ic', self._bases, left)
+            self._known[ways] = float(np.sum(left**2) - np.sum(explained**2))
         return self._known[ways]
 
     def turned(self, ways: Convention, i: int) -> Convention:

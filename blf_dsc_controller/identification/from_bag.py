@@ -216,16 +216,14 @@ def _together(parts: Sequence[Motion], joints: Sequence[str]) -> Motion:
 
 def _at(stamp: Stamps, own: Stamps, values: Floats) -> Floats:
     """Return values (k, n) at their stamps (k,) at other ones (N,); NaN where unknown."""
-    found = np.full((stamp.size, values.shape[1]), np.nan)
     if own.size < 2:
-        return found
+        return np.full((stamp.size, values.shape[1]), np.nan)
     after = np.clip(np.searchsorted(own, stamp), 1, own.size - 1)
     pause = own[after] - own[after - 1]
-    is_known = (pause <= GAP * np.median(np.diff(own))) & (stamp <= own[-1])
-    is_known &= stamp >= own[0]
-    seconds = (own - own[0]) * 1e-9
-    at = (stamp[is_known] - own[0]) * 1e-9
-    found[is_known] = interpolated(at, seconds, values)
+    is_unknown = pause > GAP * np.median(np.diff(own))
+    is_unknown |= (stamp < own[0]) | (stamp > own[-1])
+    found = interpolated((stamp - own[0]) * 1e-9, (own - own[0]) * 1e-9, values)
+    found[is_unknown] = np.nan
     return found
 
 

@@ -209,12 +209,12 @@ def _completed(
     fits = fit_alone(fit.rows, windows.fit, problem.prior, COLUMNS)
     final = fitted(selected.rows, moving, selected.prior, selected.found)
     rows = final.rows
-    size = shares(rows, moving, problem.P, final.theta[: rows.p])
+    gravity, inertia = shares(rows, moving, problem.P, final.theta[: rows.p])
     compliance = None
     if recording.twist is not None:
         compliance = compliance_of(rows, recording.twist, moving, final, problem.prior)
     begin(INTERVALS)
-    doubted = doubt(problem, selected.prior, final)
+    covariance, torques = doubt(problem, selected.prior, final)
     return Identified(
         source=recording.source,
         duration=recording.duration,
@@ -222,8 +222,8 @@ def _completed(
         parameters=problem.parameters,
         prior=problem.prior,
         values=final.values,
-        covariance=doubted.covariance,
-        left_out=doubted.torques,
+        covariance=covariance,
+        left_out=torques,
         dynamics=nearest_friction(rows, windows, final.values),
         score=score,
         alone=errors_alone(rows, windows.test, fits),
@@ -235,8 +235,8 @@ def _completed(
         lasting=final.problem.lasting,
         rest=(rows.time.size - moving.size) * HOP,
         clipped=rows.clipped[moving].mean(axis=0),
-        gravity=size.gravity,
-        inertia=size.inertia,
+        gravity=gravity,
+        inertia=inertia,
         other='',
         carried=problem.carried,
         compliance=compliance,

@@ -171,7 +171,7 @@ def prior_of(
     start[at.load[0]] = _FIRST
     of_terms = np.diag(np.append(spread, coupling))
     D = block_diag(*blocks, of_terms, of_load, _DELAY)
-    cones = Cones.of(bodies), terms
+    cones = Cones(*map(np.array, zip(*bodies, strict=True))), terms
     return Prior(base_matrix(parameters, n), mean, D, cones, start)
 
 

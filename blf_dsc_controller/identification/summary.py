@@ -359,21 +359,14 @@ def _stiffness_notes(found: Identified) -> Iterator[str]:
             'was not computed'
         )
         return
-    equal = names[compliance.largest == 0.0]
-    if equal.size:
-        yield (
-            f'{", ".join(equal)}: motors and links have the same positions, as where a robot has '
-            'one encoder and reports it twice'
-        )
-    against = names[compliance.is_negative]
-    if against.size:
-        yield (
-            f'{", ".join(against)} twist against their torques: are the positions of motors '
-            '(theta) and links (q) exchanged?'
-        )
-    computed = names[compliance.is_computed]
-    if computed.size:
-        yield (
-            f'{", ".join(computed)} twist so exactly by their torques that the robot computes one '
-            'position from the other: their stiffness is the one that it assumes'
-        )
+    notes = {
+        ': motors and links have the same positions, as where a robot has one encoder and '
+        'reports it twice': compliance.largest == 0.0,
+        ' twist against their torques: are the positions of motors (theta) and links (q) '
+        'exchanged?': compliance.is_negative,
+        ' twist so exactly by their torques that the robot computes one position from the '
+        'other: their stiffness is the one that it assumes': compliance.is_computed,
+    }
+    for what, which in notes.items():
+        if which.any():
+            yield ', '.join(names[which]) + what

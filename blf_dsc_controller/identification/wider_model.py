@@ -29,7 +29,6 @@ like another such factor.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,16 +59,12 @@ _LOST = 0.6  # of the mean load friction: gears lose more driving than driven
 _FLOOR = 1e-4  # of a joint's torque, least residual
 
 
-class Doubt(NamedTuple):
-    """What the wider model says of the values, and of what the model leaves out."""
+def doubt(problem: Problem, prior: Prior, fit: Fit) -> tuple[Floats, Floats]:
+    """Return what the wider model says of a fit to all motion with this prior.
 
-    covariance: Floats  # (17 n + 14, 17 n + 14) of the values
-    # (kinds, n) rms torque of each kind of `left_out`, N m or N
-    torques: Floats
-
-
-def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
-    """Return the doubt in a fit to all motion with this prior."""
+    That is the covariance of its values (17 n + 14, 17 n + 14), and the rms torque of each kind
+    of `left_out` (kinds, n) [N m or N].
+    """
     from scipy.special import stdtrit
 
     model = problem.parameters.model
@@ -86,7 +81,7 @@ def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
         factor = float(stdtrit(n - 1, _QUANTILE)) / TWO_SIDED * spread / np.sqrt(n)
     lost = _LOST * float(parts(fit.values).terms[LOAD_FRICTION].mean())
     covariance += (factor**2 + lost**2) * np.outer(scaled, scaled)
-    return Doubt(covariance, _torques(problem, columns, z[k:]))
+    return covariance, _torques(problem, columns, z[k:])
 
 
 def _wider_fit(
@@ -192,7 +187,7 @@ def _residual(
 
 
 def _torques(problem: Problem, columns: LeftOut, z: Floats) -> Floats:
-    """Return `Doubt.torques` for the values z of the columns left out."""
+    """Return the rms torque (kinds, n) of the values z of the columns left out."""
     moving = problem.windows.moving
     found = np.zeros((len(KINDS), moving.size, problem.rows.speed.size))
     for block in problem.rows.blocks(moving):
