@@ -46,10 +46,8 @@ def other_mounting(
     if strength < _LEAST * size or found @ gravity > _APART * strength * size:
         return None
     direction = found / strength
-    axis = np.zeros(3)
-    main = int(np.argmax(np.abs(direction)))
-    axis[main] = np.sign(direction[main])
-    return size * (axis if direction @ axis > _SNAP else direction)
+    axis = np.trunc(direction / _SNAP)  # zero if none is near
+    return size * (axis if axis.any() else direction)
 
 
 def _shown_gravity(
