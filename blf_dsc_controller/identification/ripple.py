@@ -417,30 +417,25 @@ def _ripple(joint: _Joint, left: Floats, all_cycles: Sequence[float], k: int) ->
     """Return ripple k of several, without what the others explain."""
     if len(all_cycles) > 1:
         left = left - joint.fitted(all_cycles, left, but=k)
-    N = all_cycles[k]
-    estimate = joint.estimate(np.array([N]), left)
-    c = estimate.of()[0]
+    N = np.array([all_cycles[k]])
+    (H,) = joint.columns(N)
+    (c,) = joint.estimate(N, left).of()
+    rest = left - c @ H
+    sine, cosine = H
+    slope = joint.centred(joint.q * (c @ (cosine, -sine)))  # d/dN of the ripple
     amplitude = float(np.hypot(*c))
     along = c / (amplitude + _TINY)
     return Ripple(
-        N,
-        _deviation_of_cycles(joint, left, N, c),
+        all_cycles[k],
+        float(np.sqrt(_covariance(joint, np.stack((*H, slope)), rest)[2, 2])),
         amplitude,
-        float(np.sqrt(along @ estimate.covariance()[0] @ along)),
+        float(np.sqrt(along @ _covariance(joint, H, rest) @ along)),
     )
 
 
-def _deviation_of_cycles(joint: _Joint, left: Floats, N: float, c: Floats) -> float:
-    """Return the deviation of N of a ripple with the coefficients c (2,), by passes.
-
-    Its column is d/dN of the ripple; sine and cosine are estimated with it.
-    """
-    a, b = c
-    sine, cosine = joint.columns(np.array([N]))[0]
-    slope = joint.centred(joint.q * (a * cosine - b * sine))
-    H = np.stack((sine, cosine, slope))
+def _covariance(joint: _Joint, H: Floats, rest: Floats) -> Floats:
+    """Return the covariance (m, m) of coefficients of columns H (m, K) by passes."""
     inverse = np.linalg.inv((joint.weight * H) @ H.T)
-    score = joint.passes.sums(joint.weight * H * (left - a * sine - b * cosine))
+    score = joint.passes.sums(joint.weight * H * rest)
     G = joint.passes.begins.size
-    C = inverse @ score @ score.T @ inverse * G / (G - 3.0)
-    return float(np.sqrt(C[2, 2]))
+    return np.asarray(inverse @ score @ score.T @ inverse * G / (G - len(H)))
