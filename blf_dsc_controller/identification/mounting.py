@@ -46,7 +46,7 @@ def other_mounting(
     if strength < _LEAST * size or found @ gravity > _APART * strength * size:
         return None
     direction = found / strength
-    axis = np.trunc(direction / _SNAP)  # zero if none is near
+    axis = np.trunc(direction / _SNAP) + 0.0  # zero, not -0, if none is near
     return size * (axis if axis.any() else direction)
 
 
