@@ -36,6 +36,7 @@ from blf_dsc_controller.identification.windows import (
     STILL,
     Rows,
     add_windows,
+    of_each_joint,
     smoothing_width,
     weighting,
 )
@@ -65,14 +66,8 @@ class LeftOut(NamedTuple):
 
     def matrix(self, windows: Indices) -> Floats:
         """Return the columns (k, n, e n + n) of some windows."""
-        own = self.own[windows]
-        k, e, n = own.shape
-        found = np.zeros((k, n, (e + 1) * n))
-        joints = np.arange(n)
-        for c in range(e):
-            found[:, joints, c * n + joints] = own[:, c]
-        found[:, :, e * n :] = self.elastic[windows]
-        return found
+        own = of_each_joint(self.own[windows])
+        return np.concatenate((own, self.elastic[windows]), axis=2)
 
 
 def left_out(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> LeftOut:

@@ -167,12 +167,12 @@ def _solved(products: Floats, scale: Floats, variance: Floats) -> tuple[Floats, 
 
 def _sizes(kinds: Floats, z: Floats, H: Floats, sizes: Floats) -> Floats:
     """Return the size of each kind: its sum of squares over the number of values that are shown."""
-    found = []
-    for kind, size in enumerate(sizes[:-1]):
-        own = kinds == kind
-        shown = np.sum(1.0 - np.diag(H)[own] / size**2)
-        found.append(np.sqrt(np.sum(z[own] ** 2) / max(shown, _LEAST)))
-    return np.asarray(np.clip(found, _LEAST, LARGEST))
+    squares, shown = (
+        np.bincount(kinds, each)[:-1]
+        for each in (z**2, 1.0 - np.diag(H) / sizes[kinds] ** 2)
+    )
+    found = np.sqrt(squares / np.maximum(shown, _LEAST))
+    return np.clip(found, _LEAST, LARGEST)
 
 
 def _residual(
@@ -189,9 +189,11 @@ def _residual(
 def _torques(problem: Problem, columns: LeftOut, z: Floats) -> Floats:
     """Return the rms torque (kinds, n) of the values z of the columns left out."""
     moving = problem.windows.moving
-    found = np.zeros((len(KINDS), moving.size, problem.rows.speed.size))
-    for block in problem.rows.blocks(moving):
-        X = columns.matrix(moving[block]) * z
-        for kind, torques in enumerate(found):
-            torques[block] = X[:, :, columns.kind == kind].sum(axis=2)
-    return problem.rows.rms(found, moving)
+    of_kinds = columns.kind[:, None] == np.arange(len(KINDS))
+    found = np.concatenate(
+        [
+            columns.matrix(moving[block]) * z @ of_kinds
+            for block in problem.rows.blocks(moving)
+        ]
+    )
+    return problem.rows.rms(np.moveaxis(found, 2, 0), moving)

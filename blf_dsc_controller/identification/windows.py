@@ -142,10 +142,8 @@ class Rows(NamedTuple):
         X = np.zeros((windows.size, n, self.unknowns))
         inertial = self.inertial[windows]
         X[:, :, :p] = inertial
-        joints = np.arange(n)
-        for c, name in enumerate(COLUMNS):
-            X[:, joints, p + c * n + joints] = self.columns[name][windows]
         at = X.shape[2] - LOAD - COUPLING
+        X[:, :, p:at] = of_each_joint(self.friction(windows))
         X[:, -2:, at : at + COUPLING] = self.coupling[windows]
         with_load = self.carried.at(self.time[windows])
         X[with_load, :, -LOAD:] = inertial[with_load] @ self.load
@@ -284,6 +282,13 @@ class Rows(NamedTuple):
         for block in self.blocks(np.arange(self.starts.size)):
             starts = self.starts[block]
             yield block, slice(int(starts[0]), int(starts[-1]) + self.g.size)
+
+
+def of_each_joint(columns: Floats) -> Floats:
+    """Return columns (k, n, c n) that are zero but for their own joint, from these (k, c, n)."""
+    k, _, n = columns.shape
+    found: Floats = np.einsum('kcn,in->kicn', columns, np.eye(n))
+    return found.reshape(k, n, -1)
 
 
 def rows_of(recording: Recording, model: SerialChain) -> Rows:
