@@ -21,23 +21,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.arms.serial_chain import SerialChain
 from blf_dsc_controller.identification.recording import Indices
-from blf_dsc_controller.identification.windows import STILL, Rows
+from blf_dsc_controller.identification.selection import repeats
+from blf_dsc_controller.identification.windows import STILL, Rows, shortened
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
 
-SHORT = 0.05
-"""Length of the windows [s]."""
-
-SAMPLES = 6
-"""Samples of a window, at least."""
-
-PER_HOP = 4
-"""Windows in the time from one window of the fit to the next; fewer in long recordings."""
-
-ROWS = 20_000
-"""Windows that are enough."""
-
+_SHORT = 0.05  # s, length of the windows
+_SAMPLES = 6  # of a window, at least
+_PER_HOP = 4  # windows, from one of the fit to the next; fewer in long recordings
+_ENOUGH = 20_000  # windows
 _LARGEST = 300.0  # N that is searched
 _PERIODS = 2.5  # of a ripple in the range of the joint, at least
 _GRID = (
@@ -83,10 +77,19 @@ NOTHING = Ripples((), (np.inf, 0.0), np.inf, 0.0)
 """What is found of a joint that moved too little."""
 
 
-def ripples_of(short: Rows, theta: Floats) -> tuple[Ripples, ...]:
-    """Return the ripples of each joint in short windows, for the unknowns and delay (m + 1,)."""
-    windows = np.arange(short.time.size)
-    left = short.u(theta[-1]) - short.torques(windows, theta)
+def ripples_of(
+    rows: Rows, windows: Indices, model: SerialChain, distances: Floats, theta: Floats
+) -> tuple[Ripples, ...]:
+    """Return the ripples of each joint in the torques that a fit leaves in some windows.
+
+    `distances` (n,) are those of its contacts, and `theta` (m + 1,) its unknowns and delay.
+    """
+    length = max(_SHORT, _SAMPLES * rows.period)
+    in_each = max(1, min(_PER_HOP, _ENOUGH // windows.size))
+    short = shortened(rows, windows, model, distances, length, in_each)
+    short = short.with_load(theta)
+    left = short.u(theta[-1]) - short.torques(np.arange(short.time.size), theta)
+    again = repeats(rows, windows)
     dq = short.columns['viscous']
     found = []
     for i in range(short.speed.size):
@@ -96,7 +99,7 @@ def ripples_of(short: Rows, theta: Floats) -> tuple[Ripples, ...]:
             continue
         joint = _Joint.of(short, moves, short.postures[moves, i], dq[moves, i])
         found.append(_of_joint(joint, left[moves, i]) if joint.is_enough else NOTHING)
-    return tuple(found)
+    return tuple(each._replace(repeats=again) for each in found)
 
 
 def listed_cycles(ripples: Sequence[Ripples]) -> tuple[float, ...]:
