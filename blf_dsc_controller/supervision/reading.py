@@ -178,9 +178,10 @@ class Readings:
         counted, wrapped = self._wraps.count(measurement, gap, self.fastest)
         found = self._says(stamp, counted)
         doubt = self._doubt(stamp, found)
-        if not found & NOT_FINITE:
-            self._at[:] = counted[: self._at.size]
-        self._arrived = stamp
+        if doubt is not Doubt.REPEATED:  # which does not show where the arm is by now
+            if not found & NOT_FINITE:
+                self._at[:] = counted[: self._at.size]
+            self._arrived = stamp
         continues = doubt is None
         if begins and not found & NOT_FINITE:
             if doubt is Doubt.OUT_OF_REACH:
