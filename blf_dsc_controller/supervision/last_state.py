@@ -56,6 +56,7 @@ class LastState:
         self.age = inf
         self.gap = 0.0
         self._resumed = 0  # ns, stamp of the state after the last gap
+        self._skipped = 0.0  # s, in which states that are not trusted have come
         self.stamp = -1
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
@@ -127,6 +128,7 @@ class LastState:
     def skip(self, period: float) -> None:
         """Account for a state that is not trusted: after some, the motion is unknown."""
         self.age += period
+        self._skipped += period
         if self.age > LONG_GAP * period:
             self._forget_motion()
 
@@ -153,5 +155,7 @@ class LastState:
         if gap < 0.0 or gap > LONG_GAP * period:
             self._resumed = stamp
             if self.stamp >= 0:
+                gap -= self._skipped
                 self.gap = max(self.gap, min(gap, _LONGEST_GAP))
+        self._skipped = 0.0
         self.stamp = stamp

@@ -104,13 +104,21 @@ class RecentMotion:
         return best * self._sample_time
 
     def load(self, settings: Settings, estimate: Array) -> Array | None:
-        """Return the torque (n,) [N m] that the model lacks; None in the first 0.1 s."""
+        """Return the torque (n,) [N m] that the model lacks; None in the first 0.1 s.
+
+        Torques after the last new state are left out: the law has not seen what they do.
+        """
         if self._count < self.size:
             return None
         order = self._order
+        is_new = (np.diff(self._states[order], axis=0) != 0.0).any(axis=1)
+        seen = 1 + int(np.flatnonzero(is_new).max(initial=-1))
+        if seen >= self._step:  # else the arm has hardly moved at all
+            order = order[seen % self._step : seen + 1]
         stamps = self._stamps[order[:: self._step]]
         states = self._states[order[:: self._step]]
-        torques = self._torques[order[:-1]].reshape(self._blocks, self._step, -1)
+        torques = self._torques[order[:-1]]
+        torques = torques.reshape(-1, self._step, torques.shape[1])
         steps = 1e-9 * np.diff(stamps)  # s
         means = 0.5 * (states[:-1] + states[1:])
         changes = np.diff(states, axis=0) / steps[:, np.newaxis]

@@ -65,9 +65,8 @@ DOUBTFUL: dict[Reason, Doubtful] = {
     Reason.OUTSIDE_BOUND: Doubtful.MOTION | Doubtful.ESTIMATES | Doubtful.EFFECT,
     Reason.SATURATED: Doubtful.MOTION | Doubtful.ESTIMATES | Doubtful.EFFECT,
     Reason.NO_EFFECT: Doubtful.MOTION | Doubtful.EFFECT,
-    # wrong velocities, states that hang, or a law that has fought against something
+    # wrong velocities, or a law that has fought against something
     Reason.VELOCITY: Doubtful.MOTION | Doubtful.ESTIMATES,
-    Reason.STAMP_REPEATED: Doubtful.MOTION | Doubtful.ESTIMATES,
     Reason.CONTACT: Doubtful.MOTION | Doubtful.ESTIMATES,
     Reason.OSCILLATION: Doubtful.MOTION | Doubtful.ESTIMATES,
 }
