@@ -75,6 +75,15 @@ def test_same_pose_without_velocities_beside_the_arm_does_not_throw_it():
     assert record.speed[-1].max() < 0.1
 
 
+@pytest.mark.parametrize(('preset', 'moves'), [('panda_rigid', False), ('panda', True)])
+def test_arm_whose_states_hang_nearly_always_is_braked_again(preset, moves):
+    """Five states of 105: they threw both, and none was trusted later: 35 and 45 rad/s for ever."""
+    play = Play('frozen', 0.0, 0, 5, 100)
+    arm, record, _ = played(preset, play, moves=moves, payload=1.0)
+    assert record.speed.max() < 4.0
+    assert arm.run(1.0).speed[-1].max() < 0.05
+
+
 class Late:
     """States that arrive some samples late, from the first one on that it gets."""
 

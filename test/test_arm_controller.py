@@ -156,6 +156,12 @@ def test_it_follows_trajectories_and_stops_on_request():
         controller.follow([blf.TrajectoryPoint(1e-3, (90.0, 90.0))])
     with pytest.raises(blf.TrajectoryError, match='each point is a time and positions'):
         controller.follow([2.2, 1.6])
+    for begin in (float('nan'), 1.7e9, 'soon'):
+        with pytest.raises(blf.TrajectoryError):
+            controller.follow([(2.0, np.array([2.2, 1.6]))], begin=begin)
+    for stamp in (float('nan'), 1.7e18, 'now'):
+        with pytest.raises(blf.StateError, match='a time in s is needed'):
+            controller.update(stamp, [2.0, 1.5], [0.0, 0.0])
     (*_, q) = arm.run(2.5).q
     np.testing.assert_allclose(q, (2.2, 1.6), atol=2e-3)  # the bound
     controller.stop()

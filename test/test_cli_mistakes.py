@@ -75,7 +75,7 @@ LONG = {  # commands, and what takes minutes, or moves a robot
     ),
     'identify BAG --urdf panda.urdf --out no/x.urdf': 'identify._identified',
     'identify BAG --urdf panda.urdf --report no/x.html': 'identify._identified',
-    'commission --config ur5e --write no/x.yaml --posture 0 -1.5 1.5 -1.5 -1.5 0': '',
+    'commission --config ur5e --write no/x.yaml --posture 0 -1.5 1.5 -1.5 -15e-1 0': '',
 }
 
 

@@ -134,6 +134,8 @@ def _check(options: Namespace) -> None:
             f'--duration: got {options.duration:g} s, but a finite time of at least 0 is needed '
             '(0: until Ctrl-C)'
         )
+    if not options.robot:
+        raise BlfDscError('--robot: got nothing, but a robot or its address is needed')
     if options.ros and options.robot == ROS:
         raise BlfDscError('--robot ros has its topics already: leave out --ros')
     if options.ros:

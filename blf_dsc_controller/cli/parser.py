@@ -6,9 +6,10 @@ from __future__ import annotations
 import argparse
 import difflib
 import os
+import re
 import textwrap
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.commands import COMMANDS, Command
@@ -20,6 +21,11 @@ _OTHERS = {'view': 'blf_dsc run --view shows a run, arm_view a running loop'}
 
 class _Parser(argparse.ArgumentParser):
     """Parser whose errors are one line, with an example of what to type."""
+
+    def __init__(self, *words: Any, **options: Any) -> None:
+        super().__init__(*words, **options)
+        # negative numbers, also those with an exponent, are no options
+        self._negative_number_matcher = re.compile(r'-\.?\d')
 
     def error(self, message: str) -> NoReturn:
         """Exit with code 2."""

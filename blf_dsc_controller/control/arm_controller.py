@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import NoneType, TracebackType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,7 +21,12 @@ from blf_dsc_controller.configuration.rules import When
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.loop_outputs import LoopOutputs
 from blf_dsc_controller.control.outputs import Output, Outputs
-from blf_dsc_controller.errors import BlfDscError, LoopEndedError, check_type
+from blf_dsc_controller.errors import (
+    ArgumentTypeError,
+    BlfDscError,
+    LoopEndedError,
+    check_type,
+)
 from blf_dsc_controller.law.payload import DEVIATION, MASS, mass_interval
 from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.messages.tip_load import TAKEN_UP, TipLoad
@@ -33,6 +38,9 @@ from blf_dsc_controller.supervision.supervisor import Phase
 from blf_dsc_controller.warnings.table import config_warnings, refuse
 
 Vector = NDArray[np.float64]
+
+
+_NEVER = 9e9  # s: whole ns have 64 bits
 
 
 class StateError(BlfDscError):
@@ -104,11 +112,17 @@ class ArmController:
         that are given; with `wall`, as much later as the wall clock was at the first.
 
         Raises:
-            ArgumentTypeError: it is none of these.
+            ArgumentTypeError: `config`, `record` or `stamps` is none of these.
             ConfigurationError: with all problems of the file.
             StartError: no arm bears the gains.
             BagError: there is such a folder.
+            OSError: the folder cannot be made.
         """
+        check_type('record', record, (str, Path, NoneType), 'give a folder, or None')
+        if stamps not in ('given', 'wall'):
+            raise ArgumentTypeError(
+                f'stamps: got {stamps!r}, but given or wall is needed'
+            )
         check_type(
             'config',
             config,
@@ -172,8 +186,10 @@ class ArmController:
             LoopEndedError: the controller is closed.
         """
         self._check_open()
-        if not _is_finite(stamp):
-            raise StateError(f'stamp: got {stamp}, but a finite time in s is needed')
+        if not _is_time(stamp):
+            raise StateError(
+                f'stamp: got {stamp}, but a time in s is needed; 1 ns is 1e-9 s'
+            )
         n = len(self.joints)
         values = self._measurement(q, dq, effort)
         of_motors = None
@@ -270,6 +286,7 @@ class ArmController:
         names = tuple(joints) or self.joints
         try:
             given = tuple(_point(*point) for point in points)
+            begin = None if begin is None else float(begin)
         except (TypeError, ValueError) as error:
             expected = 'each point is a time and positions, as in (1.0, [0.1, 0.2])'
             raise TrajectoryError([f'{error}; {expected}']) from error
@@ -514,10 +531,10 @@ class ArmController:
         return tuple(self._loop.estimates)
 
 
-def _is_finite(stamp: float) -> bool:
-    """Whether a stamp is a finite number; it may be anything."""
+def _is_time(stamp: float) -> bool:
+    """Whether a stamp is a time [s] that ROS knows, in whole ns; it may be anything."""
     try:
-        return math.isfinite(stamp)
+        return abs(stamp) < _NEVER
     except TypeError:
         return False
 

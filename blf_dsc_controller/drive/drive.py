@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from blf_dsc_controller.drive.pose import Pose, Poses
 
 _KEPT = 100  # results of motions
+_BRAKED = 5.0  # s: longer than braking takes
 
 
 class Drive:
@@ -451,7 +452,11 @@ class Drive:
         try:
             self._await_result(number, timeout)
         except NotInTimeError as error:
-            self.stop()
+            try:
+                self.stop(_BRAKED)
+            except NotInTimeError:
+                text = 'the loop does not say whether the arm has braked'
+                raise NotInTimeError(f'{error}: {text}') from None
             raise NotInTimeError(f'{error}: the arm has braked') from None
         except KeyboardInterrupt:
             # where no block ends with it, as in a notebook, the arm would go on

@@ -485,8 +485,10 @@ def _time_problems(trajectory: Trajectory, now: float) -> Iterator[str]:
                 f'point {number} is at {after.time:g} s, not after the one before it, '
                 f'at {before.time:g} s'
             )
-    begin = trajectory.begin
-    if begin is not None and begin + points[-1].time < now:
+    begin = now if trajectory.begin is None else trajectory.begin
+    if not begin <= now + LONGEST:
+        yield f'it begins at {begin:g} s since the start, more than {LONGEST:g} s from now'
+    elif begin + points[-1].time < now:
         yield (
             f'it lies entirely in the past: it ended {now - begin - points[-1].time:.6g} s ago; '
             'stamp it with its start time, or with 0 to start immediately'

@@ -25,7 +25,7 @@ from blf_dsc_controller.configuration.law_file import errors_told_with_line
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
-from blf_dsc_controller.errors import StartError, check_type
+from blf_dsc_controller.errors import BlfDscError, StartError, check_type
 from blf_dsc_controller.factory.controller import begin, controller_of
 from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.controller import Controller
@@ -67,12 +67,17 @@ def simulate(
     its limits too.  A run whose law has been stopped for `after_stop` [s] may end early.
 
     Raises StartError if no arm bears the gains, or if the law cannot take over or stops before its
-    first torque, MotionError if there is no approach within the limits, and ArgumentTypeError if
-    the configurations are others.
+    first torque, MotionError if there is no approach within the limits, ArgumentTypeError if
+    the configurations are others, and BlfDscError if they are of other joints.
     """
     remedy = 'simulate(loop.controller, loop.plant) runs what load_loop returns'
     check_type('controller_config', controller_config, ControllerConfig, remedy)
     check_type('plant_config', plant_config, PlantConfig, remedy)
+    if controller_config.joints != plant_config.joints:
+        raise BlfDscError(
+            f'the joints of the controller are {", ".join(controller_config.joints)}, those of the '
+            f'plant {", ".join(plant_config.joints)}: {remedy}'
+        )
     plant = plant_of(plant_config)
     if supervised:
         guard = Guard(controller_config, lambda: 0, lambda: 0)
