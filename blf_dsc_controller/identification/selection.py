@@ -29,6 +29,7 @@ _WORTH_OF_TERM = 0.003  # ... and by an optional term
 _WIDTHS = (1.0, 3.0, 10.0, 30.0)  # of the prior
 _OF_REPEATED = 2  # of them, if all folds have the same motion: they reward overfitting
 _SAME = 0.1  # of the standard deviations of positions and speeds, from other folds
+_WAY = 0.0, 0.25, 0.5, 0.75  # places between two windows
 _TINY = 1e-9
 _PARTS = 2 * FOLDS  # for optional terms
 
@@ -103,15 +104,23 @@ def _worthwhile(found: Regression, prior: Prior) -> list[Entry]:
 
 
 def repeats(rows: Rows, fit: Indices) -> bool:
-    """Return whether most states of each fifth of the motion are also in the others."""
+    """Return whether most states of each fifth of the motion are also in the others.
+
+    Between two windows the motion is nearly straight: a period of it need not be a multiple of
+    their distance.
+    """
     from scipy.spatial import cKDTree
 
     states = np.hstack([rows.postures, rows.speeds])[fit]
     states = states / np.maximum(states.std(axis=0), _TINY)
     folds = np.array_split(states, FOLDS)
+    ways = [
+        np.concatenate([fold[:-1] + each * np.diff(fold, axis=0) for each in _WAY])
+        for fold in folds
+    ]
     distances = []
     for k, fold in enumerate(folds):
-        others = np.concatenate([*folds[:k], *folds[k + 1 :]])
+        others = np.concatenate([*ways[:k], *ways[k + 1 :]])
         distances.append(cKDTree(others).query(fold)[0])
     return bool(np.median(np.concatenate(distances)) < _SAME)
 
