@@ -231,6 +231,18 @@ def test_weak_drives_are_named_where_no_effort_shows_what_they_give(
     assert (named in arm.text) == (effort == 'unknown')
 
 
+def test_arm_that_sped_up_in_the_stop_comes_to_rest_once_its_drive_answers_again():
+    """It kept the load of the stop, and drifted on at 0.12 rad/s."""
+    arm = Scenario('ur5e', {'safety.torque': 'hold_gravity'})
+    arm.run(0.3)
+    arm.controller.fail('by hand')
+    stuck = arm.run(0.01).torque[-1] + np.array([0.0, 0.0, 8.0, 0.0, 0.0, 0.0])
+    arm.run(3.0, reach=lambda _: stuck, until=lambda: 'speeds' in arm.text)
+    after = arm.run(2.0)
+    assert after.speed[0].max() > 1.0
+    assert after.speed[-1].max() < 0.02
+
+
 def test_load_known_before_is_used_if_the_arm_speeds_up_in_the_stop():
     """A drive that is stuck: what is observed of its motion is no load."""
     given = {

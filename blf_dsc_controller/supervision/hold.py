@@ -48,7 +48,7 @@ class Load(Enum):
     AWAITED = 'as the ramp began, until commands have had an effect on the arm'
     UNTIL_MOVED = 'from the motion until the arm has rested and moves again'
     KEPT = 'as the arm rested: another moves it'
-    REFUTED = 'as the ramp began: the arm has sped up since'
+    REFUTED = 'as the ramp began, while the arm speeds up'
     YIELDS = 'as the ramp began, to give way to a contact'
 
 
@@ -75,8 +75,8 @@ class Hold:
 
     If commands do not reach the arm, the observed load would grow for ever.  `Load` says when it
     is kept instead: after a stop that may have this cause until the arm accelerates, as it does
-    if commands act on it (`CommandEffect`); while another node may command the arm; and once the
-    arm has sped up.
+    if commands act on it (`CommandEffect`); while another node may command the arm; and while the
+    arm speeds up.
 
     A joint that swings under its damping gets the share of it that it bears (`Swing`).
 
@@ -175,9 +175,15 @@ class Hold:
         self._begin_observing(0.0)
 
     def stop_observing(self) -> None:
-        """Return to the load that was known at the stop, until the next ramp."""
+        """Return to the load that was known at the stop, until `observe_again`."""
         self.load[:] = self._known_load
         self._source = Load.REFUTED
+
+    def observe_again(self) -> None:
+        """Observe the load from what was known at the stop on, of an arm that sped up before."""
+        if self._source is Load.REFUTED:
+            self._begin_observing(self._known_load)
+            self._source = Load.OBSERVED
 
     @property
     def is_settled(self) -> bool:

@@ -25,7 +25,7 @@ _SPEEDS_UP = 0.2  # s
 
 
 class StopSpeed:
-    """Finds, once in a safe stop, that the arm speeds up instead of coming to rest."""
+    """Finds in a safe stop that the arm speeds up instead of coming to rest."""
 
     def __init__(self) -> None:
         self.begin(0.0)
@@ -37,15 +37,11 @@ class StopSpeed:
         self._speeding = 0.0  # s, for which the arm has been faster
 
     def observe(self, speed: float, gap: float) -> bool:
-        """Take the speed of a state; return whether the arm now speeds up.
+        """Take the speed of a state; return whether the arm speeds up.
 
-        That is once it has been faster for long enough, and at most once in a stop.
-
-        `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last
-        one.
+        That is while it has been faster for long enough.  `speed` [rad/s] is the largest of a
+        joint, `gap` [s] the time since the last one.
         """
-        if self._speeding > _SPEEDS_UP:
-            return False
         self._peak = max(speed, self._peak)
         is_faster = speed > 2.0 * self._at_stop + _SPED_UP
         is_growing = speed > _GROWING * self._peak
@@ -71,6 +67,7 @@ class SafeStop:
         self._hold = hold
         self._held = held
         self._speed = StopSpeed()
+        self._has_sped_up = False  # since the stop
         self._swings = SwingNames(config.joints)
 
     def begin(
@@ -86,6 +83,7 @@ class SafeStop:
         `was_running`: the law was in command.  `oscillates`: the arm did so.
         """
         self._speed.begin(speed)
+        self._has_sped_up = False
         self._swings.begin()
         load = self._hold.load.copy()
         if was_running:
@@ -136,15 +134,16 @@ class SafeStop:
         return self._hold.leave(safety)
 
     def observe_speed(self, safety: Safety, speed: float, gap: float) -> bool:
-        """Return to the load known before if the arm speeds up; return whether it does.
+        """Hold the load known before while the arm speeds up; return whether it does so first.
 
         `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last one.
         """
-        begins = self._speed.observe(speed, gap)
-        if not begins or safety.torque == 'zero':
+        if not self._speed.observe(speed, gap) or safety.torque == 'zero':
+            self._hold.observe_again()
             return False
         self._hold.stop_observing()
-        return True
+        is_first, self._has_sped_up = not self._has_sped_up, True
+        return is_first
 
     def name_swings(self) -> str:
         """Return a text about joints that swing in the stop and have not been named; or empty."""
