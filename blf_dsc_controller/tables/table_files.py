@@ -86,13 +86,11 @@ class _Arrays:
         vectors = {name: n for name, n in squeezed.items() if 0 < len(n) <= 2}
         longest = max((max(n) for n in vectors.values()), default=0)
         for name, n in vectors.items():
-            if max(n) < longest:
-                continue
-            if len(n) == 1:
-                self._columns[name] = name, 0
-            else:
-                of_matrix = {f'{name}_{k}': (name, k) for k in range(min(n))}
-                self._columns |= of_matrix
+            if max(n) == longest:
+                columns = [name]
+                if len(n) > 1:
+                    columns = [f'{name}_{k}' for k in range(min(n))]
+                self._columns |= {each: (name, k) for k, each in enumerate(columns)}
 
     @property
     def names(self) -> tuple[str, ...]:
