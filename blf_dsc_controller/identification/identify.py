@@ -23,7 +23,12 @@ from blf_dsc_controller.identification.conventions import (
     likely_conventions,
     simpler,
 )
-from blf_dsc_controller.identification.identified import Identified, Score
+from blf_dsc_controller.identification.identified import (
+    Identified,
+    Score,
+    nearest_friction,
+    scored,
+)
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.plausibility import outside_range, shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
@@ -37,7 +42,6 @@ from blf_dsc_controller.identification.problems import (
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.regression import Fit, fitted
 from blf_dsc_controller.identification.ripple import ripples_of
-from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import Selected, select
 from blf_dsc_controller.identification.stiffness import compliance_of
 from blf_dsc_controller.identification.wider_model import doubt
