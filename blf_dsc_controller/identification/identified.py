@@ -18,7 +18,6 @@ from blf_dsc_controller.identification.values import (
     OFFSET,
     VISCOUS,
     Parts,
-    indices,
     parts,
 )
 from blf_dsc_controller.identification.windows import Carried, Rows, Split
@@ -104,7 +103,7 @@ class Identified(NamedTuple):
     @property
     def load(self) -> tuple[Floats, Floats]:
         """Mass [kg] and centre (x, y, z) [m] in the tip of the load, and their deviations."""
-        at = indices(len(self.chain.joints)).load[:4]
+        at = self.prior.at.load[:4]
         C = self.covariance[np.ix_(at, at)]
         return mass_and_centre(self.values[at], C, self.chain.tip_placement)
 

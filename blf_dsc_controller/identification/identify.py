@@ -21,7 +21,7 @@ from blf_dsc_controller.identification.conventions import (
     Convention,
     converted,
     likely_conventions,
-    simpler,
+    simplest,
 )
 from blf_dsc_controller.identification.identified import (
     Identified,
@@ -164,15 +164,15 @@ def _better_convention(
             break
     else:
         return None
-    score = other.score
-    most = _AS_GOOD * _left(score)
-    for i in range(len(convention)):
-        for without in simpler(convention, i):
-            trained = trained_as(without)
-            if _left(trained.score) < most:
-                convention, score = without, trained.score
-                break
-    return convention, score
+    scores = {convention: other.score}
+    most = _AS_GOOD * _left(other.score)
+
+    def is_as_good(without: Convention, _: Convention) -> bool:
+        scores[without] = trained_as(without).score
+        return _left(scores[without]) < most
+
+    convention = simplest(convention, is_as_good)
+    return convention, scores[convention]
 
 
 def _left(score: Score) -> float:

@@ -17,7 +17,7 @@ friction is not, and in both halves of the recording, and stand out of its neigh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -191,13 +191,12 @@ class _Passes(NamedTuple):
         if moves.size < 2:
             nothing = np.zeros(0, dtype=np.intp)
             return cls(nothing, nothing, nothing > 0, np.zeros(0))
-        step = np.diff(time[moves])
+        at = time[moves]
+        step = np.diff(at)
         is_end = (np.diff(np.sign(dq[moves])) != 0) | (step > 1.5 * np.median(step))
-        number = np.concatenate(([0], np.cumsum(is_end)))
-        since = time[moves] - time[moves][np.searchsorted(number, number)]
-        part = np.floor(since / _LONGEST)
-        is_new = (np.diff(number) != 0) | (np.diff(part) != 0)
-        number = np.concatenate(([0], np.cumsum(is_new)))
+        number = np.cumsum(np.append(0, is_end))
+        part = np.floor((at - at[np.searchsorted(number, number)]) / _LONGEST)
+        number = np.cumsum(np.append(0, is_end | (np.diff(part) != 0)))
         is_long = np.bincount(number) >= _ROWS
         rows = moves[is_long[number]]
         begins = np.unique(number[is_long[number]], return_index=True)[1]
@@ -221,11 +220,6 @@ class _Passes(NamedTuple):
         longer = np.abs(np.subtract.outer(length, length)) > 1 + 0.1 * length
         is_twin = (apart < 1.0) & ~longer & ~np.eye(length.size, dtype=bool)
         return bool(is_twin.any(axis=1).mean() > 0.5)
-
-    def parts(self) -> Iterator[Flags]:
-        """Yield the passes (G,) of both directions, and of both halves."""
-        first = self.time < np.median(self.time)
-        yield from (self.is_forward, ~self.is_forward, first, ~first)
 
 
 class _Estimate(NamedTuple):
@@ -393,7 +387,9 @@ def _is_ripple(joint: _Joint, estimate: _Estimate) -> Flags:
     F = 0.5 * np.einsum('ka,ka->k', c, np.linalg.solve(V, c[..., None])[..., 0])
     certain = joint.level < F
     amplitude = np.linalg.norm(c, axis=1)
-    for part in joint.passes.parts():
+    forward, time = joint.passes.is_forward, joint.passes.time
+    first = time < np.median(time)
+    for part in (forward, ~forward, first, ~first):
         certain &= np.linalg.norm(estimate.of(part) - c, axis=1) < _LIKE * amplitude
     power = estimate.power
     for k in np.flatnonzero(certain):
