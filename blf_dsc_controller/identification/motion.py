@@ -187,7 +187,12 @@ def checked(motion: Motion, tree: Tree) -> Motion:
     missing = np.zeros(motion.stamp.size, dtype=bool)
     said = list(motion.said)
     for group in motion.groups.values():
-        _check_known(motion, group)
+        least, most = extremes(group.values)
+        empty = np.flatnonzero(least > most)
+        if empty.size:
+            raise BlfDscError(
+                f'{motion.path}: {group.names[int(empty[0])]} has no numbers: {motion.others}'
+            )
         rows, found = stand_ins(group.values, group.names)
         missing |= rows
         said += [f'{each}, read as missing' for each in found]
@@ -200,16 +205,6 @@ def checked(motion: Motion, tree: Tree) -> Motion:
     if zeros.any():
         said.append(f'torques are exactly 0 in {zeros.sum()} row(s), read as missing')
     return motion.select(~(missing | zeros))._replace(said=said)
-
-
-def _check_known(motion: Motion, group: Group) -> None:
-    """Raise BlfDscError if a column has no numbers."""
-    least, most = extremes(group.values)
-    empty = np.flatnonzero(least > most)
-    if empty.size:
-        raise BlfDscError(
-            f'{motion.path}: {group.names[int(empty[0])]} has no numbers: {motion.others}'
-        )
 
 
 def _check_angles(motion: Motion, tree: Tree) -> None:
