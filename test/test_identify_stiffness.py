@@ -88,6 +88,18 @@ def test_positions_of_motors_in_bags_are_those_of_another_topic(tmp_path, motion
     np.testing.assert_array_equal(unasked.twist[:], recording.twist[:])
 
 
+def test_a_column_of_motors_that_is_given_has_the_unit_of_its_name(tmp_path):
+    time = 0.01 * np.arange(200)
+    q, twist = np.sin(time), 0.01 * np.sin(3.0 * time)
+    rows = np.column_stack((time, q, np.cos(time), np.rad2deg(q + twist)))
+    header = 't,q_1,tau_1,motor deg'
+    np.savetxt(tmp_path / 'a.csv', rows, delimiter=',', header=header, comments='')
+    names = NameMap.parse(['theta=motor deg'])
+    recording = read_recording(tmp_path / 'a.csv', PANDA_TEXT, PANDA[:1], names=names)
+    expected = (twist - np.median(twist))[: len(recording.twist), None]
+    np.testing.assert_allclose(recording.twist, expected, atol=1e-6)
+
+
 # From the arm to its stiffness.
 
 GEARS = {

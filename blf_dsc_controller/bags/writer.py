@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writer of bags like those of `ros2 bag record`: metadata.yaml and MCAP files."""
+"""Bags as those of `ros2 bag record` are written: metadata.yaml and MCAP files."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass
@@ -19,7 +20,7 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.bags.background_file import BackgroundFile
 from blf_dsc_controller.bags.sources import METADATA, BagError, BagExistsError
 from blf_dsc_controller.messages.codecs import NANOSECONDS, Definition, definition
-from blf_dsc_controller.messages.topics import FOREVER, Quality
+from blf_dsc_controller.messages.topics import FOREVER, Quality, Topic
 from blf_dsc_controller.writing import whole
 
 _CHUNK_SIZE = 1 << 20
@@ -269,3 +270,42 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._end_chunk()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
+
+
+class TopicRecorder:
+    """A bag of messages by topic, numbered as a publisher does."""
+
+    def __init__(self, bag: BagWriter) -> None:
+        """Record into a new bag."""
+        self._bag = bag
+        self._handles: dict[Topic, int] = {}
+        self._sent: Counter[Topic] = Counter()
+
+    def write(self, stamp: int, topic: Topic, raw: bytes) -> None:
+        """Write a serialised message with its time [ns].
+
+        Raises:
+            BagError: the disk is full, or too slow; the bag ends there.
+        """
+        try:
+            if topic not in self._handles:
+                offered = [topic.offered]
+                self._handles[topic] = self._bag.add_topic(
+                    topic.resolved, topic.type, offered
+                )
+            self._sent[topic] += 1
+            handle = self._handles[topic]
+            self._bag.write(handle, raw, stamp, sequence=self._sent[topic])
+        except (OSError, BagError) as error:
+            raise self._bag.abandon(error) from error
+
+    def close(self) -> None:
+        """Complete the bag.
+
+        Raises:
+            BagError: as `write`.
+        """
+        try:
+            self._bag.close()
+        except (OSError, BagError) as error:
+            raise self._bag.abandon(error) from error

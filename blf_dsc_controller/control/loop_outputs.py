@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from blf_dsc_controller.bags.topic_recorder import TopicRecorder
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.writer import BagWriter, TopicRecorder
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.messages import topics

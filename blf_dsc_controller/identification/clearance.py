@@ -37,22 +37,14 @@ class Clearance:
             centre = (placements[k] @ place)[:3]
             if distance(centre, centre, origins[k], origins[k + 1]) > radius:
                 self._points.insert(k + 1, (k, place))
-        pairs = self._pairs(origins)
-        self._first, self._second = np.array(pairs, dtype=int).reshape(-1, 2).T
-
-    def _pairs(self, origins: np.ndarray) -> list[tuple[int, int]]:
-        """Return the pairs of lines to check, of links whose joints have these origins."""
+        # pairs of lines to check
         links = [k for k, _ in self._points[:-1]]  # of each line
         length = np.linalg.norm(np.diff(origins, axis=0), axis=1)
         end = np.cumsum(length)
         begin = end - length
-        pairs = []
-        for a, this in enumerate(links):
-            for b, other in enumerate(links):
-                is_line = min(length[this], length[other]) > _LEAST
-                if is_line and begin[other] - end[this] > 2.0 * self._radius:
-                    pairs.append((a, b))
-        return pairs
+        is_line = length[links] > _LEAST
+        are_apart = begin[links] - end[links][:, None] > 2.0 * radius
+        self._first, self._second = np.nonzero(are_apart & is_line & is_line[:, None])
 
     def corners(self, q: np.ndarray) -> np.ndarray:
         """Return base, joints, centres of mass aside, and tip (..., k, 3) [m], at q (..., n)."""

@@ -13,7 +13,7 @@ the best.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, combinations, islice, permutations, product
 
 import numpy as np
@@ -47,12 +47,21 @@ def signs_and_offsets(convention: Convention) -> tuple[Floats, Floats]:
     return signs, 0.25 * TURN * quarters
 
 
-def simpler(convention: Convention, i: int) -> Iterator[Convention]:
-    """Yield others, in which joint i is as in the URDF, or has its zero, but not all joints."""
-    for way in dict.fromkeys((_AS_IS, (convention[i][0], 0))):
-        other = _with(convention, i, way)
-        if other != convention and {*other} != {_AS_IS}:
-            yield other
+def simplest(
+    ways: Convention, is_as_good: Callable[[Convention, Convention], bool]
+) -> Convention:
+    """Return the ways without what is not needed: of each joint all, or its offset.
+
+    `is_as_good` says whether others may replace some; not all joints are as in the URDF.
+    """
+    for i in range(len(ways)):
+        for way in dict.fromkeys((_AS_IS, (ways[i][0], 0))):
+            other = _with(ways, i, way)
+            is_other = other != ways and {*other} != {_AS_IS}
+            if is_other and is_as_good(other, ways):
+                ways = other
+                break
+    return ways
 
 
 def converted(recording: Recording, convention: Convention) -> Recording:
@@ -125,14 +134,9 @@ class _Gravity:
         """Return the other ways if they are clearly better."""
         return other if self.cost(other) < _CLEAR * self.cost(ways) else ways
 
-    def simplest(self, ways: Convention) -> Convention:
-        """Return the ways without what hardly matters: of each joint all, or its offset."""
-        for i in range(len(ways)):
-            for other in simpler(ways, i):
-                if _CLEAR * self.cost(other) <= self.cost(ways):
-                    ways = other
-                    break
-        return ways
+    def is_as_good(self, other: Convention, ways: Convention) -> bool:
+        """Return whether other ways are not clearly worse."""
+        return _CLEAR * self.cost(other) <= self.cost(ways)
 
     def search(self) -> None:
         """Ask for the costs of likely ways in which joints that turn may count.
@@ -172,10 +176,10 @@ class _Gravity:
         """
         found = set()
         for ways in sorted(self._known, key=self._rank):
-            simplest = self.simplest(ways)
-            if simplest not in found:
-                found.add(simplest)
-                yield simplest
+            least = simplest(ways, self.is_as_good)
+            if least not in found:
+                found.add(least)
+                yield least
 
     def _rank(self, ways: Convention) -> tuple[float, int]:
         """Return what counts against these ways; of what is as good, directions are likelier."""

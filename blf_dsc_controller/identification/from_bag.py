@@ -66,7 +66,7 @@ def motion_of_bag(
     parts = [bag.motion(each, each, source, _OF_EFFORTS) for each in states]
     if len(groups) == 1:
         (motion,) = parts
-        if commanded or not np.nan_to_num(motion.tau.values).any():
+        if commanded or not np.nan_to_num(motion.groups['tau'].values).any():
             motion = _of_commands(bag, states[0])
     elif commanded:
         raise BagError(
@@ -101,9 +101,10 @@ class _Bag(NamedTuple):
             path=self.content.path,
             joints=[self.joints[name] for name in states.names],
             stamp=states.stamp,
-            q=group(states, 0, 'position', 'q'),
-            tau=group(efforts, 2, 'effort', 'tau'),
-            theta=None,
+            groups={
+                'q': group(states, 0, 'position', 'q'),
+                'tau': group(efforts, 2, 'effort', 'tau'),
+            },
             unit='' if self.units['q'].name else 'q=',
             others=others,
             source=source,
@@ -115,7 +116,7 @@ def _of_commands(bag: _Bag, states: JointStates) -> Motion:
     """Return the motion of states with commanded torques."""
     source, efforts = applied_torque(bag.content, states)
     motion = bag.motion(states, efforts, source, _OF_COMMANDS)
-    if not np.nan_to_num(motion.tau.values).any():
+    if not np.nan_to_num(motion.groups['tau'].values).any():
         raise BagError(
             f'{motion.path}: all torques in the {source} are zero: record measured efforts'
         )
@@ -162,7 +163,7 @@ def _with_motors(motion: Motion, content: Content, joints: Sequence[str]) -> Mot
     missing, _ = stand_ins(values, joints)
     theta = _at(motion.stamp, states.stamp[~missing], values[~missing])
     return motion._replace(
-        theta=motion.q._replace(values=theta),
+        groups={**motion.groups, 'theta': motion.groups['q']._replace(values=theta)},
         source=f'{motion.source}, positions of motors of {messages.name}',
     )
 
@@ -198,20 +199,20 @@ def _together(parts: Sequence[Motion], joints: Sequence[str]) -> Motion:
     first = parts[0]
     named = [name for part in parts for name in part.joints]
     order = [named.index(name) for name in joints]
-    groups = []
-    for kind in ('q', 'tau'):
-        of_parts: list[Group] = [getattr(part, kind) for part in parts]
+    groups = {}
+    for kind in first.groups:
+        of_parts = [part.groups[kind] for part in parts]
         values = [
             _at(first.stamp, part.stamp, own.values)
             for part, own in zip(parts, of_parts, strict=True)
         ]
         names = [name for own in of_parts for name in own.names]
         factors = np.concatenate([own.factors for own in of_parts])
-        groups.append(
-            Group(np.hstack(values)[:, order], [names[k] for k in order], factors)
+        groups[kind] = Group(
+            np.hstack(values)[:, order], [names[k] for k in order], factors
         )
     said = [each for part in parts for each in part.said]
-    return first._replace(joints=joints, q=groups[0], tau=groups[1], said=said)
+    return first._replace(joints=joints, groups=groups, said=said)
 
 
 def _at(stamp: Stamps, own: Stamps, values: Floats) -> Floats:

@@ -62,7 +62,7 @@ def motion_of_table(
     if joints:
         _check_count(path, columns, trunk)
     groups = _groups(path, table, columns)
-    time, said = _seconds(path, columns, groups['time'])
+    time, said = _seconds(path, columns, groups.pop('time'))
     _check_rows(path, time, groups['q'].values)
     stamp, runs = _one_clock(path, time)
     if runs > 1:
@@ -72,9 +72,7 @@ def motion_of_table(
         path=path,
         joints=trunk[: len(columns.q)],
         stamp=stamp,
-        q=groups['q'],
-        tau=groups['tau'],
-        theta=groups['theta'] if columns.theta else None,
+        groups={kind: each for kind, each in groups.items() if len(each.names)},
         unit='' if split_unit(given['q'], 'q').unit else f'q={pattern}',
         others='choose the columns that have it, as in --map tau=effort_*',
         source=f'{path.name}: {columns.text}',

@@ -21,9 +21,14 @@ from blf_dsc_controller.identification.conventions import (
     Convention,
     converted,
     likely_conventions,
-    simpler,
+    simplest,
 )
-from blf_dsc_controller.identification.identified import Identified, Score
+from blf_dsc_controller.identification.identified import (
+    Identified,
+    Score,
+    nearest_friction,
+    scored,
+)
 from blf_dsc_controller.identification.joint_alone import errors_alone, fit_alone
 from blf_dsc_controller.identification.plausibility import outside_range, shares
 from blf_dsc_controller.identification.problem import Effort, Problem, problem_of
@@ -37,7 +42,6 @@ from blf_dsc_controller.identification.problems import (
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.regression import Fit, fitted
 from blf_dsc_controller.identification.ripple import ripples_of
-from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import Selected, select
 from blf_dsc_controller.identification.stiffness import compliance_of
 from blf_dsc_controller.identification.wider_model import doubt
@@ -160,15 +164,15 @@ def _better_convention(
             break
     else:
         return None
-    score = other.score
-    most = _AS_GOOD * _left(score)
-    for i in range(len(convention)):
-        for without in simpler(convention, i):
-            trained = trained_as(without)
-            if _left(trained.score) < most:
-                convention, score = without, trained.score
-                break
-    return convention, score
+    scores = {convention: other.score}
+    most = _AS_GOOD * _left(other.score)
+
+    def is_as_good(without: Convention, _: Convention) -> bool:
+        scores[without] = trained_as(without).score
+        return _left(scores[without]) < most
+
+    convention = simplest(convention, is_as_good)
+    return convention, scores[convention]
 
 
 def _left(score: Score) -> float:

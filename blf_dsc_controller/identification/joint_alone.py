@@ -68,21 +68,36 @@ def fit_alone(
     (products,) = weighted.products(1)
     deviations = _WEAK * np.linalg.norm(prior.G @ prior.D, axis=1)
     deviations[-1] = _DELAY
-    counted = np.sum(rows.weight[fit] ** 2, axis=0)
-    fits = []
-    for i, of_joint in enumerate(products):
+    scale = np.zeros((len(products), deviations.size))
+    for i, own in enumerate(scale):
         used = [*range(rows.p), *_unknowns_of(rows, i, columns), rows.unknowns]
-        own = np.zeros_like(deviations)
         own[used] = deviations[used]
-        fits.append(_fitted(of_joint, own, float(counted[i])))
-    values = np.array([each.scale * each.z for each in fits])
+    both = np.column_stack((scale, np.ones(len(scale))))
+    scaled = both[:, :, None] * products * both[:, None]
+    counted = np.sum(rows.weight[fit] ** 2, axis=0) - np.count_nonzero(scale, axis=1)
+    counted = np.maximum(counted, 1.0)
+    torque = np.sqrt(scaled[:, -1, -1] / counted)
+    least = _FLOOR * torque + _TINY
+    residual = least
+    for _ in range(_PASSES):
+        normal = scaled / residual[:, None, None] ** 2
+        z = np.array(list(map(most_likely, normal)))
+        left = np.array(list(map(left_of, scaled, z)))
+        residual = np.maximum(np.sqrt(left / counted), least)
+    values = scale * z
     of_residuals = np.column_stack((values, np.full(len(values), -1.0)))
     lengths = correlation_lengths(sums_of(weighted.blocks(), of_residuals))
+    clear = (_CLEAR * torque) ** 2 * counted
     signs = [
-        _sign(each, _unknowns_of(rows, i, SIMPLE[:2]), float(lengths[i]))
-        for i, each in enumerate(fits)
+        _sign(
+            scaled[i] / residual[i] ** 2,
+            z[i],
+            clear[i] / residual[i] ** 2,
+            _unknowns_of(rows, i, SIMPLE[:2]),
+            lengths[i],
+        )
+        for i in range(len(z))
     ]
-    residual, torque = np.transpose([(each.residual, each.torque) for each in fits])
     return Alone(products, values, residual, torque, np.array(signs))
 
 
@@ -97,49 +112,28 @@ def errors_alone(rows: Rows, test: Indices, alone: Alone) -> Floats:
     return rows.rms(left, test)
 
 
-class _Fit(NamedTuple):
-    """The fit of one joint, by values that are scale times z."""
-
-    scale: Floats  # (m + 1,)
-    z: Floats  # (m + 1,)
-    products: Floats  # (m + 2, m + 2) of the columns of z, and of the torque
-    counted: float  # rows
-    residual: float
-    torque: float
-
-
 def _unknowns_of(rows: Rows, joint: int, columns: Collection[str]) -> list[int]:
     """Return the unknowns of some columns of a joint."""
     n = rows.speed.size
     return [rows.p + COLUMNS.index(name) * n + joint for name in columns]
 
 
-def _fitted(products: Floats, scale: Floats, counted: float) -> _Fit:
-    """Return the fit from the products of a joint's rows, of which so many count."""
-    both = np.append(scale, 1.0)
-    products = both[:, None] * products * both
-    counted = max(counted - np.count_nonzero(scale), 1.0)
-    torque = float(np.sqrt(products[-1, -1] / counted))
-    least = _FLOOR * torque + _TINY
-    residual = least
-    z = np.zeros(scale.size)
-    for _ in range(_PASSES):
-        z = most_likely(products / residual**2)
-        residual = max(float(np.sqrt(left_of(products, z) / counted)), least)
-    return _Fit(scale, z, products, counted, residual, torque)
+def _sign(
+    products: Floats, z: Floats, clear: float, friction: list[int], length: float
+) -> float:
+    """Return the sign of friction that explains more than `clear`, 0 if it is not certain.
 
-
-def _sign(fit: _Fit, friction: list[int], length: float) -> float:
-    """Return the sign of clear friction, with residuals of a correlation length."""
+    Products and `clear` are in units of the residual, which has a correlation length.
+    """
     viscous, coulomb = friction
-    of_torque = fit.products[:, friction] @ fit.z[friction]
-    if fit.z[friction] @ of_torque[friction] < _CLEAR**2 * fit.torque**2 * fit.counted:
+    of_torque = products[:, friction] @ z[friction]
+    if z[friction] @ of_torque[friction] < clear:
         return 0.0
     work = float(of_torque[viscous])
-    information = fit.products[:-1, :-1] / fit.residual**2
-    one = np.eye(fit.z.size)
+    information = products[:-1, :-1]
+    one = np.eye(z.size)
     H = np.linalg.inv(information + one)
     variance = (H @ (one + length * information) @ H)[coulomb, coulomb]
-    value = float(fit.z[coulomb])
+    value = float(z[coulomb])
     is_certain = abs(value) > _CERTAIN * np.sqrt(variance)
     return float(np.sign(value)) if is_certain and value * work > 0.0 else 0.0

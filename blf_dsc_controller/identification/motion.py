@@ -8,7 +8,7 @@ limit seems to exceed it three times.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,9 +66,7 @@ class Motion(NamedTuple):
     path: Path
     joints: Sequence[str]
     stamp: Stamps  # (N,) ns
-    q: Group
-    tau: Group
-    theta: Group | None  # of the motors
+    groups: Mapping[str, Group]  # q, tau and, if known, theta of the motors
     unit: str  # `q=` and the columns, to which a unit can be added; empty: it was given
     others: str  # what to do to get other torques
     source: str  # of the torques: a topic, or columns of a table
@@ -79,13 +77,11 @@ class Motion(NamedTuple):
         """Return the states of some rows (N,)."""
         if rows.all():
             return self  # a long motion is not copied
-        theta = self.theta
-        return self._replace(
-            stamp=self.stamp[rows],
-            q=self.q._replace(values=self.q.values[rows]),
-            tau=self.tau._replace(values=self.tau.values[rows]),
-            theta=theta and theta._replace(values=theta.values[rows]),
-        )
+        groups = {
+            kind: each._replace(values=each.values[rows])
+            for kind, each in self.groups.items()
+        }
+        return self._replace(stamp=self.stamp[rows], groups=groups)
 
 
 def recording_of(motion: Motion, tree: Tree) -> Recording:
@@ -102,9 +98,7 @@ def recording_of(motion: Motion, tree: Tree) -> Recording:
     joints = tuple(sound.joints)
     turning = tree.turning(joints)
     stamp = sound.stamp
-    groups = [
-        each.scaled for each in (sound.q, sound.tau, sound.theta) if each is not None
-    ]
+    groups = [each.scaled for each in sound.groups.values()]
     order = _order(stamp, groups)
     if not np.array_equal(order, np.arange(stamp.size)):
         stamp = stamp[order]
@@ -192,43 +186,38 @@ def checked(motion: Motion, tree: Tree) -> Motion:
     """
     missing = np.zeros(motion.stamp.size, dtype=bool)
     said = list(motion.said)
-    for group in (motion.q, motion.tau, motion.theta):
-        if group is not None:
-            _check_known(motion, group)
-            rows, found = stand_ins(group.values, group.names)
-            missing |= rows
-            said += [f'{each}, read as missing' for each in found]
+    for group in motion.groups.values():
+        least, most = extremes(group.values)
+        empty = np.flatnonzero(least > most)
+        if empty.size:
+            raise BlfDscError(
+                f'{motion.path}: {group.names[int(empty[0])]} has no numbers: {motion.others}'
+            )
+        rows, found = stand_ins(group.values, group.names)
+        missing |= rows
+        said += [f'{each}, read as missing' for each in found]
     known = motion.select(~missing)
     if motion.unit:
         _check_angles(known, tree)
         _check_speeds(known, tree)
     _check_torques(known)
-    zeros = unrecorded(motion.tau.values)
+    zeros = unrecorded(motion.groups['tau'].values)
     if zeros.any():
         said.append(f'torques are exactly 0 in {zeros.sum()} row(s), read as missing')
     return motion.select(~(missing | zeros))._replace(said=said)
 
 
-def _check_known(motion: Motion, group: Group) -> None:
-    """Raise BlfDscError if a column has no numbers."""
-    least, most = extremes(group.values)
-    empty = np.flatnonzero(least > most)
-    if empty.size:
-        raise BlfDscError(
-            f'{motion.path}: {group.names[int(empty[0])]} has no numbers: {motion.others}'
-        )
-
-
 def _check_angles(motion: Motion, tree: Tree) -> None:
     """Raise BlfDscError if positions are far beyond what the joints can reach."""
     reach = np.where(tree.turning(motion.joints), tree.reaches(motion.joints), np.inf)
-    least, most = extremes(motion.q.values)
-    found = np.maximum(-least, most) * motion.q.factors
+    q = motion.groups['q']
+    least, most = extremes(q.values)
+    found = np.maximum(-least, most) * q.factors
     beyond = np.flatnonzero(found > _BEYOND * np.maximum(reach, TURN))
     if beyond.size:
         k = int(beyond[0])
         raise BlfDscError(
-            f'{motion.path}: {motion.q.names[k]} goes to {found[k]:.3g} rad, but '
+            f'{motion.path}: {q.names[k]} goes to {found[k]:.3g} rad, but '
             f'{motion.joints[k]} turns by at most {reach[k]:.3g} rad. {_units(motion)}'
         )
 
@@ -241,8 +230,9 @@ def _check_speeds(motion: Motion, tree: Tree) -> None:
     ratio = speed[moving] / limit[moving]
     if moving.size and np.median(ratio) > _FAST:
         k = int(moving[np.argmax(ratio)])
+        names = motion.groups['q'].names
         raise BlfDscError(
-            f'{motion.path}: {motion.q.names[k]} is faster than {speed[k]:.3g} rad/s in a tenth of '
+            f'{motion.path}: {names[k]} is faster than {speed[k]:.3g} rad/s in a tenth of '
             f'the time, but {motion.joints[k]} reaches {limit[k]:.3g} rad/s, and so it is with '
             f'most joints. {_units(motion)}'
         )
@@ -262,8 +252,8 @@ def _speeds(motion: Motion) -> Floats:
     if time.size < 2 or time[-1] < _SHORTEST:
         return np.zeros(len(motion.joints))
     at = np.flatnonzero(np.diff(np.floor(time / _STEP), prepend=-1.0))
-    q = motion.q.values[rows[at]] * motion.q.factors
-    steps = np.diff(q, axis=0)
+    group = motion.groups['q']
+    steps = np.diff(group.values[rows[at]] * group.factors, axis=0)
     steps -= TURN * np.round(steps / TURN)  # of positions that wrap
     steps = np.abs(steps) / np.diff(time[at])[:, None]
     known = steps[np.isfinite(steps).all(axis=1)]
@@ -274,24 +264,24 @@ def _speeds(motion: Motion) -> Floats:
 
 def _check_torques(motion: Motion) -> None:
     """Raise BlfDscError if torques are the same in all rows, or the positions."""
-    q, tau = motion.q.values, motion.tau.values
-    least, most = extremes(q)
+    q, tau = motion.groups['q'], motion.groups['tau']
+    least, most = extremes(q.values)
     if (least == most).all():
         return  # so are the torques of an arm that does not move
-    least, most = extremes(tau)
+    least, most = extremes(tau.values)
     same = np.flatnonzero(least == most).tolist()
     if same:
-        listed = ', '.join(motion.tau.names[k] for k in same)
+        listed = ', '.join(tau.names[k] for k in same)
         moved = ', '.join(motion.joints[k] for k in same)
         raise BlfDscError(
             f'{motion.path}: {listed}: {least[same[0]]:g} in all rows, so the torque of '
             f'{moved} was not recorded there: {motion.others}'
         )
-    unknown = ~(np.isfinite(q) & np.isfinite(tau))
-    copied = np.flatnonzero(((q == tau) | unknown).all(axis=0))
+    unknown = ~(np.isfinite(q.values) & np.isfinite(tau.values))
+    copied = np.flatnonzero(((q.values == tau.values) | unknown).all(axis=0))
     if copied.size:
         k = int(copied[0])
         raise BlfDscError(
-            f'{motion.path}: {motion.tau.names[k]} is {motion.q.names[k]} in all rows, so it is '
+            f'{motion.path}: {tau.names[k]} is {q.names[k]} in all rows, so it is '
             f'no torque: {motion.others}'
         )

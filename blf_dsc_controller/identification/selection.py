@@ -79,27 +79,25 @@ def _worthwhile(found: Regression, prior: Prior) -> list[Entry]:
 
     Entries that cannot be negative must be positive in each prediction.
     """
-    kept: list[Entry] = []
     optional = prior.optional
     _, terms = prior.cones
     positive = [k for entry in optional for k in entry if k in terms.entries]
-    used = np.ones(prior.mean.size)
-    for entry in optional:
-        used[list(entry)] = 0.0
-    least = float(cross_validated(found, used, positive).sum())
+
+    def error(kept: Sequence[Entry]) -> float:
+        used = np.ones(prior.mean.size)
+        used[[k for entry in optional if entry not in kept for k in entry]] = 0.0
+        return float(cross_validated(found, used, positive).sum())
+
+    kept: list[Entry] = []
+    least = error(kept)
     left = list(optional)
     while left:
-        errors = []
-        for entry in left:
-            extended = used.copy()
-            extended[list(entry)] = 1.0
-            errors.append(float(cross_validated(found, extended, positive).sum()))
+        errors = [error([*kept, entry]) for entry in left]
         best = int(np.argmin(errors))
         if errors[best] > (1.0 - _WORTH_OF_TERM) * least:
             break
         least = errors[best]
         kept.append(left.pop(best))
-        used[list(kept[-1])] = 1.0
     return kept
 
 

@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blf_dsc_controller.bags.topic_recorder import TopicRecorder
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.writer import BagWriter, TopicRecorder
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import errors_told_with_line

@@ -16,7 +16,7 @@ from math import prod
 from os import SEEK_CUR
 from pathlib import Path
 from struct import Struct
-from typing import Any, Protocol
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -24,7 +24,7 @@ import numpy as np
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.extras import import_extra
 from blf_dsc_controller.run import Floats
-from blf_dsc_controller.tables.text_tables import text_table
+from blf_dsc_controller.tables.text_tables import TextTable, text_table
 
 _MOST = 1 << 28  # bytes that an array, or a mat file, may have, unpacked
 _BYTES = 8  # of a number
@@ -34,17 +34,6 @@ _HEADER = 128  # bytes of a mat file
 _COMPRESSED = 15  # type of an element
 _WITH_COMPRESSION, _HDF5 = 1, 2  # major versions of mat files
 _AT_ONCE = 1 << 20  # bytes
-
-
-class Table(Protocol):
-    """Columns of one length, by name."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns."""
-
-    def read(self, columns: Sequence[str], /) -> Floats:
-        """Return some columns (N, k)."""
 
 
 def open_table(path: Path) -> Table:
@@ -72,7 +61,11 @@ def _check_regular(path: Path) -> None:
 
 
 class _Arrays:
-    """Columns of arrays, of which each is loaded when it is asked for."""
+    """Columns of arrays, of which each is loaded when it is asked for.
+
+    Attributes:
+        names: of the columns.
+    """
 
     def __init__(
         self, shapes: Mapping[str, tuple[int, ...]], load: Callable[[str], Any]
@@ -86,18 +79,12 @@ class _Arrays:
         vectors = {name: n for name, n in squeezed.items() if 0 < len(n) <= 2}
         longest = max((max(n) for n in vectors.values()), default=0)
         for name, n in vectors.items():
-            if max(n) < longest:
-                continue
-            if len(n) == 1:
-                self._columns[name] = name, 0
-            else:
-                of_matrix = {f'{name}_{k}': (name, k) for k in range(min(n))}
-                self._columns |= of_matrix
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns."""
-        return tuple(self._columns)
+            if max(n) == longest:
+                columns = [name]
+                if len(n) > 1:
+                    columns = [f'{name}_{k}' for k in range(min(n))]
+                self._columns |= {each: (name, k) for k, each in enumerate(columns)}
+        self.names = tuple(self._columns)
 
     def read(self, columns: Sequence[str]) -> Floats:
         """Return some columns (N, k)."""
@@ -109,6 +96,10 @@ class _Arrays:
                 loaded[name] = _upright(self._load(name))
             found.append(loaded[name][:, k])
         return np.column_stack(found)
+
+
+Table = TextTable | _Arrays
+"""Columns of one length, by name."""
 
 
 def _upright(values: Any) -> Floats:

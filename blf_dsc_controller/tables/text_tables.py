@@ -17,7 +17,7 @@ from codecs import BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import islice, zip_longest
+from itertools import compress, islice, zip_longest
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -296,11 +296,7 @@ def _ros2_names(cells: Sequence[str]) -> list[str]:
     if len(cells) <= _STAMP or not any(words[_STAMP:]):
         return []
     is_stamp = all(cell.isdigit() for cell in cells[:_STAMP])
-    joints = [
-        cell
-        for cell, is_word in zip(cells[_STAMP + 1 :], words[_STAMP + 1 :], strict=True)
-        if is_word
-    ]
+    joints = list(compress(cells[_STAMP + 1 :], words[_STAMP + 1 :]))
     first = _STAMP + 1 + len(joints)
     fields, rest = divmod(len(cells) - first, max(len(joints), 1))
     if not is_stamp or not joints or rest or fields != len(_FIELDS):
