@@ -13,6 +13,9 @@ from base64 import b64decode, b64encode
 from enum import Enum
 from typing import NamedTuple, TypeAlias
 
+KIND = 0
+"""Of all of them over a `Link`."""
+
 SUCCESSFUL = 'SUCCESSFUL'
 INVALID = 'INVALID_GOAL'
 PATH_VIOLATED = 'PATH_TOLERANCE_VIOLATED'

@@ -7,10 +7,9 @@ brakes the arm.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -40,7 +39,7 @@ from blf_dsc_controller.errors import (
     NotInTimeError,
 )
 from blf_dsc_controller.extras import import_extra
-from blf_dsc_controller.messages import script_link, topic_link
+from blf_dsc_controller.messages import script_link
 from blf_dsc_controller.messages.script_link import ArmState
 from blf_dsc_controller.messages.tip_load import TAKEN_UP
 
@@ -260,7 +259,7 @@ class Drive:
         Raises:
             NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        self._ask(script_link.BRAKE, lambda number: number, timeout)
+        self._ask(script_link.BRAKE, None, timeout)
 
     def load(
         self,
@@ -282,10 +281,7 @@ class Drive:
             MotionFailedError: these drives cannot be told, or refuse.
             NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        wanted = checked_load(mass, centre)
-        self._ask(
-            script_link.LOAD, lambda number: {'number': number, **wanted}, timeout
-        )
+        self._ask(script_link.LOAD, checked_load(mass, centre), timeout)
 
     def expect_load(
         self,
@@ -318,9 +314,7 @@ class Drive:
             'interval': checked_interval(interval),
             'remember': bool(remember),
         }
-        self._ask(
-            script_link.EXPECT, lambda number: {'number': number, **wanted}, timeout
-        )
+        self._ask(script_link.EXPECT, wanted, timeout)
 
     def tare(self, timeout: float | None = None) -> None:
         """Take the external torque for zero where the arm rests now, as before an insertion.
@@ -332,7 +326,7 @@ class Drive:
                 `contact.enabled` is false.
             NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        self._ask(script_link.TARE, lambda number: number, timeout)
+        self._ask(script_link.TARE, None, timeout)
 
     # State.
 
@@ -433,17 +427,10 @@ class Drive:
     ) -> None:
         """Begin a motion; `hint` is what its error ends with."""
         checked_timeout(timeout)
-        self._loop.check()
-        self._number += 1
-        self._last = number = self._number
+        self._last = number = self._request(kind, wanted)
         self._hint = number, hint
         # another thread may still ask for that of the last motion
         self._loop.forget_results(before=number - _KEPT)
-        if kind == script_link.FOLLOW:
-            content = script_link.HEAD.pack(number) + topic_link.encode(wanted)
-        else:
-            content = topic_link.encode({**wanted, 'number': number})
-        self._loop.put(kind, content)
         if wait:
             self._await_motion(number, timeout)
 
@@ -455,18 +442,18 @@ class Drive:
             raise NotInTimeError(f'{error}: the arm has braked') from None
         except KeyboardInterrupt:
             # where no block ends with it, as in a notebook, the arm would go on
-            with contextlib.suppress(LoopEndedError):
-                self._loop.put(script_link.BRAKE, topic_link.encode(number))
+            self._loop.brake()
             raise
 
-    def _ask(
-        self, kind: int, wanted: Callable[[int], Any], timeout: float | None
-    ) -> None:
+    def _ask(self, kind: int, wanted: Any, timeout: float | None) -> None:
         checked_timeout(timeout)
-        self._number += 1
-        number = self._number
-        self._loop.put(kind, topic_link.encode(wanted(number)))
-        self._await_result(number, timeout)
+        self._await_result(self._request(kind, wanted), timeout)
+
+    def _request(self, kind: int, wanted: Any) -> int:
+        """Send a request, and return its number."""
+        self._number = number = self._number + 1
+        self._loop.request(kind, number, wanted)
+        return number
 
     def _await_result(self, number: int, timeout: float | None) -> None:
         problem = self._loop.await_result(number, timeout)

@@ -10,7 +10,6 @@ import contextlib
 import logging
 import os
 import signal
-import socket
 import subprocess
 import threading
 import time
@@ -18,8 +17,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from blf_dsc_controller import child
-from blf_dsc_controller.control import goal_messages
-from blf_dsc_controller.control.goal_messages import Answer, Outcome
 from blf_dsc_controller.drive.arguments import checked_timeout
 from blf_dsc_controller.errors import (
     DriveError,
@@ -27,7 +24,7 @@ from blf_dsc_controller.errors import (
     NotInTimeError,
 )
 from blf_dsc_controller.messages import script_link, topic_link
-from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.link import LinkedProcess
 from blf_dsc_controller.messages.script_link import ArmState
 
 _MODULE = 'blf_dsc_controller.drive.script_process'
@@ -62,16 +59,13 @@ class LoopProcess:
         self._news = threading.Condition()
         self._closed = False
         self._forget()
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [*child.running_module(_MODULE), f'{theirs.fileno()}'],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                env=child.ONE_THREAD | os.environ | child.places(),
-                start_new_session=True,  # Ctrl-C is for the script, which brakes
-            )
-        self._link = Link(ours)
+        self._link = LinkedProcess(
+            _MODULE,
+            variables=child.ONE_THREAD,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the script, which brakes
+        )
+        self._process = self._link.process
         self._send(script_link.START, topic_link.encode(wanted))
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
@@ -116,7 +110,15 @@ class LoopProcess:
     def brake(self) -> None:
         """Let the arm brake within the limits, if the loop runs, and return at once."""
         with contextlib.suppress(DriveError):
-            self.put(script_link.BRAKE, topic_link.encode(_NOBODY))
+            self.request(script_link.BRAKE, _NOBODY, None)
+
+    def request(self, kind: int, number: int, wanted: Any) -> None:
+        """Send a request, whose number is that of its result.
+
+        Raises:
+            LoopEndedError: it has ended.
+        """
+        self.put(kind, script_link.request(number, wanted))
 
     def has_result(self, number: int) -> bool:
         """Return whether it has told what became of a request."""
@@ -159,11 +161,7 @@ class LoopProcess:
 
     def end(self) -> None:
         """Wait for a process that is about to end, or kill it."""
-        try:
-            self._process.wait(_END)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._link.await_end(_END)
         self._listener.join()
         self._link.close()
 
@@ -236,12 +234,10 @@ class LoopProcess:
     # What the process tells, in a thread.
 
     def _listen(self) -> None:
-        while not self._link.broken:
-            self._link.wait(_POLL)
-            for kind, content in self._link.messages():
-                with self._news:
-                    self._take(kind, content)
-                    self._news.notify_all()
+        for kind, content in self._link.all_messages():
+            with self._news:
+                self._take(kind, content)
+                self._news.notify_all()
         code = self._process.wait()
         with self._news:
             if not self.ended:
@@ -253,9 +249,6 @@ class LoopProcess:
         self._heard = time.monotonic()
         if kind == script_link.SAMPLE:
             self._state = script_link.decode_sample(content, len(self.joints))
-            return
-        if kind == script_link.GOAL:
-            self._take_goal(goal_messages.decode(content))
             return
         told = topic_link.decode(content)
         if kind == script_link.RUNNING:
@@ -272,13 +265,6 @@ class LoopProcess:
             self.ended = told
         elif kind == topic_link.LOG:
             _LOG.log(logging.getLevelName(told['level'].upper()), told['text'])
-
-    def _take_goal(self, told: goal_messages.Message) -> None:
-        if isinstance(told, Answer) and not told.accepted:
-            self._results[told.number] = told.reason
-        elif isinstance(told, goal_messages.End):
-            done = told.outcome is Outcome.SUCCEEDED
-            self._results[told.number] = None if done else told.text
 
 
 def _death(code: int) -> str:

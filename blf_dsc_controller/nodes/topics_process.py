@@ -8,8 +8,6 @@ streamed positions and stops. It ends with the connection.
 from __future__ import annotations
 
 import os
-import signal
-import socket
 import sys
 import threading
 from collections.abc import Sequence
@@ -25,14 +23,14 @@ from rclpy.node import Node
 from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topic_link, topics
-from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.link import Link, link_of
 from blf_dsc_controller.messages.topic_link import (
     KINDS,
     LOG,
+    OF_LOOP,
     READY,
     STATUS,
     STOP,
-    TOPICS,
 )
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher, Part
@@ -51,17 +49,13 @@ _SILENT = (
 class LoopTopics:
     """The topics of a loop in another process, by its node."""
 
-    def __init__(
-        self, node: Node, link: Link, kinds: Sequence[int], joints: Sequence[str]
-    ) -> None:
-        """Create the topics of these kinds."""
+    def __init__(self, node: Node, link: Link, joints: Sequence[str]) -> None:
+        """Create the topics."""
         self._node = node
         self._link = link
-        shared = {topics.STATE, topics.DIAGNOSTICS}
         self.publishers = {
-            kind: create_publisher(node, TOPICS[kind])
-            for kind in (*kinds, KINDS[topics.ROBOT_DESCRIPTION])
-            if TOPICS[kind] not in shared
+            KINDS[topic]: create_publisher(node, topic)
+            for topic in (*OF_LOOP, topics.ROBOT_DESCRIPTION)
         }
         self._state = create_publisher(node, topics.STATE)
         self._diagnostics = DiagnosticsPublisher(node, joints)
@@ -75,7 +69,12 @@ class LoopTopics:
             self._stop,
         )
 
-    def take(self, kind: int, content: bytes) -> None:
+    def listen(self) -> None:
+        """Take the loop's messages until it ends."""
+        for message in self._link.all_messages():
+            self._take(*message)
+
+    def _take(self, kind: int, content: bytes) -> None:
         """Do what a message of the loop says."""
         publisher = self.publishers.get(kind)
         if publisher is not None:
@@ -130,28 +129,18 @@ class LoopTopics:
         return text
 
 
-def _listen(link: Link, loop: LoopTopics) -> None:
-    """Take the loop's messages until it ends."""
-    while not link.broken:
-        link.wait(_POLL)
-        for kind, content in link.messages():
-            loop.take(kind, content)
-
-
 def main() -> int:
     """Run until the loop ends."""
-    descriptor, namespace, kinds, *joints = sys.argv[1:]
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop may still brake
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    argument, namespace, *joints = sys.argv[1:]
+    process.yield_to_loop()
     os.nice(_NICE)
-    link = Link(socket.socket(fileno=int(descriptor)))
+    link = link_of(argument)
     rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     node = Node(CONTROLLER, namespace=namespace, start_parameter_services=False)
-    loop = LoopTopics(node, link, [int(kind) for kind in kinds.split(',')], joints)
+    loop = LoopTopics(node, link, joints)
     with EventsExecutor() as executor:
         executor.add_node(node)
-        listener = threading.Thread(target=_listen, args=(link, loop), daemon=True)
+        listener = threading.Thread(target=loop.listen, daemon=True)
         listener.start()
         link.put(READY, b'null')
         while listener.is_alive():
