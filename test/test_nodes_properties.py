@@ -178,7 +178,7 @@ def test_plant_survives_arbitrary_input(ros, sequence):
         enable_rosout=False,
         parameter_overrides=overrides,
     )
-    node._is_observed = lambda: True
+    node.is_observed = lambda: True
     node._peers = iter(())  # all there
     try:
         for kind, content in sequence:

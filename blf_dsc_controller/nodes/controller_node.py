@@ -14,7 +14,7 @@ from geometry_msgs.msg import Inertia
 from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, WATCHDOG
+from blf_dsc_controller.configuration.nodes import CONTROLLER, WATCHDOG
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.errors import BlfDscError
@@ -27,11 +27,14 @@ from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_log import ControllerLog
-from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
+from blf_dsc_controller.nodes.controller_start import (
+    WAITING_PERIOD,
+    ControllerStart,
+    is_simulated,
+)
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.service_declaration import ServiceDeclaration
-from blf_dsc_controller.nodes.start_conditions import WAITING_PERIOD, StartConditions
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
@@ -84,12 +87,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self.status = ControllerStatus(self, joints, self.outputs)
         self.action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
-        self.starting = ControllerStart(
-            self.config,
-            self._decoder,
-            StartConditions(self, self._watchdog, self._steady),
-            Surroundings(self._is_observed, self._is_simulated, self._wall),
-        )
+        self.starting = ControllerStart(self, self._decoder, self._watchdog)
         self._changes = parameters.on_change(
             self, type(self.config), self._retune, self._problems, self._check
         )
@@ -108,7 +106,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def configure(self) -> None:
         """Compile the law; create the topics of the loop on the first call."""
-        self._loop = GuardedLoop(self.config, self._steady, self._wall)
+        self._loop = GuardedLoop(self.config, self.steady, self.wall)
         self.guard = self._loop.guard
         self.log.begin()
         self._record_topics(self.guard)
@@ -124,7 +122,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             inputs = motion_input_of(self, len(joints), lambda: self.guard)
             self.status.trajectories = inputs
             self.action = offered_action(self, inputs, joints)
-        self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
+        self.starting.look_around(self._outputs[topics.COMMANDS].topic_name)
         self._report()
 
     def _record_topics(self, guard: Guard) -> None:
@@ -207,7 +205,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
             return True
-        now = self._steady() * 1e-9
+        now = self.steady() * 1e-9
         messages = guard.journal.messages
         if not self._ends_at:
             self._ends_at = now + _LONGEST_END
@@ -222,7 +220,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _begin_again(self, guard: Guard) -> None:
         """Look at the conditions of the start, if this node does not command now."""
         if guard.silenced or not guard.commanding:
-            self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
+            self.starting.look_around(self._outputs[topics.COMMANDS].topic_name)
 
     def _leave(self) -> None:
         """Command the torque that drivers may hold, and release the guard."""
@@ -312,11 +310,6 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 throttle_duration_sec=WAITING_PERIOD,
             )
         self.report_if_changed(guard)
-
-    def _is_simulated(self) -> bool:
-        """Whether all joint states are of this package's simulated arm."""
-        found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
-        return all(each.node_name == PLANT for each in found)
 
     def survive(self, error: Exception) -> bool:
         """Make a safe stop after an unexpected error."""
@@ -450,7 +443,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is not None and guard.reference.start_stamp != self.warned_at:
             self.warned_at = guard.reference.start_stamp
-            if not self._is_simulated():
+            if not is_simulated(self):
                 self.log.warn_of_start(guard)
 
     def _look_for_watchdog(self) -> None:

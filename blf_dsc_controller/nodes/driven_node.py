@@ -67,11 +67,6 @@ class DrivenNode(ControllerNode):
         """Full name of the topic of the joint states."""
         return str(self.resolve_topic_name(topics.JOINT_STATES.relative))
 
-    @property
-    def is_heard(self) -> bool:
-        """Whether somebody takes the torques."""
-        return self._is_observed()
-
     def position(self) -> np.ndarray | None:
         """Return the positions (n,) [rad] of the last joint state; None: there was none."""
         guard = self.guard

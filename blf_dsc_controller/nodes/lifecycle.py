@@ -65,7 +65,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         super().__init__(name, **options)
         service = self._service_change_state
         service.callback = partial(self._change_state, service.callback)
-        self._steady, self._wall = steady, wall
+        self.steady, self.wall = steady, wall
         self.config: Config = parameters.declare(self, cls)
         self._outputs: dict[Topic, Publisher] = {}
         self._senders: dict[Topic, Callable[[bytes], None]] = {}
@@ -228,7 +228,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         topic, raw = message
         self._senders[topic](raw)
 
-    def _is_observed(self) -> bool:
+    def is_observed(self) -> bool:
         """Whether each output has its recorders, and the first one the other node."""
         wanted = self.config.wait_for_subscribers
         publishers = [*self._outputs.values()]

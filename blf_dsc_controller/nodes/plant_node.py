@@ -104,7 +104,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self.start()
 
     def _now(self) -> float:
-        return self._steady() * 1e-9
+        return self.steady() * 1e-9
 
     # Life cycle.
 
@@ -189,7 +189,7 @@ class PlantNode(LoopNode[PlantConfig]):
         while self._now() < settled:
             settled = (
                 min(settled, self._now() + _SETTLING_TIME)
-                if self._is_observed()
+                if self.is_observed()
                 else inf
             )
             yield True
@@ -213,7 +213,7 @@ class PlantNode(LoopNode[PlantConfig]):
     def _offer(self) -> None:
         """Publish the first state, after incomplete ones; if a torque waits, go on at once."""
         if not self._lockstep:
-            self.start_stamp = self._wall() - self.plant.elapsed_ns
+            self.start_stamp = self.wall() - self.plant.elapsed_ns
         self.is_offered = True
         measurement = self.plant.measure().copy()
         measurement[len(self.config.joints) :] = nan
