@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import weakref
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -45,8 +46,6 @@ from blf_dsc_controller.messages.tip_load import TAKEN_UP
 
 if TYPE_CHECKING:
     from blf_dsc_controller.drive.pose import Pose, Poses
-
-_KEPT = 100  # results of motions
 
 
 class Drive:
@@ -94,9 +93,8 @@ class Drive:
         self._robot = checked_robot(robot)
         self._record = checked_record(record)
         self._starts = 0
-        self._number = 0  # of the last request
-        self._last = 0  # of the last motion
-        self._hint = 0, ''  # of which motion, and what its error ends with
+        self._last: Future[str] | None = None  # result of the last motion
+        self._hint = ''  # what its error ends with
         self._loop = self._start()
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -224,8 +222,7 @@ class Drive:
             MissingExtraError: pink is not installed.
         """
         begin = np.array(self.state.reference)
-        line = self._poses.line(begin, position, rotation, checked_speed(speed))
-        points = list(zip(line.times, line.positions, strict=True))
+        points = self._poses.line(begin, position, rotation, checked_speed(speed))
         self.follow(points, wait=wait, timeout=timeout)
 
     def stream(self, positions: ArrayLike) -> None:
@@ -250,7 +247,7 @@ class Drive:
         Raises:
             MotionFailedError, NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        if self._last:
+        if self._last is not None:
             self._await_motion(self._last, timeout)
 
     def stop(self, timeout: float | None = None) -> None:
@@ -371,7 +368,7 @@ class Drive:
             LoopEndedError: the loop has ended.
         """
         self._loop.check()
-        return self._last != 0 and not self._loop.has_result(self._last)
+        return self._last is not None and not self._last.done()
 
     @property
     def ended(self) -> str:
@@ -388,7 +385,7 @@ class Drive:
         """
         if not self.ended:
             return
-        self._last = 0
+        self._last = None
         if self._loop.can_recover:
             self._loop.recover()
         else:
@@ -427,16 +424,14 @@ class Drive:
     ) -> None:
         """Begin a motion; `hint` is what its error ends with."""
         checked_timeout(timeout)
-        self._last = number = self._request(kind, wanted)
-        self._hint = number, hint
-        # another thread may still ask for that of the last motion
-        self._loop.forget_results(before=number - _KEPT)
+        self._last = self._loop.request(kind, wanted)
+        self._hint = hint
         if wait:
-            self._await_motion(number, timeout)
+            self._await_motion(self._last, timeout)
 
-    def _await_motion(self, number: int, timeout: float | None) -> None:
+    def _await_motion(self, result: Future[str], timeout: float | None) -> None:
         try:
-            self._await_result(number, timeout)
+            self._await_result(result, timeout, self._hint)
         except NotInTimeError as error:
             self.stop()
             raise NotInTimeError(f'{error}: the arm has braked') from None
@@ -447,19 +442,14 @@ class Drive:
 
     def _ask(self, kind: int, wanted: Any, timeout: float | None) -> None:
         checked_timeout(timeout)
-        self._await_result(self._request(kind, wanted), timeout)
+        self._await_result(self._loop.request(kind, wanted), timeout)
 
-    def _request(self, kind: int, wanted: Any) -> int:
-        """Send a request, and return its number."""
-        self._number = number = self._number + 1
-        self._loop.request(kind, number, wanted)
-        return number
-
-    def _await_result(self, number: int, timeout: float | None) -> None:
-        problem = self._loop.await_result(number, timeout)
-        if problem is not None:
-            of, hint = self._hint
-            raise MotionFailedError(problem + hint if number == of else problem)
+    def _await_result(
+        self, result: Future[str], timeout: float | None, hint: str = ''
+    ) -> None:
+        problem = self._loop.await_result(result, timeout)
+        if problem:
+            raise MotionFailedError(problem + hint)
 
 
 def _listed(values: Any) -> list[float]:

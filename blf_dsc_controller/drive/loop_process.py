@@ -14,6 +14,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from typing import Any
 
 from blf_dsc_controller import child
@@ -30,7 +31,6 @@ from blf_dsc_controller.messages.script_link import ArmState
 _MODULE = 'blf_dsc_controller.drive.script_process'
 _POLL = 0.1  # s
 _SILENCE = 60.0  # s without a word of a loop that runs
-_NOBODY = 0  # number of a request whose end nobody waits for
 _END = 5.0  # s, for a process that was told to end at once
 _LOG = logging.getLogger('blf_dsc_controller')
 
@@ -58,6 +58,7 @@ class LoopProcess:
         self._owner = os.getpid()
         self._news = threading.Condition()
         self._closed = False
+        self._count = 0  # of requests
         self._forget()
         self._link = LinkedProcess(
             _MODULE,
@@ -110,35 +111,32 @@ class LoopProcess:
     def brake(self) -> None:
         """Let the arm brake within the limits, if the loop runs, and return at once."""
         with contextlib.suppress(DriveError):
-            self.request(script_link.BRAKE, _NOBODY, None)
+            self.request(script_link.BRAKE, None)
 
-    def request(self, kind: int, number: int, wanted: Any) -> None:
-        """Send a request, whose number is that of its result.
+    def request(self, kind: int, wanted: Any) -> Future[str]:
+        """Send a request; its result says why it failed, or is empty once it is done.
 
         Raises:
             LoopEndedError: it has ended.
         """
-        self.put(kind, script_link.request(number, wanted))
+        self.check()
+        result: Future[str] = Future()
+        with self._news:
+            self._count += 1
+            number = self._count
+            self._results[number] = result
+        self._send(kind, script_link.request(number, wanted))
+        return result
 
-    def has_result(self, number: int) -> bool:
-        """Return whether it has told what became of a request."""
-        return number in self._results
-
-    def await_result(self, number: int, timeout: float | None) -> str | None:
-        """Wait for the end of a request; return why it failed, or None if it is done.
+    def await_result(self, result: Future[str], timeout: float | None) -> str:
+        """Wait for the end of a request, and return its result.
 
         Raises:
             NotInTimeError: after the timeout [s].
             LoopEndedError: it ends before.
         """
-        self._until(lambda: number in self._results, timeout)
-        return self._results[number]
-
-    def forget_results(self, before: int) -> None:
-        """Forget what became of requests with smaller numbers."""
-        with self._news:
-            for number in [each for each in self._results if each < before]:
-                del self._results[number]
+        self._until(result.done, timeout)
+        return result.result()
 
     def recover(self) -> None:
         """Begin another loop in the same process, and wait until the arm is held."""
@@ -197,7 +195,7 @@ class LoopProcess:
         self.ended = ''
         self._state: ArmState | None = None
         self._waits = self._runs = False
-        self._results: dict[int, str | None] = {}  # of requests: why they failed
+        self._results: dict[int, Future[str]] = {}  # of requests that are not over
         self._heard = time.monotonic()
 
     def _send(self, kind: int, content: bytes) -> None:
@@ -255,7 +253,8 @@ class LoopProcess:
             self.joints = tuple(told)
             self._runs = True
         elif kind == script_link.DONE:
-            self._results[told['number']] = told['problem'] or None
+            if result := self._results.pop(told['number'], None):
+                result.set_result(told['problem'])
         elif kind == script_link.ENDED:
             reason = f': {told["text"]}' if told['text'] else ''
             self._waits = told['waits']

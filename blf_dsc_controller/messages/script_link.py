@@ -7,6 +7,7 @@ LOG.
 
 from __future__ import annotations
 
+from functools import cache
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -87,36 +88,31 @@ class ArmState(NamedTuple):
     contact: bool  #: whether something touches the arm; False unless `contact.enabled`
 
 
-_SCALARS = 4
-_VECTORS = 7
+_SCALARS = {
+    'time': 'f8',
+    'phase': 'U16',
+    'load': 'f8',
+    'load_interval': 'f8',
+    'contact': '?',
+}
+
+
+@cache
+def _layout(joints: int) -> np.dtype[np.void]:
+    """Return how a state of an arm with so many joints is sent."""
+    return np.dtype(
+        [
+            (name, _SCALARS.get(name, 'f8'), () if name in _SCALARS else (joints,))
+            for name in ArmState._fields
+        ]
+    )
 
 
 def encode_sample(state: ArmState) -> bytes:
     """Return a state as bytes."""
-    scalars = state.time, state.load, state.load_interval, float(state.contact)
-    values = np.concatenate((scalars, *state[2 : 2 + _VECTORS]))
-    return values.tobytes() + state.phase.encode()
+    return np.array(tuple(state), _layout(len(state.q))).tobytes()
 
 
 def decode_sample(raw: bytes, joints: int) -> ArmState:
     """Return the state of `encode_sample`, of an arm with so many joints."""
-    size = _SCALARS + _VECTORS * joints
-    values = np.frombuffer(raw, np.float64, size)
-    time, load, interval, contact = values[:_SCALARS].tolist()
-    q, dq, tau, reference, error, bound, external = values[_SCALARS:].reshape(
-        _VECTORS, joints
-    )
-    return ArmState(
-        time=time,
-        phase=raw[8 * size :].decode(),
-        q=q,
-        dq=dq,
-        tau=tau,
-        reference=reference,
-        error=error,
-        bound=bound,
-        external=external,
-        load=load,
-        load_interval=interval,
-        contact=bool(contact),
-    )
+    return ArmState(*np.frombuffer(raw, _layout(joints)).item())
