@@ -35,7 +35,7 @@ from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import Change
-from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
+from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.diagnostics import (
     ERROR,
@@ -339,11 +339,14 @@ class PlantNode(LoopNode[PlantConfig]):
         self.has_torque = False
         self._published = self._now()
         self.latency.state_published(self._published)
-        if (motors := self.plant.motor_reading) is not None:
-            self._publish(self._telemetry.motor_states(stamp, motors))
-        self._publish(self._telemetry.joint_states(stamp, measurement))
-        if self.plant.sample % DECIMATION == 0:
-            self._publish(self._telemetry.truth(stamp, self.plant.truth()))
+        for message in self._telemetry.states(
+            self.plant.sample,
+            stamp,
+            measurement,
+            self.plant.motor_reading,
+            self.plant.truth,
+        ):
+            self._publish(message)
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 
