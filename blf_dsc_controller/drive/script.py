@@ -263,7 +263,7 @@ class Script(Beside):
             self._tell_done(message.number, message.reason)
         elif isinstance(message, End) and self._guard.supervisor.running:
             # else the loop ends, and says why
-            succeeded = message.outcome is Outcome.SUCCEEDED
+            succeeded = message.outcome == Outcome.SUCCEEDED
             self._tell_done(message.number, '' if succeeded else message.text)
 
 

@@ -159,9 +159,9 @@ class TrajectoryActionServer:
 
     def _on_end(self, message: End) -> None:
         handle = self._handles.pop(message.number)
-        if message.outcome is Outcome.SUCCEEDED:
+        if message.outcome == Outcome.SUCCEEDED:
             handle.succeed()
-        elif message.outcome is Outcome.CANCELLED:
+        elif message.outcome == Outcome.CANCELLED:
             handle.canceled()
         else:
             handle.abort()
@@ -185,10 +185,8 @@ def _unsupported(request: Any) -> str:
     return ''
 
 
-def _tolerances(sent: Any) -> tuple[JointTolerance, ...]:
-    return tuple(
-        JointTolerance(each.name, each.position, each.velocity) for each in sent
-    )
+def _tolerances(sent: Any) -> list[JointTolerance]:
+    return [(each.name, each.position, each.velocity) for each in sent]
 
 
 def _point(time: float, values: list[list[float]]) -> JointTrajectoryPoint:
