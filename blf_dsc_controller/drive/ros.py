@@ -185,7 +185,7 @@ class RosDriver(Driver):
 
     def finish(self) -> None:
         """Record no more; the node goes on holding the arm."""
-        self._node.end(self._controller)
+        self._node.is_recorded = False
 
     def recover(self) -> None:
         """Do nothing: no robot behind ROS says that it has stopped by itself."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from time import monotonic
 
 from blf_dsc_controller.control.arm_controller import ArmController
-from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.control.status_report import StatusReport
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.errors import BlfDscError
@@ -43,14 +42,12 @@ class RosTopics(Beside):
             BlfDscError: it did not start.
         """
         config = controller.config
-        self._estimates = controller.estimate_names
         self._ros = LinkedProcess(_PROCESS, f'/{namespace.strip("/")}', *config.joints)
         super().__init__(self._ros, controller)
         self._report = StatusReport(self.log)
         self._report.trajectories = self._inputs
         self._late = ''
         self._reported = -1.0, -1  # s, and revision of the state
-        self._columns = b''
         self._await_ros()
         if config.robot.urdf:
             description = encode_string(config.robot.text)
@@ -100,11 +97,6 @@ class RosTopics(Beside):
             self._tell_status(guard)
 
     def _tell_status(self, guard: Guard) -> None:
-        columns = guard.controller.state.latch.active.tobytes()
-        if columns != self._columns:
-            self._columns = columns
-            rejected = rejected_columns(guard.controller, self._estimates)
-            self._report.rejected = rejected
         parts = [
             (
                 name,

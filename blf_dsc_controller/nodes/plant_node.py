@@ -31,20 +31,14 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
+from blf_dsc_controller.control.status_report import ERROR, OK, STALE, WARN, Part
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import Change
 from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
-from blf_dsc_controller.nodes.diagnostics import (
-    ERROR,
-    OK,
-    STALE,
-    WARN,
-    DiagnosticsPublisher,
-    Part,
-)
+from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.run import FIRST_STAMP
@@ -80,7 +74,7 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(PLANT, PlantConfig, **options)
-        parameters.on_change(self, PlantConfig, self._reconfigure)
+        parameters.Changes(self, self.config, self._reconfigure)
         self.latency = Latency()
         joints = self.config.joints
         self._steps = steps_of(self.config)

@@ -11,16 +11,15 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from queue import Empty, SimpleQueue
-from time import monotonic
+from concurrent import futures
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from blf_dsc_controller.configuration.nodes import CONTROLLER
+from blf_dsc_controller.control.status_report import Part
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topic_link, topics
 from blf_dsc_controller.messages.link import Link, link_of
@@ -33,7 +32,7 @@ from blf_dsc_controller.messages.topic_link import (
     STOP,
 )
 from blf_dsc_controller.nodes import process
-from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher, Part
+from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import connect
 
@@ -57,11 +56,9 @@ class LoopTopics:
             KINDS[topic]: create_publisher(node, topic)
             for topic in (*OF_LOOP, topics.ROBOT_DESCRIPTION)
         }
-        self._state = create_publisher(node, topics.STATE)
-        self._diagnostics = DiagnosticsPublisher(node, joints)
-        self._revision = -1
-        self._answers: SimpleQueue[tuple[int, str]] = SimpleQueue()
+        self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
         self._stops = 0  # asked for
+        self._answers: dict[int, futures.Future[str]] = {}  # to those
         connect(
             node,
             lambda raw: self._pass_on(topics.JOINT_TRAJECTORY, raw),
@@ -83,7 +80,7 @@ class LoopTopics:
             self._report(topic_link.decode(content))
         elif kind == STOP:
             number, text = topic_link.decode(content)
-            self._answers.put((number, text))
+            self._answers.pop(number).set_result(text)
         elif kind == LOG:
             self._write_log(**topic_link.decode(content))
 
@@ -102,10 +99,7 @@ class LoopTopics:
             Part(name, bytes([level]), message, values)
             for name, level, message, values in status['parts']
         )
-        state: DiagnosticStatus = self._diagnostics.publish(*parts)
-        if status['revision'] != self._revision:
-            self._revision = status['revision']
-            self._state.publish(state)
+        self._diagnostics.publish(*parts, key=status['revision'])
 
     def _pass_on(self, topic: topics.Topic, raw: bytes) -> None:
         self._link.put(KINDS[topic], bytes(raw))
@@ -117,16 +111,13 @@ class LoopTopics:
         Raises BlfDscError if it says nothing; a stop is never taken back.
         """
         self._stops += 1
+        self._answers[self._stops] = answer = futures.Future[str]()
         self._link.put(STOP, topic_link.encode(self._stops))
         self._link.flush()
-        end = monotonic() + _PATIENCE
-        number = 0
-        while number != self._stops:  # an answer to an earlier stop comes too late
-            try:
-                number, text = self._answers.get(timeout=max(0.0, end - monotonic()))
-            except Empty:
-                raise BlfDscError(_SILENT) from None
-        return text
+        try:
+            return answer.result(_PATIENCE)
+        except futures.TimeoutError:  # its own in Python 3.10
+            raise BlfDscError(_SILENT) from None
 
 
 def main() -> int:
