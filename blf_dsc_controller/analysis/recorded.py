@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from blf_dsc_controller.messages.journal import EventType, found_in, stops_in
 from blf_dsc_controller.reference.turns import turns_freely
 from blf_dsc_controller.run import (
     Contact,
+    Floats,
     LearnedArm,
     Oscillation,
     Run,
@@ -141,8 +143,18 @@ def _arrays(
         # positions may wrap, the controller's is whole turns off.
         if known is None or may_wrap:
             known = states.select(np.full(states.size, -1))
-        arrays['reference'] = Values(known, 0, (states.field(0), errors.field(0)))
+        arrays['reference'] = Values(
+            partial(_reference, known.field(0), states.field(0), errors.field(0))
+        )
     return arrays
+
+
+def _reference(known: Values, positions: Values, errors: Values, key: Any) -> Floats:
+    """Return the reference at an index: the one that is known, or else q - xi1."""
+    values = known[key]
+    if np.isnan(values).any():
+        values = np.where(np.isnan(values), positions[key] - errors[key], values)
+    return values
 
 
 def _torques(content: Content, states: JointStates) -> JointStates:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
@@ -123,7 +124,7 @@ class ArmController:
         refuse(config)
         self._recorder: TopicRecorder | None = None
         if record is not None:
-            self._recorder = TopicRecorder(Path(record), in_background=True)
+            self._recorder = TopicRecorder(BagWriter(record, in_background=True))
             self._loop.outputs.add(self._recorder)
         self._is_on_wall = stamps == 'wall'
         self._shift: int | None = None  # ns, of the stamps

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import errors_told_with_line
@@ -326,14 +327,14 @@ def write_bag(
     Its record may come in parts.  The bag has the configuration of the controller and, if
     given, of the plant; `compression` is `none` or `zstd`. Raises BagError if `path` exists.
     """
-    bag = TopicRecorder(path, compression=compression, flush_interval=None)
-    with closing(bag):
+    bag = BagWriter(path, compression=compression, flush_interval=None)
+    with closing(TopicRecorder(bag)) as recorder:
         if plant is not None:
             configured = Change(FIRST_STAMP, flatten(plant), configured=True).encode()
-            bag.write(FIRST_STAMP, topics.CHANGES, configured)
+            recorder.write(FIRST_STAMP, topics.CHANGES, configured)
         parts = [record] if isinstance(record, Record) else record
         for stamp, message in _messages(parts):
-            bag.write(stamp, *message)
+            recorder.write(stamp, *message)
 
 
 def simulate_into_bag(
