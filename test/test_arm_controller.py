@@ -32,7 +32,7 @@ import os, signal, sys, time
 from test_arm_controller import LOOP, blf, plant_of, run
 controller = blf.ArmController(LOOP.controller, record=sys.argv[1])
 run(controller, plant_of(LOOP.plant), LOOP.plant, 700)
-controller._outputs._recorder._bag.flush()  # as after 0.1 s
+controller._recorder._bag.flush()  # as after 0.1 s
 while os.path.getsize(f'{sys.argv[1]}/bag_0.mcap') < 100_000:  # of some 300 kB
     time.sleep(0.01)
 os.kill(os.getpid(), signal.SIGKILL)

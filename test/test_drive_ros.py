@@ -192,10 +192,10 @@ def test_loop_does_not_notice_that_ros_is_lost(
     def between(count, _, beside):
         time.sleep(0.001)
         if count == 100:
-            beside._process.send_signal(number)
+            beside._ros.process.send_signal(number)
             beside._link._most = 10_000  # bytes that wait
             if number == signal.SIGKILL:
-                beside._process.wait()
+                beside._ros.process.wait()
 
     driver, outcome, after = beside(between, tmp_path, duration=0.6)
     assert outcome.end is End.DURATION

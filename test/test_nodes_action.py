@@ -35,7 +35,7 @@ from trajectory_msgs.msg import (
 )
 
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.nodes import action_process
+from blf_dsc_controller.nodes import trajectory_action
 from blf_dsc_controller.supervision.supervisor import Reason
 
 BRISK = {
@@ -452,7 +452,7 @@ def test_process_of_the_action_has_the_enclave_of_its_controller_and_the_policys
 
 def test_controller_goes_on_when_the_process_of_the_action_dies(own_loop, capfd):
     arm, law, client = own_loop
-    process = law.action._process._process
+    process = law.action.process
     client.follow(point(NEAR, 0.5))
     process.kill()
     process.wait()
@@ -468,9 +468,9 @@ def test_process_of_the_action_ends_with_its_node(own_loop, capfd, monkeypatch):
 
     A terminal sends Ctrl-C to all processes, systemd SIGTERM.
     """
-    monkeypatch.setattr(action_process, '_PATIENCE', PATIENCE)  # on a slow computer
+    monkeypatch.setattr(trajectory_action, '_PATIENCE', PATIENCE)  # on a slow computer
     _, law, client = own_loop
-    process = law.action._process._process
+    process = law.action.process
     os.kill(process.pid, signal.SIGINT)
     os.kill(process.pid, signal.SIGTERM)
     client.ros.spin(0.3)

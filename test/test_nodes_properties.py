@@ -119,7 +119,10 @@ def apply_event(node, kind, content):
         request = ChangeState.Request(transition=Transition(id=content))
         node._service_change_state.callback(request, ChangeState.Response())
     elif kind == 'reset':
-        node._on_reset(Trigger.Request(), Trigger.Response())
+        (service,) = (
+            each for each in node.services if each.srv_name.endswith('/reset')
+        )
+        service.callback(Trigger.Request(), Trigger.Response())
     elif kind == 'tick':
         node._on_poll()
         node._report()
@@ -137,7 +140,7 @@ def apply_event(node, kind, content):
 def test_controller_survives_arbitrary_input(ros, sequence):
     node = ControllerNode(context=ros.context, cli_args=[], enable_rosout=False)
     commands = []
-    node._command = lambda torque: torque is None or commands.append(torque.copy())
+    node.command = lambda torque: torque is None or commands.append(torque.copy())
     node.starting._was_observed = True
     stamp = 10**9
     try:
@@ -178,7 +181,7 @@ def test_plant_survives_arbitrary_input(ros, sequence):
         enable_rosout=False,
         parameter_overrides=overrides,
     )
-    node._is_observed = lambda: True
+    node.is_observed = lambda: True
     node._peers = iter(())  # all there
     try:
         for kind, content in sequence:

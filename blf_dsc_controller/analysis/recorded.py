@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,20 +25,15 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
-from blf_dsc_controller.messages.journal import (
-    Event,
-    EventType,
-    contact_in,
-    oscillation_in,
-)
+from blf_dsc_controller.messages.journal import EventType, found_in, stops_in
 from blf_dsc_controller.reference.turns import turns_freely
 from blf_dsc_controller.run import (
     Contact,
     Floats,
     LearnedArm,
+    Oscillation,
     Run,
     Series,
-    Stop,
     ToolErrors,
 )
 
@@ -81,6 +76,8 @@ def recorded_run(
     stamp = run.states.stamp
     begin, end = run.received
     events = [event for at, event in content.events if begin <= at < end]
+    given = content.configurations.get(CONTROLLER, {})
+    contacts = found_in(events, EventType.CONTACT, Contact)
     config, arm, unusable = _arm(content)
     may_wrap = config is not None and bool(turns_freely(config).any())
     arrays: dict[str, Any] = {
@@ -105,19 +102,15 @@ def recorded_run(
         truth=series(topics.TRUTH),
         timing=series(topics.TIMING),
         external=series(topics.EXTERNAL_TORQUE, 'effort'),
-        stops=tuple(_stops(events, int(stamp[0]))),
-        contacts=_contacts(content, events),
-        oscillations=tuple(
-            oscillation_in(event)
-            for event in events
-            if event.type is EventType.OSCILLATION
-        ),
+        stops=tuple(stops_in(events, int(stamp[0]))),
+        contacts=contacts if given.get('contact.enabled') else None,
+        oscillations=found_in(events, EventType.OSCILLATION, Oscillation),
         arm=arm,
         tool=_tool(config) if config else None,
         learns=_learns([event.content.get('parameters', {}) for event in events]),
         notes=(*run.notes, *_unknown_parameters(content), *unusable),
         sliding=config.robot.sliding(config.joints) if config else (),
-        parameters=content.configurations.get(CONTROLLER, {}),
+        parameters=given,
     )
 
 
@@ -216,30 +209,6 @@ def _tool(config: ControllerConfig) -> ToolErrors | None:
 
     tool = tool_of(config)
     return tool.errors if tool else None
-
-
-def _stops(events: Iterable[Event], first: int) -> Iterator[Stop]:
-    """Yield the stops in the journal; an early one gets the first stamp [ns]."""
-    ordered = list(events)
-    for k, event in enumerate(ordered):
-        if event.type is EventType.STOP:
-            starts = [
-                later.stamp for later in ordered[k:] if later.type is EventType.START
-            ]
-            what = event.content['reason'], event.content['text']
-            yield Stop(
-                max(event.stamp, first), *what, until=starts[0] if starts else None
-            )
-
-
-def _contacts(content: Content, events: Iterable[Event]) -> tuple[Contact, ...] | None:
-    """Return the contacts in the journal; None if nothing looked for any."""
-    given = content.configurations.get(CONTROLLER, {})
-    if not given.get('contact.enabled'):
-        return None
-    return tuple(
-        contact_in(event) for event in events if event.type is EventType.CONTACT
-    )
 
 
 def _learns(settings: Sequence[Mapping[str, Any]]) -> bool:

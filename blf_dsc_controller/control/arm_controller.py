@@ -14,13 +14,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
 from blf_dsc_controller.configuration.rules import When
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.control.loop_outputs import LoopOutputs
-from blf_dsc_controller.control.outputs import Output, Outputs
+from blf_dsc_controller.control.outputs import Output
 from blf_dsc_controller.errors import (
     ArgumentTypeError,
     BlfDscError,
@@ -135,7 +136,10 @@ class ArmController:
         self.joints = config.joints
         self._loop = GuardedLoop(config)
         refuse(config)
-        self._outputs = LoopOutputs(self._loop, record)
+        self._recorder: TopicRecorder | None = None
+        if record is not None:
+            self._recorder = TopicRecorder(BagWriter(record, in_background=True))
+            self._loop.outputs.add(self._recorder)
         self._is_on_wall = stamps == 'wall'
         self._shift: int | None = None  # ns, of the stamps
         self._logged_turns: set[str] = set()
@@ -203,7 +207,7 @@ class ArmController:
                 send(answer)
         finally:
             self._loop.guard.perceive()
-            self._outputs.write_state(nanoseconds, values, of_motors, torque)
+            self._loop.write_state(nanoseconds, values, of_motors, torque)
             self._log_turns('the reference', self._loop.guard.reference.turned)
         return answer
 
@@ -396,7 +400,7 @@ class ArmController:
         has been commanded yet, so command nothing.
         """
         torque = self._loop.guard.fail(text)
-        self._outputs.write_end(torque)
+        self._loop.write_end(torque)
         return None if torque is None else np.array(torque)
 
     def withdraw(self, text: str) -> None:
@@ -488,8 +492,10 @@ class ArmController:
         """
         self._is_closed = True
         torque = self._loop.guard.release()
-        self._outputs.write_end(torque)
-        self._outputs.close()
+        self._loop.write_end(torque)
+        if self._recorder is not None:
+            self._loop.outputs.end(self._recorder, self._recorder.close)
+            self._recorder = None
         return None if torque is None else np.array(torque)
 
     def _check_open(self) -> None:
@@ -503,12 +509,12 @@ class ArmController:
 
         One that raises an error is dropped, and the loop goes on: `output_problem`.
         """
-        self._outputs.add(output)
+        self._loop.outputs.add(output)
 
     @property
     def output_problem(self) -> str:
         """Why the recording or another output ended before the loop; or empty."""
-        return self._outputs.problem
+        return self._loop.outputs.problem
 
     @property
     def guard(self) -> Guard:
@@ -519,16 +525,6 @@ class ArmController:
     def loop(self) -> GuardedLoop:
         """The law with its telemetry, for a node that answers joint states by it."""
         return self._loop
-
-    @property
-    def outputs(self) -> Outputs:
-        """Where the messages of its loop go, such as a bag."""
-        return self._outputs
-
-    @property
-    def estimate_names(self) -> tuple[str, ...]:
-        """Names of the learned parameters."""
-        return tuple(self._loop.estimates)
 
 
 def _is_time(stamp: float) -> bool:

@@ -10,8 +10,12 @@ from __future__ import annotations
 
 import json
 from base64 import b64decode, b64encode
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple, TypeAlias
+
+KIND = 0
+"""Of all of them over a `Link`."""
 
 SUCCESSFUL = 'SUCCESSFUL'
 INVALID = 'INVALID_GOAL'
@@ -19,12 +23,8 @@ PATH_VIOLATED = 'PATH_TOLERANCE_VIOLATED'
 GOAL_VIOLATED = 'GOAL_TOLERANCE_VIOLATED'
 
 
-class JointTolerance(NamedTuple):
-    """A tolerance as it was sent: 0 is the default, -1 none."""
-
-    joint: str
-    position: float  # rad
-    velocity: float  # rad/s
+JointTolerance: TypeAlias = tuple[str, float, float]
+"""Of a joint: position [rad] and velocity [rad/s], as sent: 0 is the default, -1 none."""
 
 
 # From the process of the action.
@@ -35,8 +35,8 @@ class Goal(NamedTuple):
 
     number: int
     trajectory: bytes  # serialised trajectory_msgs/JointTrajectory
-    path: tuple[JointTolerance, ...]
-    goal: tuple[JointTolerance, ...]
+    path: Sequence[JointTolerance]
+    goal: Sequence[JointTolerance]
     time: float  # s, as sent: 0 is the default, negative without end
 
 
@@ -79,7 +79,7 @@ class End(NamedTuple):
     """The end of a goal that was accepted."""
 
     number: int
-    outcome: Outcome
+    outcome: Outcome | str  # a text once it was sent
     code: str  # the name of an error code of the action's result
     text: str
 
@@ -101,13 +101,7 @@ def decode(raw: bytes) -> Message:
     kind, *fields = json.loads(raw)
     message = _KINDS[kind](*fields)
     if isinstance(message, Goal):
-        return message._replace(
-            trajectory=b64decode(message.trajectory),
-            path=tuple(JointTolerance(*each) for each in message.path),
-            goal=tuple(JointTolerance(*each) for each in message.goal),
-        )
-    if isinstance(message, End):
-        return message._replace(outcome=Outcome(message.outcome))
+        return message._replace(trajectory=b64decode(message.trajectory))
     return message
 
 

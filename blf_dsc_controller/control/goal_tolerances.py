@@ -59,14 +59,14 @@ def tolerances(joints: Sequence[str], given: Sequence[JointTolerance]) -> Tolera
     """
     position = np.full(len(joints), nan)
     velocity = np.full(len(joints), inf)
-    for each in given:
-        if each.joint not in joints:
+    for joint, of_position, of_velocity in given:
+        if joint not in joints:
             raise BlfDscError(
-                f'the tolerance of {each.joint!r}: the joints are {", ".join(joints)}'
+                f'the tolerance of {joint!r}: the joints are {", ".join(joints)}'
             )
-        i = joints.index(each.joint)
-        position[i] = _value(each.joint, each.position, nan)
-        velocity[i] = _value(each.joint, each.velocity, inf)
+        i = joints.index(joint)
+        position[i] = _value(joint, of_position, nan)
+        velocity[i] = _value(joint, of_velocity, inf)
     return Tolerances(position, velocity)
 
 

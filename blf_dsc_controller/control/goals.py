@@ -24,6 +24,7 @@ from blf_dsc_controller.control.goal_messages import (
     End,
     Feedback,
     Goal,
+    Message,
     Outcome,
 )
 from blf_dsc_controller.control.goal_tolerances import Tolerances, tolerances
@@ -74,10 +75,12 @@ class Goals:
         self._followed: _Followed | None = None
         self._next_feedback = 0.0
 
-    def take(self, guard: Guard | None, message: Goal | Cancel) -> None:
+    def take(self, guard: Guard | None, message: Message) -> None:
         """Begin or cancel the goal of a client."""
         if isinstance(message, Cancel):
             self._cancel(guard, message.number)
+        elif not isinstance(message, Goal):
+            return
         elif guard is None:
             reason = 'the controller is not configured'
             self._log.warning(f'goal rejected: {reason}')

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """The guarded law for each joint state: a torque, and the messages about it.
 
-The node publishes these messages, `ArmController` records them.
+The node publishes these messages, `ArmController` gives them to its outputs.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
+from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
 from blf_dsc_controller.factory.estimate import estimate_names
+from blf_dsc_controller.messages import topics
+from blf_dsc_controller.messages.codecs import JointStateEncoder
 from blf_dsc_controller.messages.topics import Message
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -31,6 +35,7 @@ class GuardedLoop:
         guard: the law between its checks.
         telemetry: encoders of the messages.
         estimates: names of the entries of theta^.
+        outputs: where the messages of a loop of your own go, as those of a run over ROS.
     """
 
     def __init__(
@@ -43,6 +48,9 @@ class GuardedLoop:
         self.guard = Guard(config, steady, wall)
         self.estimates = estimate_names(config)
         self.telemetry = ControllerTelemetry(config, self.estimates)
+        self.outputs = Outputs()
+        self._states = JointStateEncoder(config.joints)
+        self._motors = JointStateEncoder(config.joints, ('position', 'velocity'))
 
     def retune(self, config: ControllerConfig) -> Message | None:
         """Apply a configuration; return the bound by it, after the first sample of the law."""
@@ -78,3 +86,42 @@ class GuardedLoop:
             )
         elif torque is not None and errors_wanted:
             yield self.telemetry.answer(guard.journal.stamp, torque)
+
+    def write_state(
+        self,
+        stamp: int,
+        measurement: Vector,
+        motors: Vector | None,
+        torque: Vector | None,
+    ) -> None:
+        """Write the messages about a state [q, dq, effort] (3 n,), which got this torque (n,).
+
+        `motors` are positions and velocities (2, n).
+        """
+        if not self.outputs:
+            return
+        write = partial(self.outputs.write, stamp)
+        write(
+            topics.JOINT_STATES,
+            self._states.encode(stamp, *measurement.reshape(3, -1)),
+        )
+        if torque is not None:
+            write(*self.telemetry.command(torque))
+        for message in self.messages(torque):
+            write(*message)
+        self._write_events(stamp)
+        if motors is not None:
+            write(topics.MOTOR_STATES, self._motors.encode(stamp, *motors))
+
+    def write_end(self, torque: Vector | None) -> None:
+        """Write a torque (n,) that no state asked for, and the events."""
+        if not self.outputs:
+            return
+        stamp = max(self.guard.journal.stamp, 0)
+        if torque is not None:
+            self.outputs.write(stamp, *self.telemetry.command(torque))
+        self._write_events(stamp)
+
+    def _write_events(self, stamp: int) -> None:
+        for message in self.guard.journal.take():
+            self.outputs.write(stamp, *message)

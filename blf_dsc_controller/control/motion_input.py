@@ -59,10 +59,12 @@ class _Request(NamedTuple):
     """A motion that somebody asked for."""
 
     make: Callable[[], Command]  # may take a while: called where it is planned
-    report: Report
     lead: float  # s
     source: str  # who asked for it
-    check: Callable[[Plan], None] | None = None  # raises TrajectoryError: not like this
+    report: Report = lambda *_: None  # to a client
+    # raises TrajectoryError: not like this
+    check: Callable[[Plan], None] = lambda _: None
+    is_streamed: bool = False
 
 
 class _Job(NamedTuple):
@@ -159,17 +161,12 @@ class MotionInput:
         report: Report,
     ) -> None:
         """Follow a trajectory that came by another way, serialised or still to be made."""
-
-        def report_to_both(plan: Plan | None, reason: str) -> None:
-            self._report(plan, reason)
-            report(plan, reason)
-
         start = guard.reference.start_stamp
 
         def make() -> Trajectory:
             return _trajectory(given, start) if isinstance(given, bytes) else given()
 
-        self._request(guard, _Request(make, report_to_both, _LEAD, source, check))
+        self._request(guard, _Request(make, _LEAD, source, report, check))
 
     # Requests.
 
@@ -187,12 +184,8 @@ class MotionInput:
             return
         start = guard.reference.start_stamp
         if len(raw) > _SMALL:
-            self._request(
-                guard,
-                _Request(
-                    lambda: _trajectory(raw, start), self._report, _LEAD, _ON_TRAJECTORY
-                ),
-            )
+            large = _Request(lambda: _trajectory(raw, start), _LEAD, _ON_TRAJECTORY)
+            self._request(guard, large)
             return
         try:
             self._on_few_points(guard, _trajectory(raw, start))
@@ -206,7 +199,7 @@ class MotionInput:
             return
         command = self._target_of(guard, trajectory) or trajectory
         lead = self._target_lead if isinstance(command, Target) else _LEAD
-        request = _Request(lambda: command, self._report, lead, _ON_TRAJECTORY)
+        request = _Request(lambda: command, lead, _ON_TRAJECTORY)
         self._request(guard, request)
 
     def _target_of(self, guard: Guard, trajectory: Trajectory) -> Target | None:
@@ -255,8 +248,7 @@ class MotionInput:
             timeout=_STREAM_TIMEOUT,
         )
         lead = self._target_lead
-        request = _Request(lambda: target, self._report_target, lead, source)
-        self._request(guard, request)
+        self._request(guard, _Request(lambda: target, lead, source, is_streamed=True))
 
     def _short_way(
         self, guard: Guard, stream: TargetStream, positions: np.ndarray
@@ -338,7 +330,7 @@ class MotionInput:
             try:
                 self._adopt(guard, guard.motions.plan(request.make()), request)
             except Exception as error:  # noqa: BLE001 - the current reference continues
-                request.report(None, _reason(error))
+                self._report(request, None, _reason(error))
         elif self.job is None:
             self._submit(guard, request)
         else:
@@ -359,7 +351,7 @@ class MotionInput:
             self._adopt(guard, job.plan.result(), request)
         except LatePlanError as error:
             if request.lead > _LONGEST_LEAD:
-                request.report(None, _reason(error))
+                self._report(request, None, _reason(error))
                 return
             lead = 2.0 * request.lead
             if request.lead == self._target_lead < _LEAD:
@@ -367,35 +359,38 @@ class MotionInput:
             if self._next is None:
                 self._submit(guard, request._replace(lead=lead))
             else:
-                request.report(None, _REPLACED)
+                self._report(request, None, _REPLACED)
         except Exception as error:  # noqa: BLE001 - the current reference continues
-            request.report(None, _reason(error))
+            self._report(request, None, _reason(error))
 
     def _adopt(self, guard: Guard, plan: Plan, request: _Request) -> None:
-        if request.check is not None:
-            request.check(plan)
+        request.check(plan)
         guard.motions.adopt(plan)
         self.source = request.source
-        request.report(plan, '')
+        self._report(request, plan, '')
 
     def _drop(self, reason: str) -> None:
         """Drop what is being planned."""
         if self.job is not None:
-            self.job.request.report(None, reason)
+            self._report(self.job.request, None, reason)
             self.job = None
         self._drop_next(reason)
 
     def _drop_next(self, reason: str) -> None:
         if self._next is not None:
-            self._next.report(None, reason)
+            self._report(self._next, None, reason)
             self._next = None
 
     # Reports.
 
-    def _report(self, plan: Plan | None, reason: str) -> None:
-        """Count what the topics' senders sent."""
+    def _report(self, request: _Request, plan: Plan | None, reason: str) -> None:
+        """Count and log what was sent, and report it to its client.
+
+        In a stream the latest target wins, which is no rejection.
+        """
         if plan is None:
-            self._reject(reason)
+            if not (request.is_streamed and reason == _REPLACED):
+                self._reject(reason)
         elif isinstance(plan.command, Target):
             self.targets += 1
         else:
@@ -405,11 +400,7 @@ class MotionInput:
             note = f' {plan.motion.note}' if plan.motion.note else ''
             self.log.info(f'following a trajectory of {points}{note}')
             self._log_turns(plan.motion.turned)
-
-    def _report_target(self, plan: Plan | None, reason: str) -> None:
-        """Count a target; in a stream the latest wins, which is no rejection."""
-        if reason != _REPLACED:
-            self._report(plan, reason)
+        request.report(plan, reason)
 
     def _reject(self, reason: str) -> None:
         self.rejected += 1

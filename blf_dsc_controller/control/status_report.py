@@ -10,6 +10,7 @@ import numpy as np
 
 from blf_dsc_controller.control.log import Log
 from blf_dsc_controller.control.motion_input import MotionInput
+from blf_dsc_controller.factory.estimate import estimate_names
 from blf_dsc_controller.law.contact import is_touched
 from blf_dsc_controller.law.perception import DISTANCE
 from blf_dsc_controller.messages.named_values import load_text
@@ -31,6 +32,7 @@ _PHASES = {
     Phase.TRACKING: (OK, 'tracking'),
     Phase.SAFE_STOP: (ERROR, 'stopped'),
 }
+_NOTABLE = 0.1  # relative to the largest component
 
 
 class Part(NamedTuple):
@@ -46,13 +48,13 @@ class StatusReport:
     """The parts of a controller's status.
 
     Attributes:
-        rejected: disturbance columns that are not estimated, and why.
         trajectories: counts accepted and rejected trajectories; None: nobody sends any.
     """
 
     def __init__(self, log: Log) -> None:
         """Warn, once, of a torque that chatters."""
-        self.rejected: Mapping[str, str] = {}
+        self._rejected: Mapping[str, str] = {}
+        self._columns = b''  # by which they are
         self.trajectories: MotionInput | None = None
         self._log = log
         self._has_warned = False
@@ -76,6 +78,15 @@ class StatusReport:
             if guard.config.contact.enabled:
                 parts.append(_contact(guard))
         return parts
+
+    def rejected(self, guard: Guard) -> Mapping[str, str]:
+        """Return disturbance columns that are not estimated, and why; another object if changed."""
+        latch = guard.controller.state.latch
+        columns = latch.active.tobytes() + latch.columns_checked.tobytes()
+        if columns != self._columns:
+            self._columns = columns
+            self._rejected = _rejected_columns(guard)
+        return self._rejected
 
     def _state(self, lifecycle: str, guard: Guard | None) -> Part:
         supervisor = guard.supervisor if guard else Supervisor()
@@ -137,11 +148,10 @@ class StatusReport:
             'learning': learning,
         }
         values['model changes'] = f'{state.change.changes[0]:.0f}'
-        values |= {
-            f'{REJECTED}{column}': reason for column, reason in self.rejected.items()
-        }
-        if self.rejected:
-            message = f'not estimated: {", ".join(self.rejected)}'
+        rejected = self.rejected(guard)
+        values |= {f'{REJECTED}{column}': why for column, why in rejected.items()}
+        if rejected:
+            message = f'not estimated: {", ".join(rejected)}'
             return Part('learning', WARN, message, values)
         return Part('learning', OK, learning, values)
 
@@ -211,3 +221,32 @@ def _by_joint(guard: Guard, counts: np.ndarray) -> str:
     return (
         ', '.join(f'{joint} {count:.0f}' for joint, count in pairs if count) or 'none'
     )
+
+
+def _rejected_columns(guard: Guard) -> dict[str, str]:
+    """Return why a law that learns does not estimate columns, by their names.
+
+    Each resembles a combination of others in the current window; these are named,
+    largest first.
+    """
+    names = estimate_names(guard.config)
+    state, reasons = guard.controller.state, {}
+    upper = np.triu(state.window.running[:-1, :-1])
+    Phi = upper + np.triu(upper, 1).T
+    kept = np.flatnonzero(state.latch.active > 0.0)
+    for column in np.flatnonzero(state.latch.active == 0.0).tolist():
+        products = Phi[kept, column]
+        parts = np.linalg.lstsq(Phi[np.ix_(kept, kept)], products, rcond=None)[0]
+        strength = np.abs(parts) * np.sqrt(np.diag(Phi)[kept])
+        order = kept[np.argsort(-strength)].tolist()
+        alike = [
+            names[k] for k in order[: np.sum(strength >= _NOTABLE * strength.max())]
+        ]
+        explained = float(np.clip(parts @ products / Phi[column, column], 0.0, 1.0))
+        reasons[names[column]] = (
+            f'{names[column]} is not estimated: this window cannot distinguish it from '
+            f'{" + ".join(alike)} ({100 * explained:.4g} % of it is explained by them). '
+            'A reference with more tones can separate them; learning.excitation_threshold sets '
+            'how clearly'
+        )
+    return reasons

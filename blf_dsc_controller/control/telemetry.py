@@ -47,9 +47,12 @@ class ControllerTelemetry:
         self._error = JointStateEncoder(joints)
         self._bound = JointStateEncoder(joints, ('position', 'effort'))
         self._monitor = JointStateEncoder(names, ('position',))
-        self._external = None
+        self._external = self._wrench = None
         if config.contact.enabled:
-            self._external = ExternalTelemetry(config)
+            self._external = JointStateEncoder(external_names(joints), ('effort',))
+            if config.model == 'urdf' and config.robot.tip:
+                self._wrench = WrenchEncoder(config.robot.tip)
+                self._tip = TipWrench(config.robot.chain(joints))
         self._parts = attrgetter(*parts)
         self._decimation = config.telemetry.decimation
         self.restart()
@@ -119,29 +122,15 @@ class ControllerTelemetry:
             )
             yield topics.MONITOR, self._monitor.encode(stamp, values)
             self._slowest = 0.0
-            if self._external is not None:
-                yield from self._external.sample(stamp, sample)
+            yield from self._contact(stamp, sample)
 
-
-class ExternalTelemetry:
-    """Messages of the torque from outside; of the wrench where `robot.tip` says at which link."""
-
-    def __init__(self, config: ControllerConfig) -> None:
-        joints = config.joints
-        self._torque = JointStateEncoder(external_names(joints), ('effort',))
-        self._wrench = None
-        if config.model == 'urdf' and config.robot.tip:
-            self._wrench = WrenchEncoder(config.robot.tip)
-            self._tip = TipWrench(config.robot.chain(joints))
-
-    def sample(self, stamp: int, sample: Sample) -> Iterator[Message]:
-        """Yield the messages of a telemetry sample with its stamp [ns]."""
-        torque = sample.external
-        interval = sample.external_interval
-        yield (
-            topics.EXTERNAL_TORQUE,
-            self._torque.encode(stamp, effort=np.concatenate((torque, interval))),
-        )
+    def _contact(self, stamp: int, sample: Sample) -> Iterator[Message]:
+        """Yield the torque from outside, and the wrench where `robot.tip` says at which link."""
+        if self._external is None:
+            return
+        torque, interval = sample.external, sample.external_interval
+        effort = np.concatenate((torque, interval))
+        yield topics.EXTERNAL_TORQUE, self._external.encode(stamp, effort=effort)
         if self._wrench is not None:
             wrench = self._tip.of(sample.qr + sample.xi1, torque, interval)
             yield topics.EXTERNAL_WRENCH, self._wrench.encode(stamp, wrench)

@@ -7,10 +7,10 @@ brakes the arm.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -40,14 +40,13 @@ from blf_dsc_controller.errors import (
     NotInTimeError,
 )
 from blf_dsc_controller.extras import import_extra
-from blf_dsc_controller.messages import script_link, topic_link
+from blf_dsc_controller.messages import script_link
 from blf_dsc_controller.messages.script_link import ArmState
 from blf_dsc_controller.messages.tip_load import TAKEN_UP
 
 if TYPE_CHECKING:
     from blf_dsc_controller.drive.pose import Pose, Poses
 
-_KEPT = 100  # results of motions
 _BRAKED = 5.0  # s: longer than braking takes
 
 
@@ -96,9 +95,8 @@ class Drive:
         self._robot = checked_robot(robot)
         self._record = checked_record(record)
         self._starts = 0
-        self._number = 0  # of the last request
-        self._last = 0  # of the last motion
-        self._hint = 0, ''  # of which motion, and what its error ends with
+        self._last: Future[str] | None = None  # result of the last motion
+        self._hint = ''  # what its error ends with
         self._loop = self._start()
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -226,8 +224,7 @@ class Drive:
             MissingExtraError: pink is not installed.
         """
         begin = np.array(self.state.reference)
-        line = self._poses.line(begin, position, rotation, checked_speed(speed))
-        points = list(zip(line.times, line.positions, strict=True))
+        points = self._poses.line(begin, position, rotation, checked_speed(speed))
         self.follow(points, wait=wait, timeout=timeout)
 
     def stream(self, positions: ArrayLike) -> None:
@@ -252,7 +249,7 @@ class Drive:
         Raises:
             MotionFailedError, NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        if self._last:
+        if self._last is not None:
             self._await_motion(self._last, timeout)
 
     def stop(self, timeout: float | None = None) -> None:
@@ -261,7 +258,7 @@ class Drive:
         Raises:
             NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        self._ask(script_link.BRAKE, lambda number: number, timeout)
+        self._ask(script_link.BRAKE, None, timeout)
 
     def load(
         self,
@@ -283,10 +280,7 @@ class Drive:
             MotionFailedError: these drives cannot be told, or refuse.
             NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        wanted = checked_load(mass, centre)
-        self._ask(
-            script_link.LOAD, lambda number: {'number': number, **wanted}, timeout
-        )
+        self._ask(script_link.LOAD, checked_load(mass, centre), timeout)
 
     def expect_load(
         self,
@@ -319,9 +313,7 @@ class Drive:
             'interval': checked_interval(interval),
             'remember': bool(remember),
         }
-        self._ask(
-            script_link.EXPECT, lambda number: {'number': number, **wanted}, timeout
-        )
+        self._ask(script_link.EXPECT, wanted, timeout)
 
     def tare(self, timeout: float | None = None) -> None:
         """Take the external torque for zero where the arm rests now, as before an insertion.
@@ -333,7 +325,7 @@ class Drive:
                 `contact.enabled` is false.
             NotInTimeError, LoopEndedError: as for `move_to`.
         """
-        self._ask(script_link.TARE, lambda number: number, timeout)
+        self._ask(script_link.TARE, None, timeout)
 
     # State.
 
@@ -378,7 +370,7 @@ class Drive:
             LoopEndedError: the loop has ended.
         """
         self._loop.check()
-        return self._last != 0 and not self._loop.has_result(self._last)
+        return self._last is not None and not self._last.done()
 
     @property
     def ended(self) -> str:
@@ -395,7 +387,7 @@ class Drive:
         """
         if not self.ended:
             return
-        self._last = 0
+        self._last = None
         if self._loop.can_recover:
             self._loop.recover()
         else:
@@ -434,23 +426,14 @@ class Drive:
     ) -> None:
         """Begin a motion; `hint` is what its error ends with."""
         checked_timeout(timeout)
-        self._loop.check()
-        self._number += 1
-        self._last = number = self._number
-        self._hint = number, hint
-        # another thread may still ask for that of the last motion
-        self._loop.forget_results(before=number - _KEPT)
-        if kind == script_link.FOLLOW:
-            content = script_link.HEAD.pack(number) + topic_link.encode(wanted)
-        else:
-            content = topic_link.encode({**wanted, 'number': number})
-        self._loop.put(kind, content)
+        self._last = self._loop.request(kind, wanted)
+        self._hint = hint
         if wait:
-            self._await_motion(number, timeout)
+            self._await_motion(self._last, timeout)
 
-    def _await_motion(self, number: int, timeout: float | None) -> None:
+    def _await_motion(self, result: Future[str], timeout: float | None) -> None:
         try:
-            self._await_result(number, timeout)
+            self._await_result(result, timeout, self._hint)
         except NotInTimeError as error:
             try:
                 self.stop(_BRAKED)
@@ -460,24 +443,19 @@ class Drive:
             raise NotInTimeError(f'{error}: the arm has braked') from None
         except KeyboardInterrupt:
             # where no block ends with it, as in a notebook, the arm would go on
-            with contextlib.suppress(LoopEndedError):
-                self._loop.put(script_link.BRAKE, topic_link.encode(number))
+            self._loop.brake()
             raise
 
-    def _ask(
-        self, kind: int, wanted: Callable[[int], Any], timeout: float | None
-    ) -> None:
+    def _ask(self, kind: int, wanted: Any, timeout: float | None) -> None:
         checked_timeout(timeout)
-        self._number += 1
-        number = self._number
-        self._loop.put(kind, topic_link.encode(wanted(number)))
-        self._await_result(number, timeout)
+        self._await_result(self._loop.request(kind, wanted), timeout)
 
-    def _await_result(self, number: int, timeout: float | None) -> None:
-        problem = self._loop.await_result(number, timeout)
-        if problem is not None:
-            of, hint = self._hint
-            raise MotionFailedError(problem + hint if number == of else problem)
+    def _await_result(
+        self, result: Future[str], timeout: float | None, hint: str = ''
+    ) -> None:
+        problem = self._loop.await_result(result, timeout)
+        if problem:
+            raise MotionFailedError(problem + hint)
 
 
 def _listed(values: Any) -> list[float]:

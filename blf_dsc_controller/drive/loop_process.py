@@ -10,16 +10,14 @@ import contextlib
 import logging
 import os
 import signal
-import socket
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from typing import Any
 
 from blf_dsc_controller import child
-from blf_dsc_controller.control import goal_messages
-from blf_dsc_controller.control.goal_messages import Answer, Outcome
 from blf_dsc_controller.drive.arguments import checked_timeout
 from blf_dsc_controller.errors import (
     DriveError,
@@ -27,13 +25,12 @@ from blf_dsc_controller.errors import (
     NotInTimeError,
 )
 from blf_dsc_controller.messages import script_link, topic_link
-from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.link import LinkedProcess
 from blf_dsc_controller.messages.script_link import ArmState
 
 _MODULE = 'blf_dsc_controller.drive.script_process'
 _POLL = 0.1  # s
 _SILENCE = 60.0  # s without a word of a loop that runs
-_NOBODY = 0  # number of a request whose end nobody waits for
 _END = 5.0  # s, for a process that was told to end at once
 _LOG = logging.getLogger('blf_dsc_controller')
 
@@ -61,17 +58,15 @@ class LoopProcess:
         self._owner = os.getpid()
         self._news = threading.Condition()
         self._closed = False
+        self._count = 0  # of requests
         self._forget()
-        ours, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(
-                [*child.running_module(_MODULE), f'{theirs.fileno()}'],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                env=child.ONE_THREAD | os.environ | child.places(),
-                start_new_session=True,  # Ctrl-C is for the script, which brakes
-            )
-        self._link = Link(ours)
+        self._link = LinkedProcess(
+            _MODULE,
+            variables=child.ONE_THREAD,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the script, which brakes
+        )
+        self._process = self._link.process
         self._send(script_link.START, topic_link.encode(wanted))
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
@@ -116,27 +111,32 @@ class LoopProcess:
     def brake(self) -> None:
         """Let the arm brake within the limits, if the loop runs, and return at once."""
         with contextlib.suppress(DriveError):
-            self.put(script_link.BRAKE, topic_link.encode(_NOBODY))
+            self.request(script_link.BRAKE, None)
 
-    def has_result(self, number: int) -> bool:
-        """Return whether it has told what became of a request."""
-        return number in self._results
+    def request(self, kind: int, wanted: Any) -> Future[str]:
+        """Send a request; its result says why it failed, or is empty once it is done.
 
-    def await_result(self, number: int, timeout: float | None) -> str | None:
-        """Wait for the end of a request; return why it failed, or None if it is done.
+        Raises:
+            LoopEndedError: it has ended.
+        """
+        self.check()
+        result: Future[str] = Future()
+        with self._news:
+            self._count += 1
+            number = self._count
+            self._results[number] = result
+        self._send(kind, script_link.request(number, wanted))
+        return result
+
+    def await_result(self, result: Future[str], timeout: float | None) -> str:
+        """Wait for the end of a request, and return its result.
 
         Raises:
             NotInTimeError: after the timeout [s].
             LoopEndedError: it ends before.
         """
-        self._until(lambda: number in self._results, timeout)
-        return self._results[number]
-
-    def forget_results(self, before: int) -> None:
-        """Forget what became of requests with smaller numbers."""
-        with self._news:
-            for number in [each for each in self._results if each < before]:
-                del self._results[number]
+        self._until(result.done, timeout)
+        return result.result()
 
     def recover(self) -> None:
         """Begin another loop in the same process, and wait until the arm is held."""
@@ -159,11 +159,7 @@ class LoopProcess:
 
     def end(self) -> None:
         """Wait for a process that is about to end, or kill it."""
-        try:
-            self._process.wait(_END)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._link.await_end(_END)
         self._listener.join()
         self._link.close()
 
@@ -199,7 +195,7 @@ class LoopProcess:
         self.ended = ''
         self._state: ArmState | None = None
         self._waits = self._runs = False
-        self._results: dict[int, str | None] = {}  # of requests: why they failed
+        self._results: dict[int, Future[str]] = {}  # of requests that are not over
         self._heard = time.monotonic()
 
     def _send(self, kind: int, content: bytes) -> None:
@@ -236,12 +232,10 @@ class LoopProcess:
     # What the process tells, in a thread.
 
     def _listen(self) -> None:
-        while not self._link.broken:
-            self._link.wait(_POLL)
-            for kind, content in self._link.messages():
-                with self._news:
-                    self._take(kind, content)
-                    self._news.notify_all()
+        for kind, content in self._link.all_messages():
+            with self._news:
+                self._take(kind, content)
+                self._news.notify_all()
         code = self._process.wait()
         with self._news:
             if not self.ended:
@@ -254,15 +248,13 @@ class LoopProcess:
         if kind == script_link.SAMPLE:
             self._state = script_link.decode_sample(content, len(self.joints))
             return
-        if kind == script_link.GOAL:
-            self._take_goal(goal_messages.decode(content))
-            return
         told = topic_link.decode(content)
         if kind == script_link.RUNNING:
             self.joints = tuple(told)
             self._runs = True
         elif kind == script_link.DONE:
-            self._results[told['number']] = told['problem'] or None
+            if result := self._results.pop(told['number'], None):
+                result.set_result(told['problem'])
         elif kind == script_link.ENDED:
             reason = f': {told["text"]}' if told['text'] else ''
             self._waits = told['waits']
@@ -272,13 +264,6 @@ class LoopProcess:
             self.ended = told
         elif kind == topic_link.LOG:
             _LOG.log(logging.getLevelName(told['level'].upper()), told['text'])
-
-    def _take_goal(self, told: goal_messages.Message) -> None:
-        if isinstance(told, Answer) and not told.accepted:
-            self._results[told.number] = told.reason
-        elif isinstance(told, goal_messages.End):
-            done = told.outcome is Outcome.SUCCEEDED
-            self._results[told.number] = None if done else told.text
 
 
 def _death(code: int) -> str:

@@ -35,13 +35,6 @@ class Pose(NamedTuple):
     rotation: Floats  #: (3, 3), its columns are the axes of the tip
 
 
-class Line(NamedTuple):
-    """The way along a straight line."""
-
-    times: Floats  # (k,) s
-    positions: Floats  # (k, n) rad, of the joints
-
-
 class Poses:
     """Kinematics of a configured arm."""
 
@@ -69,8 +62,8 @@ class Poses:
         position: ArrayLike,
         rotation: ArrayLike | None,
         speed: float,
-    ) -> Line:
-        """Return the way from positions `begin` (n,) [rad] straight to a pose.
+    ) -> list[tuple[float, Floats]]:
+        """Return times [s] and positions (n,) [rad] on the way from `begin` (n,) to a pose.
 
         `speed` is a share of the limits of the joints.
 
@@ -95,7 +88,7 @@ class Poses:
         far = np.abs(np.diff(way, axis=0)).sum(axis=0)
         fastest, acceleration = speed * np.array((limits.velocity, limits.acceleration))
         duration = max(_SHORTEST, duration_of(far, fastest, acceleration))
-        return Line(duration * s, np.array(way[1:]))
+        return [*zip((duration * s).tolist(), way[1:], strict=True)]
 
 
 class _Solver:
@@ -152,24 +145,12 @@ def _model(pin: Any, chain: Chain, config: ControllerConfig) -> Any:
 
 
 def _checked(position: ArrayLike, rotation: ArrayLike) -> Pose:
-    try:
-        at = np.asarray(position, float)
-    except (TypeError, ValueError):
-        raise DriveError(
-            f'position: got {type(position).__name__}, but three finite values in m are needed, '
-            'such as pose.position'
-        ) from None
-    try:
-        turned = np.asarray(rotation, float)
-    except (TypeError, ValueError):
-        raise DriveError(
-            f'rotation: got {type(rotation).__name__}, but an orthonormal matrix (3, 3) is needed, '
-            'such as pose.rotation'
-        ) from None
+    at = _array('position', position, 'three finite values in m are needed')
     if at.shape != (3,) or not np.isfinite(at).all():
         raise DriveError(
             f'position: got {at.tolist()}, but three finite values in m are needed'
         )
+    turned = _array('rotation', rotation, 'an orthonormal matrix (3, 3) is needed')
     if (
         turned.shape != (3, 3)
         or not np.abs(turned.T @ turned - np.eye(3)).max() < _ORTHONORMAL
@@ -180,3 +161,12 @@ def _checked(position: ArrayLike, rotation: ArrayLike) -> Pose:
             'is needed'
         )
     return Pose(at, turned)
+
+
+def _array(name: str, given: ArrayLike, need: str) -> Floats:
+    try:
+        return np.asarray(given, float)
+    except (TypeError, ValueError):
+        raise DriveError(
+            f'{name}: got {type(given).__name__}, but {need}, such as pose.{name}'
+        ) from None

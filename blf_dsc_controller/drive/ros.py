@@ -185,7 +185,7 @@ class RosDriver(Driver):
 
     def finish(self) -> None:
         """Record no more; the node goes on holding the arm."""
-        self._node.end(self._controller)
+        self._node.is_recorded = False
 
     def recover(self) -> None:
         """Do nothing: no robot behind ROS says that it has stopped by itself."""
@@ -234,7 +234,7 @@ class RosDriver(Driver):
         silent = now - max(node.heard, self._began)
         if now - self._looked > _LOOK:
             self._looked = now
-            if not node.is_heard:
+            if not node.is_observed():
                 raise ConnectionLostError(
                     f'nobody takes torques on {node.commands}: start the effort controller, or '
                     'name its topic as drive.commands (of commission, --commands)'

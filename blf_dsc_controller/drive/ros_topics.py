@@ -7,21 +7,16 @@ node.  If it ends or hangs, the loop goes on without.
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
 from time import monotonic
 
-from blf_dsc_controller import child
 from blf_dsc_controller.control.arm_controller import ArmController
-from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.control.status_report import StatusReport
 from blf_dsc_controller.drive.beside import Beside
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topic_link, topics
-from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.link import LinkedProcess
 from blf_dsc_controller.messages.strings import encode_string
-from blf_dsc_controller.messages.topic_link import KINDS, READY, STATUS, STOP
+from blf_dsc_controller.messages.topic_link import KINDS, OF_LOOP, READY, STATUS, STOP
 from blf_dsc_controller.messages.topics import Topic
 from blf_dsc_controller.supervision.guard import Guard
 
@@ -29,22 +24,6 @@ _PROCESS = 'blf_dsc_controller.nodes.topics_process'
 _START = 30.0  # s, for ROS to start
 _END = 10.0  # s, for its last messages
 _STATUS_PERIOD = 1.0  # s
-_TELEMETRY = (
-    topics.REFERENCE,
-    topics.TRACKING_ERROR,
-    topics.BOUND,
-    topics.MONITOR,
-    topics.EXTERNAL_TORQUE,
-    topics.EXTERNAL_WRENCH,
-)
-_ALWAYS = (
-    topics.JOINT_STATES,
-    topics.COMMANDS,
-    topics.JOURNAL,
-    topics.TARGETS,
-    topics.STATE,
-    topics.DIAGNOSTICS,
-)
 
 
 class RosTopics(Beside):
@@ -63,15 +42,12 @@ class RosTopics(Beside):
             BlfDscError: it did not start.
         """
         config = controller.config
-        self._estimates = controller.estimate_names
-        self._sent = frozenset((*_ALWAYS, *_TELEMETRY))
-        link, self._process = _start(config.joints, namespace, self._sent)
-        super().__init__(link, controller)
+        self._ros = LinkedProcess(_PROCESS, f'/{namespace.strip("/")}', *config.joints)
+        super().__init__(self._ros, controller)
         self._report = StatusReport(self.log)
         self._report.trajectories = self._inputs
         self._late = ''
         self._reported = -1.0, -1  # s, and revision of the state
-        self._columns = b''
         self._await_ros()
         if config.robot.urdf:
             description = encode_string(config.robot.text)
@@ -89,7 +65,7 @@ class RosTopics(Beside):
 
     def write(self, _stamp: int, topic: Topic, raw: bytes) -> None:
         """Publish a serialised message, or drop it."""
-        if topic in self._sent:
+        if topic in OF_LOOP:
             self._link.put(KINDS[topic], raw)
 
     def close(self) -> None:
@@ -98,12 +74,8 @@ class RosTopics(Beside):
             self._tell_status(self._guard)
         end = monotonic() + _END
         self._link.close(_END)
-        try:
-            self._process.wait(max(end - monotonic(), 0.0))
-        except subprocess.TimeoutExpired:
+        if not self._ros.await_end(max(end - monotonic(), 0.0)):
             self._late = 'ROS did not take the last messages'
-            self._process.kill()
-            self._process.wait()
 
     def _take(self, kind: int, content: bytes) -> None:
         if kind == STOP:
@@ -125,11 +97,6 @@ class RosTopics(Beside):
             self._tell_status(guard)
 
     def _tell_status(self, guard: Guard) -> None:
-        columns = guard.controller.state.latch.active.tobytes()
-        if columns != self._columns:
-            self._columns = columns
-            rejected = rejected_columns(guard.controller, self._estimates)
-            self._report.rejected = rejected
         parts = [
             (
                 name,
@@ -149,29 +116,7 @@ class RosTopics(Beside):
             self._link.wait(0.1)
             if any(kind == READY for kind, _ in self._link.messages()):
                 return
-        self._process.kill()
-        self._process.wait()
+        self._ros.await_end(0.0)
         raise BlfDscError(
             'ROS did not start: see above; without --ros the robot is controlled without topics'
         )
-
-
-def _start(
-    joints: tuple[str, ...], namespace: str, sent: frozenset[Topic]
-) -> tuple[Link, subprocess.Popen[bytes]]:
-    """Start the process, which ends with the other end of the link."""
-    ours, theirs = socket.socketpair()
-    kinds = ','.join(str(KINDS[topic]) for topic in sent)
-    with theirs:
-        process = subprocess.Popen(
-            [
-                *child.running_module(_PROCESS),
-                f'{theirs.fileno()}',
-                f'/{namespace.strip("/")}',
-                kinds,
-                *joints,
-            ],
-            pass_fds=[theirs.fileno()],
-            env=os.environ | child.places(),
-        )
-    return Link(ours), process

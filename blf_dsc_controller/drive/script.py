@@ -16,7 +16,13 @@ import numpy as np
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.control.arm_controller import ArmController
-from blf_dsc_controller.control.goal_messages import End, Goal, Message, encode
+from blf_dsc_controller.control.goal_messages import (
+    Answer,
+    End,
+    Goal,
+    Message,
+    Outcome,
+)
 from blf_dsc_controller.control.goals import Goals
 from blf_dsc_controller.control.motion_input import MotionInput
 from blf_dsc_controller.control.slow_move import duration_of
@@ -28,7 +34,6 @@ from blf_dsc_controller.messages import script_link, topic_link
 from blf_dsc_controller.messages.link import Link
 from blf_dsc_controller.messages.script_link import ArmState, encode_sample
 from blf_dsc_controller.messages.tip_load import TipLoad
-from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
 from blf_dsc_controller.reference.turns import short_way
 from blf_dsc_controller.run import TURNING
@@ -38,6 +43,9 @@ _SHORTEST = 0.1  # s, of a move
 _SOURCE = 'the script'
 _TURN = 2.0 * math.pi  # rad
 _BEYOND = 2.0  # times what a joint reaches, and at least turns: no target
+
+Condition = Callable[[], bool]
+"""Whether a request is done; raises BlfDscError if it cannot be."""
 
 
 class Script(Beside):
@@ -55,9 +63,14 @@ class Script(Beside):
         self._goals = Goals(self._inputs, controller.joints, self._tell_goal, self.log)
         self._parent = os.getppid()
         self._told = -math.inf  # s, time of the last sample that was sent
-        self._braking: list[tuple[float, int]] = []  # s, end, and number of the request
+        self._orders: dict[int, Callable[[Any], Condition | None]] = {
+            script_link.BRAKE: self._brake,
+            script_link.TARE: self._tare,
+            script_link.EXPECT: self._expect,
+            script_link.LOAD: self._declare,
+        }
+        self._waiting: dict[int, Condition] = {}  # by the number of the request
         self._loop: DriveLoop | None = None
-        self._loading: int | None = None  # number of the request
         self._asked = 0  # to close, by a signal
         self._closes = 0
         self._rests_at = math.nan  # s, when the loop may end
@@ -69,7 +82,7 @@ class Script(Beside):
         self._loop = loop
         self._tells_running = True
         self._told = -math.inf
-        self._braking.clear()
+        self._waiting.clear()
 
     @property
     def is_over(self) -> bool:
@@ -116,27 +129,31 @@ class Script(Beside):
     def _take(self, kind: int, content: bytes) -> None:
         if kind == script_link.POSITIONS:
             self._stream(np.frombuffer(content))
-            return
+        elif kind == script_link.CLOSE:
+            self._close()
+        else:
+            self._take_request(kind, *script_link.request_in(content))
+
+    def _take_request(self, kind: int, number: int, content: bytes) -> None:
+        """Begin what a request asks for."""
         if kind == script_link.FOLLOW:
-            (number,) = script_link.HEAD.unpack_from(content)
             shift = self._guard.reference.time - time.time()
             self._begin_goal(number, lambda: _trajectory(content, shift))
             return
         wanted = topic_link.decode(content)
-        match kind:
-            case script_link.MOVE:
-                trajectory = self._move(wanted)
-                self._begin_goal(wanted['number'], lambda: trajectory)
-            case script_link.BRAKE:
-                self._brake(wanted)
-            case script_link.LOAD:
-                self._declare(wanted)
-            case script_link.EXPECT:
-                self._expect(wanted)
-            case script_link.TARE:
-                self._answer(wanted, self._guard.findings.tare)
-            case script_link.CLOSE:
-                self._close()
+        if kind == script_link.MOVE:
+            trajectory = self._move(wanted)
+            self._begin_goal(number, lambda: trajectory)
+            return
+        try:
+            condition = self._orders[kind](wanted)
+        except BlfDscError as error:
+            self._tell_done(number, str(error))
+            return
+        if condition is None:
+            self._tell_done(number)
+        else:
+            self._waiting[number] = condition
 
     def _stream(self, positions: np.ndarray) -> None:
         """Follow positions (n,) [rad], unless they cannot be meant; say so once."""
@@ -162,54 +179,43 @@ class Script(Beside):
         points = (TrajectoryPoint(max(_SHORTEST, duration), tuple(there.tolist())),)
         return Trajectory(config.joints, points)
 
-    def _brake(self, number: int) -> None:
-        try:
-            end = self._inputs.stop(self._guard, 'stop()')
-        except TrajectoryError as error:
-            self._tell_done(number, str(error))
-        else:
-            self._braking.append((end, number))
+    def _brake(self, _: None) -> Condition:
+        end = self._inputs.stop(self._guard, 'stop()')
+        return lambda: self._guard.reference.time >= end
+
+    def _tare(self, _: None) -> None:
+        self._guard.findings.tare()
 
     def _expect(self, wanted: dict[str, Any]) -> None:
-        load = TipLoad(wanted['mass'], tuple(wanted['centre']))
-        self._answer(
-            wanted['number'],
-            lambda: self._guard.expect_load(
-                None if wanted['remember'] else load, wanted['interval']
-            ),
-        )
+        load = None if wanted['remember'] else _load(wanted)
+        self._guard.expect_load(load, wanted['interval'])
 
-    def _answer(self, number: int, act: Callable[[], object]) -> None:
-        """Do what a request asks for at once, and say that it is done, or why not."""
-        try:
-            act()
-        except BlfDscError as error:
-            self._tell_done(number, str(error))
-        else:
-            self._tell_done(number)
+    def _declare(self, wanted: dict[str, Any]) -> Condition:
+        self._guard.loads.declare(_load(wanted))
+        return self._is_declared
 
-    def _declare(self, wanted: dict[str, Any]) -> None:
-        load = TipLoad(wanted['mass'], tuple(wanted['centre']))
-        try:
-            self._guard.loads.declare(load)
-        except BlfDscError as error:
-            self._tell_done(wanted['number'], str(error))
-        else:
-            self._loading = wanted['number']
+    def _is_declared(self) -> bool:
+        """Whether the drives have a load; BlfDscError says why they are told none any more."""
+        if self._loop is not None and self._loop.remark:
+            raise BlfDscError(self._loop.remark)
+        return self._guard.loads.is_declared
 
-    def _follow_load(self) -> None:
-        """Say when the drives have a load, or why they have not."""
-        problem = self._loop.remark if self._loop is not None else ''
-        if self._loading is not None and (problem or self._guard.loads.is_declared):
-            self._tell_done(self._loading, problem)
-            self._loading = None
+    def _follow_waiting(self) -> None:
+        """Tell which requests are done by now, or cannot be."""
+        for number, condition in [*self._waiting.items()]:
+            problem = ''
+            try:
+                if not condition():
+                    continue
+            except BlfDscError as error:
+                problem = str(error)
+            del self._waiting[number]
+            self._tell_done(number, problem)
 
     def _tell_changes(self) -> None:
         guard = self._guard
-        self._follow_load()
         self._goals.watch(guard)
-        while self._braking and guard.reference.time >= self._braking[0][0]:
-            self._tell_done(self._braking.pop(0)[1])
+        self._follow_waiting()
         if not guard.has_sample:
             return
         if self._tells_running:
@@ -253,11 +259,16 @@ class Script(Beside):
         self.tell(script_link.DONE, {'number': number, 'problem': problem})
 
     def _tell_goal(self, message: Message) -> None:
-        if isinstance(message, End):
-            if not self._guard.supervisor.running:
-                return  # the loop ends, and says why
-            self._tell_sample()
-        self._link.put(script_link.GOAL, encode(message))
+        if isinstance(message, Answer) and not message.accepted:
+            self._tell_done(message.number, message.reason)
+        elif isinstance(message, End) and self._guard.supervisor.running:
+            # else the loop ends, and says why
+            succeeded = message.outcome == Outcome.SUCCEEDED
+            self._tell_done(message.number, '' if succeeded else message.text)
+
+
+def _load(wanted: dict[str, Any]) -> TipLoad:
+    return TipLoad(wanted['mass'], tuple(wanted['centre']))
 
 
 def _far_beyond(positions: np.ndarray, config: ControllerConfig) -> str:
@@ -281,7 +292,7 @@ def _far_beyond(positions: np.ndarray, config: ControllerConfig) -> str:
 
 def _trajectory(content: bytes, shift: float) -> Trajectory:
     """Return the trajectory of a request; `shift` [s] turns wall time into time since the start."""
-    wanted = topic_link.decode(content[script_link.HEAD.size :])
+    wanted = topic_link.decode(content)
     begin = None if wanted['begin'] is None else wanted['begin'] + shift
     points = tuple(TrajectoryPoint(*map(_field, each)) for each in wanted['points'])
     return Trajectory(tuple(wanted['joints']), points, begin)

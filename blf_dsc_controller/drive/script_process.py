@@ -9,7 +9,6 @@ Between two loops the robot holds itself by its own means, and what was learned 
 from __future__ import annotations
 
 import signal
-import socket
 import sys
 from collections.abc import Mapping
 from contextlib import closing
@@ -33,7 +32,7 @@ from blf_dsc_controller.drive.motor_feedback import closed_in_motors, robot_warn
 from blf_dsc_controller.drive.script import Script
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import script_link, topic_link
-from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.link import Link, link_of
 
 _POLL = 0.1  # s
 _PATIENCE = 5.0  # s, for the script to take the last messages
@@ -42,7 +41,7 @@ _HOLD = {'reference.type': 'hold'}
 
 def main() -> int:
     """Control the arm until the script closes or ends."""
-    link = Link(socket.socket(fileno=int(sys.argv[1])))
+    link = link_of(sys.argv[1])
     log = LinkLog(link)
     code = 0
     try:

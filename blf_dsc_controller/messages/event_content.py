@@ -31,13 +31,6 @@ class Kind(NamedTuple):
     accepts: Callable[[Any], bool]
 
 
-class Field(NamedTuple):
-    """A field of an event."""
-
-    kind: Kind
-    optional: bool = False
-
-
 def _is_whole(value: object) -> bool:
     """Return whether it is an integer of 64 bits; true and false are none."""
     is_integer = isinstance(value, int) and not isinstance(value, bool)
@@ -82,19 +75,20 @@ NAMES_BY_NAME = Kind('texts by name', lambda value: _is_mapping(value, TEXT.acce
 CONTENT = Kind('fields by name', lambda value: isinstance(value, Mapping))
 PARAMETERS = Kind('parameters by name', lambda value: _is_mapping(value, _is_parameter))
 
+# Fields by name; one whose name ends with ? may be missing.
 _POINT = {
-    'time': Field(NUMBER),
-    'positions': Field(NUMBERS),
-    'velocities': Field(NUMBERS, optional=True),
-    'accelerations': Field(NUMBERS, optional=True),
-    'effort': Field(NUMBERS, optional=True),
+    'time': NUMBER,
+    'positions': NUMBERS,
+    'velocities?': NUMBERS,
+    'accelerations?': NUMBERS,
+    'effort?': NUMBERS,
 }
 
 
 def _is_point(value: object) -> bool:
     return (
         isinstance(value, Mapping)
-        and value.keys() <= _POINT.keys()
+        and value.keys() <= {name.rstrip('?') for name in _POINT}
         and not [*_problems(value, _POINT)]
     )
 
@@ -104,87 +98,87 @@ POINTS = Kind(
 )
 
 EVENT = {
-    'number': Field(COUNT),
-    'type': Field(TEXT),
-    'stamp': Field(STAMP),
-    'messages': Field(COUNT),
-    'commands': Field(COUNT),
-    'content': Field(CONTENT),
+    'number': COUNT,
+    'type': TEXT,
+    'stamp': STAMP,
+    'messages': COUNT,
+    'commands': COUNT,
+    'content': CONTENT,
 }
 """Fields of every event; see `Event`."""
 
-SCHEMA: Mapping[str, Mapping[str, Field]] = {
+SCHEMA: Mapping[str, Mapping[str, Kind]] = {
     'configure': {
-        'parameters': Field(PARAMETERS),  # all of them
-        'format': Field(COUNT, optional=True),  # of the journal; 0 without
-        'version': Field(TEXT, optional=True),  # of the package
-        'topics': Field(NAMES_BY_NAME, optional=True),  # used, by our name
-        'law_digest': Field(TEXT, optional=True),  # of the file of a law
+        'parameters': PARAMETERS,  # all of them
+        'format?': COUNT,  # of the journal; 0 without
+        'version?': TEXT,  # of the package
+        'topics?': NAMES_BY_NAME,  # used, by our name
+        'law_digest?': TEXT,  # of the file of a law
     },
     'activate': {},
-    'prepare': {'positions': Field(NUMBERS)},  # rad, of the arm at rest
-    'takeover': {'torque': Field(NUMBERS)},  # N m, by which another node holds the arm
-    'start': {'resumed': Field(FLAG)},
+    'prepare': {'positions': NUMBERS},  # rad, of the arm at rest
+    'takeover': {'torque': NUMBERS},  # N m, by which another node holds the arm
+    'start': {'resumed': FLAG},
     'trajectory': {
-        'joints': Field(NAMES),
-        'points': Field(POINTS),
-        'begin': Field(NUMBER_OR_NULL),  # s since the start; null: at once
-        'at': Field(NUMBER),  # s since the start, followed from then on
+        'joints': NAMES,
+        'points': POINTS,
+        'begin': NUMBER_OR_NULL,  # s since the start; null: at once
+        'at': NUMBER,  # s since the start, followed from then on
     },
     'target': {
-        'positions': Field(NUMBERS),  # rad, in the order of `joints`
-        'velocities': Field(NUMBERS),  # rad/s; none: it comes to rest there
-        'due': Field(NUMBER),  # s since the start, when the reference should be there
-        'until': Field(NUMBER),  # s, when it brakes if nothing follows
-        'held': Field(FLAG),  # whether it then returns to the positions
-        'at': Field(NUMBER),  # s, followed from then on
+        'positions': NUMBERS,  # rad, in the order of `joints`
+        'velocities': NUMBERS,  # rad/s; none: it comes to rest there
+        'due': NUMBER,  # s since the start, when the reference should be there
+        'until': NUMBER,  # s, when it brakes if nothing follows
+        'held': FLAG,  # whether it then returns to the positions
+        'at': NUMBER,  # s, followed from then on
     },
     'brake': {},
-    'parameters': {'parameters': Field(PARAMETERS)},  # the changed ones
+    'parameters': {'parameters': PARAMETERS},  # the changed ones
     'drive load': {  # of the tip, that the drives add from the next state on
-        'mass': Field(NUMBER),  # kg
-        'centre': Field(NUMBERS),  # m
+        'mass': NUMBER,  # kg
+        'centre': NUMBERS,  # m
     },
     'expected load': {  # what the tip takes up besides what it held at the start, as somebody says
-        'mass': Field(NUMBER),  # kg
-        'centre': Field(NUMBERS),  # m, in the frame of the tip
-        'interval': Field(NUMBER),  # s, in which it does
+        'mass': NUMBER,  # kg
+        'centre': NUMBERS,  # m, in the frame of the tip
+        'interval': NUMBER,  # s, in which it does
     },
     'tare': {},  # the external torque is zero where the arm rests now
     'contact': {
-        'reaction': Field(TEXT),
-        'joint': Field(TEXT),  # that shows it most
-        'torque': Field(NUMBER),  # N m, from outside, on this joint
-        'interval': Field(NUMBER),  # N m, up to which model and noise explain it
-        'text': Field(TEXT),
+        'reaction': TEXT,
+        'joint': TEXT,  # that shows it most
+        'torque': NUMBER,  # N m, from outside, on this joint
+        'interval': NUMBER,  # N m, up to which model and noise explain it
+        'text': TEXT,
     },
     'oscillation': {
-        'joint': Field(TEXT),  # that shows it most
-        'frequency': Field(NUMBER),  # Hz
-        'torque': Field(NUMBER),  # N m, amplitude
-        'text': Field(TEXT),
+        'joint': TEXT,  # that shows it most
+        'frequency': NUMBER,  # Hz
+        'torque': NUMBER,  # N m, amplitude
+        'text': TEXT,
     },
     'torque sensors': {
-        'joint': Field(TEXT),  # that shows it most
-        'text': Field(TEXT),
+        'joint': TEXT,  # that shows it most
+        'text': TEXT,
     },
-    'stop': {'reason': Field(TEXT), 'text': Field(TEXT)},
-    'silence': {'torques': Field(COUNT)},  # by the watchdog, before the next message
+    'stop': {'reason': TEXT, 'text': TEXT},
+    'silence': {'torques': COUNT},  # by the watchdog, before the next message
     'deactivate': {},
     'reset': {},
-    'withdraw': {'text': Field(TEXT)},  # nothing is commanded until a reset, and why
-    'release': {'resting': Field(FLAG, optional=True)},  # under the last torque
+    'withdraw': {'text': TEXT},  # nothing is commanded until a reset, and why
+    'release': {'resting?': FLAG},  # under the last torque
 }
-"""Fields of the content of each type of event.
+"""Fields of the content of each type of event, those with ? optional.
 
 Others that a later version adds are ignored.
 """
 
 
 CHANGE = {
-    'stamp': Field(STAMP),
-    'parameters': Field(PARAMETERS),
-    'configured': Field(FLAG, optional=True),
+    'stamp': STAMP,
+    'parameters': PARAMETERS,
+    'configured?': FLAG,
 }
 """Fields of a change of the plant's parameters; see `journal.Change`."""
 
@@ -221,16 +215,17 @@ def _fields_of(given: object) -> Mapping[str, Any]:
     return given
 
 
-def _check(given: Mapping[str, Any], fields: Mapping[str, Field]) -> None:
+def _check(given: Mapping[str, Any], fields: Mapping[str, Kind]) -> None:
     problem = next(_problems(given, fields), '')
     if problem:
         raise BlfDscError(problem)
 
 
-def _problems(given: Mapping[str, Any], fields: Mapping[str, Field]) -> Iterator[str]:
-    for name, (kind, is_optional) in fields.items():
+def _problems(given: Mapping[str, Any], fields: Mapping[str, Kind]) -> Iterator[str]:
+    for field, kind in fields.items():
+        name = field.rstrip('?')
         if name not in given:
-            if not is_optional:
+            if name == field:
                 yield f'`{name}` is missing, expected {kind.text}'
         elif not kind.accepts(given[name]):
             yield f'`{name}` is {str(given[name])[:_SHOWN]!r}, expected {kind.text}'

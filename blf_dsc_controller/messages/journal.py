@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from blf_dsc_controller import __version__
 from blf_dsc_controller.errors import BlfDscError
@@ -22,7 +22,9 @@ from blf_dsc_controller.messages.event_content import (
 )
 from blf_dsc_controller.messages.strings import decode_string, encode_string
 from blf_dsc_controller.messages.topics import CHANGES, JOURNAL, TARGETS, Topic
-from blf_dsc_controller.run import Contact, Oscillation
+from blf_dsc_controller.run import Contact, Oscillation, Stop
+
+Finding = TypeVar('Finding', Contact, Oscillation)
 
 OUTSIDE_BOUND = 'error past the bound'
 """Reason for a stop: the error left its bound."""
@@ -112,23 +114,26 @@ class Event(NamedTuple):
         return encode_string(f'{json.dumps(fields)[:-1]}, "content": {text}}}')
 
 
-def contact_in(event: Event) -> Contact:
-    """Return the contact of such an event."""
-    content = event.content
-    return Contact(
-        event.stamp,
-        content['joint'],
-        content['torque'],
-        content['interval'],
-        content['text'],
+def found_in(
+    events: Iterable[Event], event_type: EventType, kind: type[Finding]
+) -> tuple[Finding, ...]:
+    """Return the contacts or oscillations among events, which have their fields by name."""
+    return tuple(
+        kind(event.stamp, *(event.content[name] for name in kind._fields[1:]))
+        for event in events
+        if event.type is event_type
     )
 
 
-def oscillation_in(event: Event) -> Oscillation:
-    """Return the oscillation of such an event."""
-    content = event.content
-    values = (content[name] for name in Oscillation._fields[1:])
-    return Oscillation(event.stamp, *values)
+def stops_in(events: Sequence[Event], first: int) -> Iterator[Stop]:
+    """Yield the stops among events; an early one gets the first stamp [ns]."""
+    for k, event in enumerate(events):
+        if event.type is EventType.STOP:
+            starts = (
+                later.stamp for later in events[k:] if later.type is EventType.START
+            )
+            what = f'{event.content["reason"]}', event.content['text']
+            yield Stop(max(event.stamp, first), *what, until=next(starts, None))
 
 
 class Change(NamedTuple):

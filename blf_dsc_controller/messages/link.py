@@ -7,15 +7,21 @@ message, so that those that arrive are whole.
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import struct
-from collections.abc import Iterator
+import subprocess
+from collections.abc import Iterator, Mapping
 from time import monotonic
+from typing import Any
+
+from blf_dsc_controller import child
 
 _HEAD = struct.Struct('<BI')  # kind, and size of the content in bytes
 _MOST = 8 << 20  # bytes that wait: some seconds of messages
 _PIECE = 1 << 16  # bytes read at once
+_POLL = 0.1  # s
 
 
 class Link:
@@ -71,6 +77,12 @@ class Link:
             del self._in[:end]
             yield kind, content
 
+    def all_messages(self) -> Iterator[tuple[int, bytes]]:
+        """Yield what arrives until the other side ends, likewise; not for a loop."""
+        while not self.broken:
+            self.wait(_POLL)
+            yield from self.messages()
+
     def wait(self, seconds: float) -> None:
         """Wait until something arrives, for this time at most; not for a loop."""
         if not self.broken:
@@ -97,3 +109,49 @@ class Link:
                 piece = b''
             self._in += piece
             self.broken = not piece
+
+
+class LinkedProcess(Link):
+    """A process that runs `main` of a module of this package, and this end of a link to it.
+
+    Its first argument is the other end: see `link_of`.
+
+    Attributes:
+        process: it.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        *arguments: str,
+        variables: Mapping[str, str] | None = None,
+        **options: Any,
+    ) -> None:
+        """Start it, with environment variables and options of `subprocess.Popen`."""
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self.process = subprocess.Popen(
+                [*child.running_module(module), f'{theirs.fileno()}', *arguments],
+                pass_fds=[theirs.fileno()],
+                env={**(variables or {}), **os.environ, **child.places()},
+                **options,
+            )
+        super().__init__(ours)
+
+    def await_end(self, patience: float) -> bool:
+        """Wait for the end of the process, and kill it after the patience [s].
+
+        Return whether it has ended by itself.
+        """
+        try:
+            self.process.wait(patience)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            return False
+        return True
+
+
+def link_of(argument: str, most: int = _MOST) -> Link:
+    """Return the link of a `LinkedProcess`, in that process, by its first argument."""
+    return Link(socket.socket(fileno=int(argument)), most)

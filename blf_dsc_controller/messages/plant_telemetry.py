@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -12,8 +12,7 @@ from blf_dsc_controller.messages.codecs import JointStateEncoder, encode_clock
 from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.messages.topics import Message
 
-DECIMATION = 10
-"""Number of samples from one message of the plant's truth to the next."""
+_DECIMATION = 10  # samples from one message of the plant's truth to the next
 
 
 class PlantTelemetry:
@@ -51,13 +50,24 @@ class PlantTelemetry:
         self._published[:, self._places] = measurement.reshape(3, -1)
         return topics.JOINT_STATES, self._joint_states.encode(stamp, *self._published)
 
-    def motor_states(self, stamp: int, reading: np.ndarray) -> Message:
-        """Encode positions and velocities (2, n) of the motors."""
-        return topics.MOTOR_STATES, self._motors.encode(stamp, *reading)
+    def states(
+        self,
+        sample: int,
+        stamp: int,
+        measurement: np.ndarray,
+        motors: np.ndarray | None,
+        truth: Callable[[], np.ndarray],
+    ) -> Iterator[Message]:
+        """Yield the messages about a sample of this number.
 
-    def truth(self, stamp: int, truth: np.ndarray) -> Message:
-        """Encode the true [P, tau_dist, q, dq] (p + 3 n,)."""
-        return topics.TRUTH, self._truth.encode(stamp, truth)
+        `motors` are their positions and velocities (2, n), where these are measured; `truth`
+        returns the true [P, tau_dist, q, dq] (p + 3 n,).
+        """
+        if motors is not None:
+            yield topics.MOTOR_STATES, self._motors.encode(stamp, *motors)
+        yield self.joint_states(stamp, measurement)
+        if sample % _DECIMATION == 0:
+            yield topics.TRUTH, self._truth.encode(stamp, truth())
 
     def timing(
         self, stamp: int, latency: float, lateness: float, late_steps: int

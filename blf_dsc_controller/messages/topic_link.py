@@ -20,6 +20,20 @@ TOPICS = (
 )
 KINDS = {topic: kind for kind, topic in enumerate(TOPICS)}
 
+OF_LOOP = (
+    topics.JOINT_STATES,
+    topics.COMMANDS,
+    topics.JOURNAL,
+    topics.TARGETS,
+    topics.REFERENCE,
+    topics.TRACKING_ERROR,
+    topics.BOUND,
+    topics.MONITOR,
+    topics.EXTERNAL_TORQUE,
+    topics.EXTERNAL_WRENCH,
+)
+"""Topics of which the loop sends each message; STATE and DIAGNOSTICS come from STATUS."""
+
 READY = 100
 """The topics exist: null."""
 STATUS = 101

@@ -10,12 +10,8 @@ No coroutine waits for the end of a goal, since rclpy's executors poll those tha
 
 from __future__ import annotations
 
-import os
-import signal
-import socket
 import sys
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import rclpy
@@ -32,6 +28,7 @@ from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from blf_dsc_controller.control.goal_messages import (
+    KIND,
     Answer,
     Cancel,
     End,
@@ -43,13 +40,12 @@ from blf_dsc_controller.control.goal_messages import (
     encode,
 )
 from blf_dsc_controller.messages.codecs import NANOSECONDS
-from blf_dsc_controller.messages.link import Link
-from blf_dsc_controller.nodes.action_process import KIND
+from blf_dsc_controller.messages.link import Link, link_of
+from blf_dsc_controller.nodes.process import yield_to_loop
 from blf_dsc_controller.run import NANOSECOND
 
 _LARGEST = 1 << 30  # bytes of goals that wait
 _PATIENCE = 10.0  # s, until a controller takes a goal
-_POLL = 1.0  # s
 Result = FollowJointTrajectory.Result
 
 
@@ -163,9 +159,9 @@ class TrajectoryActionServer:
 
     def _on_end(self, message: End) -> None:
         handle = self._handles.pop(message.number)
-        if message.outcome is Outcome.SUCCEEDED:
+        if message.outcome == Outcome.SUCCEEDED:
             handle.succeed()
-        elif message.outcome is Outcome.CANCELLED:
+        elif message.outcome == Outcome.CANCELLED:
             handle.canceled()
         else:
             handle.abort()
@@ -189,10 +185,8 @@ def _unsupported(request: Any) -> str:
     return ''
 
 
-def _tolerances(sent: Any) -> tuple[JointTolerance, ...]:
-    return tuple(
-        JointTolerance(each.name, each.position, each.velocity) for each in sent
-    )
+def _tolerances(sent: Any) -> list[JointTolerance]:
+    return [(each.name, each.position, each.velocity) for each in sent]
 
 
 def _point(time: float, values: list[list[float]]) -> JointTrajectoryPoint:
@@ -203,27 +197,11 @@ def _point(time: float, values: list[list[float]]) -> JointTrajectoryPoint:
     return point
 
 
-def _listen(
-    link: Link,
-    deliver: Callable[[Any], object],
-    end: Callable[[], object],
-) -> None:
-    """Deliver what the controller sends, until it ends."""
-    while not link.broken:
-        link.wait(_POLL)
-        for _, content in link.messages():
-            deliver(decode(content))
-    end()
-
-
 def main() -> int:
     """Run until the controller ends."""
-    descriptor, domain, node_name, namespace, action, enclave, *joints = sys.argv[1:]
-    for number in (signal.SIGINT, signal.SIGTERM):  # the controller may still brake
-        signal.signal(number, signal.SIG_IGN)
-    # the controller's real-time priority is not for goals
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    link = Link(socket.socket(fileno=int(descriptor)), _LARGEST)
+    argument, domain, node_name, namespace, action, enclave, *joints = sys.argv[1:]
+    yield_to_loop()
+    link = link_of(argument, _LARGEST)
     rclpy.init(
         args=['--ros-args', '--enclave', enclave],
         domain_id=int(domain),
@@ -252,16 +230,13 @@ def _spin(node: Node, server: TrajectoryActionServer, link: Link) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     over = Future()
-    listener = threading.Thread(
-        target=_listen,
-        args=(
-            link,
-            lambda message: executor.create_task(server.on_message, message),
-            lambda: executor.create_task(over.set_result, None),
-        ),
-        daemon=True,
-    )
-    listener.start()
+
+    def listen() -> None:
+        for _, content in link.all_messages():
+            executor.create_task(server.on_message, decode(content))
+        executor.create_task(over.set_result, None)
+
+    threading.Thread(target=listen, daemon=True).start()
     executor.spin_until_future_complete(over)
 
 

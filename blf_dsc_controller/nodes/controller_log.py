@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 from blf_dsc_controller.configuration.rules import When
-from blf_dsc_controller.control.rejected_columns import rejected_columns
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
 from blf_dsc_controller.nodes.process import PlainNode
@@ -35,7 +34,7 @@ class ControllerLog:
         self._log = node.get_logger()
         self._phase = Phase.INACTIVE, 0, False, ''  # stops, silenced, text of a stop
         self._turned_at = -1  # ns, start of the last reference shifted by turns
-        self._columns = b''  # those that are estimated, and whether they were checked
+        self._rejected: Mapping[str, str] = {}
         self._model_changes = 0.0
         self._contacts = self._oscillations = 0
         self._untrusted = ''  # sentence about the torque sensors
@@ -123,32 +122,28 @@ class ControllerLog:
                 self.warns_of_gains = False
                 self._log.warning(text)
 
-    def warn_of_learning(
-        self, guard: Guard, names: Sequence[str], status: ControllerStatus
-    ) -> bool:
+    def warn_of_learning(self, guard: Guard, status: ControllerStatus) -> bool:
         """Warn of changes of the arm, and of rejected columns, since the last call.
 
-        `names` are those of theta^.  The columns are in the status, too; return whether it is
-        to be published.
+        The columns are in the status, too; return whether it is to be published.
         """
-        state = guard.controller.state
-        has_changed = state.change.changes[0] > self._model_changes
-        self._model_changes = state.change.changes[0]
+        change = guard.controller.state.change
+        has_changed = bool(change.changes[0] > self._model_changes)
+        self._model_changes = change.changes[0]
         if has_changed:
-            residual = state.change.contradiction[0] ** 0.5
+            residual = change.contradiction[0] ** 0.5
             unit = unit_of_all(guard.config.units, 'N m')
             self._log.warning(
                 f'the arm has changed: torques differ by {residual:.3g} {unit} from those '
                 'expected; learning restarts'
             )
-        columns = state.latch.active.tobytes() + state.latch.columns_checked.tobytes()
-        if columns == self._columns:
-            return bool(has_changed)
-        self._columns = columns
-        status.rejected = rejected_columns(guard.controller, names)
-        for reason in status.rejected.values():
+        rejected = status.rejected(guard)
+        if rejected is self._rejected:
+            return has_changed
+        self._rejected = rejected
+        for reason in rejected.values():
             self._log.warning(reason)
-        return bool(has_changed or status.rejected)
+        return has_changed or bool(rejected)
 
 
 def _added(before: tuple[object, ...], now: tuple[Phase, int, bool, str]) -> str:

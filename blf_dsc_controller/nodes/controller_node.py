@@ -11,12 +11,10 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Inertia
-from std_srvs.srv import Trigger
 
 from blf_dsc_controller.configuration.controller import ControllerConfig
-from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT, WATCHDOG
+from blf_dsc_controller.configuration.nodes import CONTROLLER, WATCHDOG
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
-from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
@@ -27,11 +25,15 @@ from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.tip_load import TipLoad
 from blf_dsc_controller.nodes import parameters, process
 from blf_dsc_controller.nodes.controller_log import ControllerLog
-from blf_dsc_controller.nodes.controller_start import ControllerStart, Surroundings
+from blf_dsc_controller.nodes.controller_start import (
+    WAITING_PERIOD,
+    ControllerStart,
+    is_simulated,
+)
 from blf_dsc_controller.nodes.diagnostics import ControllerStatus
+from blf_dsc_controller.nodes.endpoints import create_trigger
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.nodes.service_declaration import ServiceDeclaration
-from blf_dsc_controller.nodes.start_conditions import WAITING_PERIOD, StartConditions
 from blf_dsc_controller.nodes.trajectory_action import TrajectoryAction, offered_action
 from blf_dsc_controller.nodes.trajectory_input import motion_input_of
 from blf_dsc_controller.nodes.watchdog_presence import WatchdogPresence
@@ -53,7 +55,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     Attributes:
         guard: runs the guarded law; None until the node is configured.
-        outputs: take the loop's messages beside the topics: joint states, torques,
+        is_recorded: whether the loop's outputs take its messages, too: joint states, torques,
             telemetry and events.
         starting: what is looked at before the first state is used.
         status: diagnostics and events; its `trajectories` are the motions that were asked for.
@@ -67,7 +69,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         super().__init__(CONTROLLER, ControllerConfig, **options)
         joints = self.config.joints
         self.guard: Guard | None = None
-        self.outputs = Outputs()
+        self.is_recorded = False
         self._loop: GuardedLoop | None = None
         self.declaration: ServiceDeclaration | None = None
         self._decoder = JointStateDecoder(joints, required=('position',))
@@ -81,34 +83,27 @@ class ControllerNode(LoopNode[ControllerConfig]):
         # After a signal:
         self._ends_at = 0.0  # s, at the latest
         self._last_seen = 0, 0.0  # joint states processed by then, and s, the last
-        self.status = ControllerStatus(self, joints, self.outputs)
+        self.status = ControllerStatus(self, joints, self._write)
         self.action: TrajectoryAction | None = None
         self._watchdog = WatchdogPresence(expected=self.config.safety.expect_watchdog)
-        self.starting = ControllerStart(
-            self.config,
-            self._decoder,
-            StartConditions(self, self._watchdog, self._steady),
-            Surroundings(self._is_observed, self._is_simulated, self._wall),
-        )
-        self._changes = parameters.on_change(
-            self, type(self.config), self._retune, self._problems, self._check
+        self.starting = ControllerStart(self, self._decoder, self._watchdog)
+        self._changes = parameters.Changes(
+            self, self.config, self._retune, self._problems, self._check
         )
         if self.config.contact.enabled:
-            self.create_service(Trigger, '~/tare', self._on_tare)
+            create_trigger(self, '~/tare', self._on_tare)
         if self.config.robot.tip:
             self.create_subscription(
                 Inertia, '~/expected_load', self._on_expected_load, 10
             )
-            self.create_service(
-                Trigger, '~/expect_last_load', self._on_expect_last_load
-            )
+            create_trigger(self, '~/expect_last_load', self._on_expect_last_load)
         self.start()
 
     # Life cycle.
 
     def configure(self) -> None:
         """Compile the law; create the topics of the loop on the first call."""
-        self._loop = GuardedLoop(self.config, self._steady, self._wall)
+        self._loop = GuardedLoop(self.config, self.steady, self.wall)
         self.guard = self._loop.guard
         self.log.begin()
         self._record_topics(self.guard)
@@ -124,7 +119,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
             inputs = motion_input_of(self, len(joints), lambda: self.guard)
             self.status.trajectories = inputs
             self.action = offered_action(self, inputs, joints)
-        self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
+        self.starting.look_around(self._outputs[topics.COMMANDS].topic_name)
         self._report()
 
     def _record_topics(self, guard: Guard) -> None:
@@ -207,7 +202,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is None or not guard.commanding or self.config.safety.torque == 'zero':
             return True
-        now = self._steady() * 1e-9
+        now = self.steady() * 1e-9
         messages = guard.journal.messages
         if not self._ends_at:
             self._ends_at = now + _LONGEST_END
@@ -222,12 +217,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
     def _begin_again(self, guard: Guard) -> None:
         """Look at the conditions of the start, if this node does not command now."""
         if guard.silenced or not guard.commanding:
-            self.starting.look_around(self._outputs[topics.COMMANDS], self.config)
+            self.starting.look_around(self._outputs[topics.COMMANDS].topic_name)
 
     def _leave(self) -> None:
         """Command the torque that drivers may hold, and release the guard."""
         if self.guard is not None:
-            self._command(self.guard.release())
+            self.command(self.guard.release())
             self.status.publish_events(self.guard)
 
     def reset(self) -> str:
@@ -241,43 +236,39 @@ class ControllerNode(LoopNode[ControllerConfig]):
         self._report()
         return 'estimates cleared: starting with the next state'
 
-    def _on_tare(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        """Take the external torque for zero, or say why not."""
-        response.success, response.message = self._answer(
+    def _on_tare(self) -> str:
+        return self._do(
             lambda guard: guard.findings.tare(), 'the external torque is zero here'
         )
-        return response
 
-    def _on_expect_last_load(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        """Let the law expect the load that it has weighed last, or say why not."""
-        response.success, response.message = self._answer(
+    def _on_expect_last_load(self) -> str:
+        return self._do(
             lambda guard: guard.expect_load(None), 'the last load is expected'
         )
-        return response
 
     def _on_expected_load(self, message: Inertia) -> None:
         """Let the law expect a load of the tip: mass and centre of mass, no more of it."""
         centre = message.com.x, message.com.y, message.com.z
-        accepted, text = self._answer(
-            lambda guard: guard.expect_load(TipLoad.given(message.m, centre)), ''
-        )
-        if not accepted:
-            self.get_logger().warning(f'~/expected_load: {text}')
-
-    def _answer(self, act: Callable[[Guard], object], done: str) -> tuple[bool, str]:
-        """Do what somebody asks for; return whether it is `done`, and that or why not."""
-        if self.guard is None:
-            return False, f'{self.get_name()} is {self.state_label}: activate it first'
         try:
-            act(self.guard)
+            self._do(
+                lambda guard: guard.expect_load(TipLoad.given(message.m, centre)), ''
+            )
         except BlfDscError as error:
-            return False, str(error)
+            self.get_logger().warning(f'~/expected_load: {error}')
+
+    def _do(self, act: Callable[[Guard], object], done: str) -> str:
+        """Do what somebody asks for, and return that it is `done`.
+
+        Raises:
+            BlfDscError: it cannot be.
+        """
+        if self.guard is None:
+            raise BlfDscError(
+                f'{self.get_name()} is {self.state_label}: activate it first'
+            )
+        act(self.guard)
         self._report()
-        return True, done
+        return done
 
     # The loop.
 
@@ -296,7 +287,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
                 self.declaration.follow(guard, in_motion=self.declaration.in_motion)
             torque = self._torque_for(guard, raw)
             self._write(topics.JOINT_STATES, raw)
-            self._command(torque)
+            self.command(torque)
             guard.perceive()
         except Exception as error:  # noqa: BLE001 - the arm needs a torque after any error
             self.survive(error)
@@ -313,17 +304,12 @@ class ControllerNode(LoopNode[ControllerConfig]):
             )
         self.report_if_changed(guard)
 
-    def _is_simulated(self) -> bool:
-        """Whether all joint states are of this package's simulated arm."""
-        found = self.get_publishers_info_by_topic(topics.JOINT_STATES.relative)
-        return all(each.node_name == PLANT for each in found)
-
     def survive(self, error: Exception) -> bool:
         """Make a safe stop after an unexpected error."""
         if self.guard is None:
             return False
         self.get_logger().fatal(''.join(traceback.format_exception(error)))
-        self._command(self.guard.fail(f'{type(error).__name__}: {error}'))
+        self.command(self.guard.fail(f'{type(error).__name__}: {error}'))
         self.report_if_changed(self.guard)
         return True
 
@@ -357,7 +343,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         """Publish the messages about the last state and its torque (n,) [N m]."""
         if self._loop is not None:
             for message in self._loop.messages(
-                torque, errors_wanted=self._errors_subscribed or bool(self.outputs)
+                torque, errors_wanted=self._errors_subscribed or self.is_recorded
             ):
                 self._publish(message)
 
@@ -369,11 +355,11 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _report_learning(self, guard: Guard) -> None:
         """Report columns that were rejected or restored, and changes of the arm."""
-        names = self._loop.estimates if self._loop is not None else ()
-        if self.log.warn_of_learning(guard, names, self.status):
+        if self.log.warn_of_learning(guard, self.status):
             self._report()
 
-    def _command(self, torque: np.ndarray | None) -> None:
+    def command(self, torque: np.ndarray | None) -> None:
+        """Send torques (n,) [N m]; None: none."""
         if torque is not None:
             raw = self._encoder.encode(torque)
             self._senders[topics.COMMANDS](raw)
@@ -385,8 +371,9 @@ class ControllerNode(LoopNode[ControllerConfig]):
 
     def _write(self, topic: topics.Topic, raw: bytes) -> None:
         """Give a message to the outputs beside the topics."""
-        if self.outputs and self.guard is not None:
-            self.outputs.write(max(self.guard.journal.stamp, 0), topic, raw)
+        if self.is_recorded and self._loop is not None:
+            stamp = max(self._loop.guard.journal.stamp, 0)
+            self._loop.outputs.write(stamp, topic, raw)
 
     def _on_poll(self) -> bool:
         """Check for missing states."""
@@ -399,7 +386,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         held = self.starting.take_held(guard)
         if held is not None:
             self._on_joint_state(held)
-        self._command(guard.watch())
+        self.command(guard.watch())
         self.report_if_changed(guard)
         is_watched = guard.watchdog.on and guard.commanding
         polled, self._polled = self._polled, guard.journal.messages
@@ -450,7 +437,7 @@ class ControllerNode(LoopNode[ControllerConfig]):
         guard = self.guard
         if guard is not None and guard.reference.start_stamp != self.warned_at:
             self.warned_at = guard.reference.start_stamp
-            if not self._is_simulated():
+            if not is_simulated(self):
                 self.log.warn_of_start(guard)
 
     def _look_for_watchdog(self) -> None:

@@ -67,11 +67,6 @@ class DrivenNode(ControllerNode):
         """Full name of the topic of the joint states."""
         return str(self.resolve_topic_name(topics.JOINT_STATES.relative))
 
-    @property
-    def is_heard(self) -> bool:
-        """Whether somebody takes the torques."""
-        return self._is_observed()
-
     def position(self) -> np.ndarray | None:
         """Return the positions (n,) [rad] of the last joint state; None: there was none."""
         guard = self.guard
@@ -90,24 +85,16 @@ class DrivenNode(ControllerNode):
         acting, self._acting = self._acting, None
         self._loop, self.config, self.guard = controller.loop, controller.config, guard
         self.log.begin()
-        self.end(controller)  # of a run that was lost
-        self.outputs.add(controller.outputs)
+        self.is_recorded = True
         if acting is None:
             self._try_each('activate')
         elif guard is not before:
             guard.starting.take_over_from(acting)
         self._report()
 
-    def end(self, controller: ArmController) -> None:
-        """Give the outputs of a controller no more messages; it still holds the arm."""
-        self.outputs.end(controller.outputs, lambda: None)
-
     def command(self, torque: np.ndarray | None) -> None:
-        """Send torques (n,) [N m] that no joint state has asked for; None: none."""
-        self._command(torque)
-
-    def _command(self, torque: np.ndarray | None) -> None:
-        super()._command(torque)
+        """Send torques (n,) [N m], and say how long they took; None: none."""
+        super().command(torque)
         if torque is not None:
             self._acting = np.array(torque)
             self.took(time.monotonic() - self.heard)

@@ -31,7 +31,9 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
+from std_srvs.srv import Trigger
 
+from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.codecs import UnknownTypeError, typestore
 from blf_dsc_controller.messages.topics import Quality, Topic
 
@@ -145,6 +147,20 @@ def create_steady_timer(
     return node.create_timer(
         period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME)
     )
+
+
+def create_trigger(node: Node, name: str, act: Callable[[], str]) -> None:
+    """Offer a service that calls `act` and answers what it returns; BlfDscError: it has failed."""
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message = act()
+            response.success = True
+        except BlfDscError as error:
+            response.message = str(error)
+        return response
+
+    node.create_service(Trigger, name, answer)
 
 
 class PollingTimer:

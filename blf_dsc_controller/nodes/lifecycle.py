@@ -13,7 +13,6 @@ from typing import Any, Generic, TypeVar
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.publisher import Publisher
-from std_srvs.srv import Trigger
 
 from blf_dsc_controller.compiled.announcement import announced_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
@@ -28,6 +27,7 @@ from blf_dsc_controller.nodes.endpoints import (
     create_publisher,
     create_steady_timer,
     create_subscription,
+    create_trigger,
     subscriptions_of,
 )
 from blf_dsc_controller.supervision.state_watchdog import PERIOD
@@ -65,7 +65,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         super().__init__(name, **options)
         service = self._service_change_state
         service.callback = partial(self._change_state, service.callback)
-        self._steady, self._wall = steady, wall
+        self.steady, self.wall = steady, wall
         self.config: Config = parameters.declare(self, cls)
         self._outputs: dict[Topic, Publisher] = {}
         self._senders: dict[Topic, Callable[[bytes], None]] = {}
@@ -171,7 +171,7 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
         """Start timers and services, and the node itself if `autostart` is set."""
         PollingTimer(self, PERIOD, self._on_poll)
         create_steady_timer(self, _DIAGNOSTICS_PERIOD, self.on_second)
-        self.create_service(Trigger, '~/reset', self._on_reset)
+        create_trigger(self, '~/reset', self._on_reset)
         if self.config.autostart:
             self.autostart()
 
@@ -216,19 +216,18 @@ class LoopNode(LifecycleNode, process.PlainNode, Generic[Config]):
                 )
         self._report()
 
-    def _on_reset(
-        self, _request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        response.success = self.state_label == 'active'
-        inactive = f'{self.get_name()} is {self.state_label}: activate it first'
-        response.message = self.reset() if response.success else inactive
-        return response
+    def _on_reset(self) -> str:
+        if self.state_label != 'active':
+            raise BlfDscError(
+                f'{self.get_name()} is {self.state_label}: activate it first'
+            )
+        return self.reset()
 
     def _publish(self, message: Message) -> None:
         topic, raw = message
         self._senders[topic](raw)
 
-    def _is_observed(self) -> bool:
+    def is_observed(self) -> bool:
         """Whether each output has its recorders, and the first one the other node."""
         wanted = self.config.wait_for_subscribers
         publishers = [*self._outputs.values()]

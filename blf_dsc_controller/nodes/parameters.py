@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import sys
+from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -35,7 +37,6 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.nodes.late_answers import LateAnswers
 from blf_dsc_controller.nodes.ros_arguments import assigned, check_sections
 
 Config = TypeVar('Config')
@@ -80,43 +81,6 @@ def declare(node: Node, cls: type[Config]) -> Config:
     return config
 
 
-def read(node: Node, cls: type[Config]) -> Config:
-    """Return the current configuration of a node that has declared it."""
-    names = [parameter.name for parameter in parameters(cls)]
-    given = {name: node.get_parameter(name).value for name in names}
-    return build(cls, given, node.get_fully_qualified_name())
-
-
-def on_change(
-    node: Node,
-    cls: type[Config],
-    apply: Callable[[Config], None],
-    problems: Callable[[Config], list[str]] | None = None,
-    check: Callable[[Config, Config], list[str]] | None = None,
-) -> LateAnswers:
-    """Accept parameter changes while the node runs: all changes of a request or none.
-
-    Call it after `declare`. A request is validated as the complete resulting
-    configuration, and rejected with the reasons if that is invalid, or if `problems`
-    finds that the node cannot accept it now. `apply` receives the new configuration
-    once it is in effect, and must not fail.
-
-    `check`, for what takes long, returns reasons against a change from one
-    configuration to another. With it the node's services build and check a change in a
-    thread: poll what is returned.
-    """
-    names = {parameter.name for parameter in parameters(cls)}
-    changes = _Changes(read(node, cls), names, apply, problems, check)
-    node.add_on_set_parameters_callback(changes.validate)
-    node.add_post_set_parameters_callback(changes.put_in_force)
-    answers = LateAnswers()
-    if check is not None:
-        for service in node.services:
-            if service.srv_type in {SetParameters, SetParametersAtomically}:
-                answers.delay(service, changes.prepare_request)
-    return answers
-
-
 class _Change(NamedTuple, Generic[Config]):
     """A change of the configuration, and what the check found."""
 
@@ -126,29 +90,79 @@ class _Change(NamedTuple, Generic[Config]):
     problems: list[str]
 
 
-class _Changes(Generic[Config]):
-    """The configuration in force, the one that was accepted last, and prepared changes.
+class Changes(Generic[Config]):
+    """Accepts parameter changes while a node runs: all changes of a request or none.
 
-    Parameters of other `names` are not its own.
+    A request is validated as the complete resulting configuration, and rejected with the reasons
+    if that is invalid, or the node cannot accept it now.
+
+    rclpy's EventsExecutor sends at once what a callback returns, and awaits nothing.  What takes
+    long, to build and to check a change, is therefore done in a thread: what the callback returns
+    is not sent, but kept with the header of the request.  Once the thread is done, `poll` calls
+    the original callback, which finds the change prepared, and sends the answer.
     """
 
     def __init__(
         self,
+        node: Node,
         config: Config,
-        names: set[str],
         apply: Callable[[Config], None],
-        problems: Callable[[Config], list[str]] | None,
-        check: Callable[[Config, Config], list[str]] | None,
+        problems: Callable[[Config], list[str]] | None = None,
+        check: Callable[[Config, Config], list[str]] | None = None,
     ) -> None:
+        """Accept changes of the configuration that the node has declared.
+
+        Args:
+            node: that of the parameters.
+            config: the present one.
+            apply: receives the new configuration once it is in effect, and must not fail.
+            problems: why the node cannot accept a configuration now.
+            check: for what takes long, returns reasons against a change from one configuration
+                to another.  With it the node's services work in the thread: call `poll`.
+        """
         self._config = config
         self._accepted = config
-        self._names = names
+        self._names = {parameter.name for parameter in parameters(type(config))}
         self._apply = apply
         self._problems = problems
         self._check = check
         self._prepared: tuple[_Change[Config], ...] = ()
+        self._thread = ThreadPoolExecutor(1, 'preparation')
+        # what a request waits for, and how to answer it
+        self._waiting: deque[tuple[Future[None], Callable[[], None]]] = deque()
+        node.add_on_set_parameters_callback(self._validate)
+        node.add_post_set_parameters_callback(self._put_in_force)
+        for service in node.services if check is not None else ():
+            if service.srv_type in {SetParameters, SetParametersAtomically}:
+                self._delay(service)
 
-    def validate(self, requested: list[RosParameter]) -> SetParametersResult:
+    def poll(self) -> None:
+        """Answer the requests that are prepared, in the order of their arrival."""
+        while self._waiting and self._waiting[0][0].done():
+            self._waiting.popleft()[1]()
+
+    def _delay(self, service: Any) -> None:
+        """Prepare the requests of a service in the thread, then answer.
+
+        What that raises is left to the original callback, which finds the same problem.
+        """
+        answer, send = service.callback, service.send_response
+
+        def accept(request: Any, response: Any) -> Any:
+            return (
+                self._thread.submit(self._prepare_request, request),
+                request,
+                response,
+            )
+
+        def keep(later: Any, header: Any) -> None:
+            prepared, *of_callback = later
+            self._waiting.append((prepared, lambda: send(answer(*of_callback), header)))
+
+        service.callback = accept
+        service.send_response = keep
+
+    def _validate(self, requested: list[RosParameter]) -> SetParametersResult:
         """Accept the complete configuration that results, or say why not."""
         values = self._own(requested)
         if not values:
@@ -156,22 +170,20 @@ class _Changes(Generic[Config]):
         try:
             found = self._find(values)
         except ConfigurationError as error:
-            return SetParametersResult(
-                successful=False, reason='\n'.join(error.problems)
-            )
-        reasons = [*found.problems]
-        if self._problems is not None:
-            reasons += self._problems(found.after)
-        self._accepted = found.after
+            reasons = error.problems
+        else:
+            self._accepted = found.after
+            now = self._problems(found.after) if self._problems else []
+            reasons = [*found.problems, *now]
         return SetParametersResult(successful=not reasons, reason='\n'.join(reasons))
 
-    def put_in_force(self, changed: list[RosParameter]) -> None:
+    def _put_in_force(self, changed: list[RosParameter]) -> None:
         """Apply the configuration that was accepted last."""
         if self._own(changed):
             self._config = self._accepted
             self._apply(self._config)
 
-    def prepare_request(self, request: Any) -> None:
+    def _prepare_request(self, request: Any) -> None:
         """Build and check what a request changes, as if all of it were accepted."""
         is_atomic = isinstance(request, SetParametersAtomically.Request)
         given = [RosParameter.from_parameter_msg(each) for each in request.parameters]

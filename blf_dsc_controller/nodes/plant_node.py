@@ -31,20 +31,14 @@ from std_srvs.srv import Trigger
 from blf_dsc_controller.configuration.nodes import CONTROLLER, PLANT
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import Value, differences, flatten
+from blf_dsc_controller.control.status_report import ERROR, OK, STALE, WARN, Part
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import Float64MultiArrayDecoder
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import Change
-from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
+from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
 from blf_dsc_controller.nodes import parameters, process
-from blf_dsc_controller.nodes.diagnostics import (
-    ERROR,
-    OK,
-    STALE,
-    WARN,
-    DiagnosticsPublisher,
-    Part,
-)
+from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher, create_steady_timer
 from blf_dsc_controller.nodes.lifecycle import LoopNode
 from blf_dsc_controller.run import FIRST_STAMP
@@ -80,7 +74,7 @@ class PlantNode(LoopNode[PlantConfig]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(PLANT, PlantConfig, **options)
-        parameters.on_change(self, PlantConfig, self._reconfigure)
+        parameters.Changes(self, self.config, self._reconfigure)
         self.latency = Latency()
         joints = self.config.joints
         self._steps = steps_of(self.config)
@@ -104,7 +98,7 @@ class PlantNode(LoopNode[PlantConfig]):
         self.start()
 
     def _now(self) -> float:
-        return self._steady() * 1e-9
+        return self.steady() * 1e-9
 
     # Life cycle.
 
@@ -189,7 +183,7 @@ class PlantNode(LoopNode[PlantConfig]):
         while self._now() < settled:
             settled = (
                 min(settled, self._now() + _SETTLING_TIME)
-                if self._is_observed()
+                if self.is_observed()
                 else inf
             )
             yield True
@@ -213,7 +207,7 @@ class PlantNode(LoopNode[PlantConfig]):
     def _offer(self) -> None:
         """Publish the first state, after incomplete ones; if a torque waits, go on at once."""
         if not self._lockstep:
-            self.start_stamp = self._wall() - self.plant.elapsed_ns
+            self.start_stamp = self.wall() - self.plant.elapsed_ns
         self.is_offered = True
         measurement = self.plant.measure().copy()
         measurement[len(self.config.joints) :] = nan
@@ -339,11 +333,14 @@ class PlantNode(LoopNode[PlantConfig]):
         self.has_torque = False
         self._published = self._now()
         self.latency.state_published(self._published)
-        if (motors := self.plant.motor_reading) is not None:
-            self._publish(self._telemetry.motor_states(stamp, motors))
-        self._publish(self._telemetry.joint_states(stamp, measurement))
-        if self.plant.sample % DECIMATION == 0:
-            self._publish(self._telemetry.truth(stamp, self.plant.truth()))
+        for message in self._telemetry.states(
+            self.plant.sample,
+            stamp,
+            measurement,
+            self.plant.motor_reading,
+            self.plant.truth,
+        ):
+            self._publish(message)
         if self.config.publish_clock:
             self._publish(self._telemetry.clock(stamp))
 

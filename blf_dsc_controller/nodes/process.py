@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -34,6 +35,13 @@ _signals: list[int] = []  # received; only recorded, so that no callback is inte
 def interrupted() -> bool:
     """Whether the process of `run` has received SIGINT or SIGTERM."""
     return bool(_signals)
+
+
+def yield_to_loop() -> None:
+    """Run beside a loop, also after its signals, since it may still brake; without its priority."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 class PlainNode(Node):

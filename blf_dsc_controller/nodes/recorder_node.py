@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import partial
@@ -41,20 +41,17 @@ class RecentMessages:
 
     def __init__(self, depth: int) -> None:
         """Remember at most this number."""
-        self._order: deque[tuple[int, int, bytes]] = deque()
-        self._known: set[tuple[int, int, bytes]] = set()
+        self._known: OrderedDict[tuple[int, int, bytes], None] = OrderedDict()
         self._depth = depth
 
     def add(self, message: RawMessage) -> bool:
         """Remember a message; return whether it was new."""
         key = message.published, message.sequence, message.raw
-        if key in self._known:
-            return False
-        self._known.add(key)
-        self._order.append(key)
-        if len(self._order) > self._depth:
-            self._known.remove(self._order.popleft())
-        return True
+        is_new = key not in self._known
+        self._known[key] = None
+        if len(self._known) > self._depth:
+            self._known.popitem(last=False)
+        return is_new
 
 
 class BagRecorderNode(PlainNode):

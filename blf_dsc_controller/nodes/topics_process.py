@@ -8,34 +8,31 @@ streamed positions and stops. It ends with the connection.
 from __future__ import annotations
 
 import os
-import signal
-import socket
 import sys
 import threading
 from collections.abc import Sequence
-from queue import Empty, SimpleQueue
-from time import monotonic
+from concurrent import futures
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
 from blf_dsc_controller.configuration.nodes import CONTROLLER
+from blf_dsc_controller.control.status_report import Part
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topic_link, topics
-from blf_dsc_controller.messages.link import Link
+from blf_dsc_controller.messages.link import Link, link_of
 from blf_dsc_controller.messages.topic_link import (
     KINDS,
     LOG,
+    OF_LOOP,
     READY,
     STATUS,
     STOP,
-    TOPICS,
 )
 from blf_dsc_controller.nodes import process
-from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher, Part
+from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import create_publisher
 from blf_dsc_controller.nodes.trajectory_input import connect
 
@@ -51,23 +48,17 @@ _SILENT = (
 class LoopTopics:
     """The topics of a loop in another process, by its node."""
 
-    def __init__(
-        self, node: Node, link: Link, kinds: Sequence[int], joints: Sequence[str]
-    ) -> None:
-        """Create the topics of these kinds."""
+    def __init__(self, node: Node, link: Link, joints: Sequence[str]) -> None:
+        """Create the topics."""
         self._node = node
         self._link = link
-        shared = {topics.STATE, topics.DIAGNOSTICS}
         self.publishers = {
-            kind: create_publisher(node, TOPICS[kind])
-            for kind in (*kinds, KINDS[topics.ROBOT_DESCRIPTION])
-            if TOPICS[kind] not in shared
+            KINDS[topic]: create_publisher(node, topic)
+            for topic in (*OF_LOOP, topics.ROBOT_DESCRIPTION)
         }
-        self._state = create_publisher(node, topics.STATE)
-        self._diagnostics = DiagnosticsPublisher(node, joints)
-        self._revision = -1
-        self._answers: SimpleQueue[tuple[int, str]] = SimpleQueue()
+        self._diagnostics = DiagnosticsPublisher(node, joints, topics.STATE)
         self._stops = 0  # asked for
+        self._answers: dict[int, futures.Future[str]] = {}  # to those
         connect(
             node,
             lambda raw: self._pass_on(topics.JOINT_TRAJECTORY, raw),
@@ -75,7 +66,12 @@ class LoopTopics:
             self._stop,
         )
 
-    def take(self, kind: int, content: bytes) -> None:
+    def listen(self) -> None:
+        """Take the loop's messages until it ends."""
+        for message in self._link.all_messages():
+            self._take(*message)
+
+    def _take(self, kind: int, content: bytes) -> None:
         """Do what a message of the loop says."""
         publisher = self.publishers.get(kind)
         if publisher is not None:
@@ -84,7 +80,7 @@ class LoopTopics:
             self._report(topic_link.decode(content))
         elif kind == STOP:
             number, text = topic_link.decode(content)
-            self._answers.put((number, text))
+            self._answers.pop(number).set_result(text)
         elif kind == LOG:
             self._write_log(**topic_link.decode(content))
 
@@ -103,10 +99,7 @@ class LoopTopics:
             Part(name, bytes([level]), message, values)
             for name, level, message, values in status['parts']
         )
-        state: DiagnosticStatus = self._diagnostics.publish(*parts)
-        if status['revision'] != self._revision:
-            self._revision = status['revision']
-            self._state.publish(state)
+        self._diagnostics.publish(*parts, key=status['revision'])
 
     def _pass_on(self, topic: topics.Topic, raw: bytes) -> None:
         self._link.put(KINDS[topic], bytes(raw))
@@ -118,40 +111,27 @@ class LoopTopics:
         Raises BlfDscError if it says nothing; a stop is never taken back.
         """
         self._stops += 1
+        self._answers[self._stops] = answer = futures.Future[str]()
         self._link.put(STOP, topic_link.encode(self._stops))
         self._link.flush()
-        end = monotonic() + _PATIENCE
-        number = 0
-        while number != self._stops:  # an answer to an earlier stop comes too late
-            try:
-                number, text = self._answers.get(timeout=max(0.0, end - monotonic()))
-            except Empty:
-                raise BlfDscError(_SILENT) from None
-        return text
-
-
-def _listen(link: Link, loop: LoopTopics) -> None:
-    """Take the loop's messages until it ends."""
-    while not link.broken:
-        link.wait(_POLL)
-        for kind, content in link.messages():
-            loop.take(kind, content)
+        try:
+            return answer.result(_PATIENCE)
+        except futures.TimeoutError:  # its own in Python 3.10
+            raise BlfDscError(_SILENT) from None
 
 
 def main() -> int:
     """Run until the loop ends."""
-    descriptor, namespace, kinds, *joints = sys.argv[1:]
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop may still brake
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    argument, namespace, *joints = sys.argv[1:]
+    process.yield_to_loop()
     os.nice(_NICE)
-    link = Link(socket.socket(fileno=int(descriptor)))
+    link = link_of(argument)
     rclpy.init(args=[], signal_handler_options=rclpy.SignalHandlerOptions.NO)
     node = Node(CONTROLLER, namespace=namespace, start_parameter_services=False)
-    loop = LoopTopics(node, link, [int(kind) for kind in kinds.split(',')], joints)
+    loop = LoopTopics(node, link, joints)
     with EventsExecutor() as executor:
         executor.add_node(node)
-        listener = threading.Thread(target=_listen, args=(link, loop), daemon=True)
+        listener = threading.Thread(target=loop.listen, daemon=True)
         listener.start()
         link.put(READY, b'null')
         while listener.is_alive():

@@ -8,13 +8,11 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from blf_dsc_controller.control.motion_input import MotionInput
-from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.topics import JOINT_POSITIONS, JOINT_TRAJECTORY
-from blf_dsc_controller.nodes.endpoints import qos_profile
+from blf_dsc_controller.nodes.endpoints import create_trigger, qos_profile
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.state_watchdog import SAME_CLOCK
@@ -39,22 +37,13 @@ def connect(
 
     That fails if `take_stop` raises BlfDscError.
     """
-
-    def stop(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.message = take_stop()
-            response.success = True
-        except BlfDscError as error:
-            response.message = str(error)
-        return response
-
     for topic, type_, callback in (
         (JOINT_TRAJECTORY, JointTrajectory, take_trajectory),
         (JOINT_POSITIONS, Float64MultiArray, take_positions),
     ):
         quality = qos_profile(topic.requested)
         node.create_subscription(type_, topic.name, callback, quality, raw=True)
-    node.create_service(Trigger, '~/stop', stop)
+    create_trigger(node, '~/stop', take_stop)
 
 
 def _is_live(guard: Guard) -> bool:

@@ -27,6 +27,7 @@ from blf_dsc_controller.configuration.nodes import CONTROLLER, WATCHDOG, load
 from blf_dsc_controller.configuration.received import without_files
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.configuration.side_nodes import WatchdogConfig
+from blf_dsc_controller.control.status_report import ERROR, OK, WARN, Part
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import (
@@ -37,18 +38,11 @@ from blf_dsc_controller.messages.codecs import (
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import decode
 from blf_dsc_controller.messages.topics import READY, Quality
-from blf_dsc_controller.nodes.diagnostics import (
-    ERROR,
-    OK,
-    WARN,
-    DiagnosticsPublisher,
-    Part,
-)
+from blf_dsc_controller.nodes.diagnostics import DiagnosticsPublisher
 from blf_dsc_controller.nodes.endpoints import (
     PollingTimer,
     RawMessage,
     RawSubscriptions,
-    create_publisher,
     create_steady_timer,
     is_listener,
     message_class,
@@ -94,7 +88,6 @@ class WatchdogNode(PlainNode):
         self.problem = ''
         self._journal = WatchedJournal()
         self._given = self._journal.parameters  # those that are watched by
-        self._reported: Status | None = None
         self._states: JointStateDecoder
         self._commands: Float64MultiArrayDecoder
         self._encoder: Float64MultiArrayEncoder
@@ -107,8 +100,7 @@ class WatchdogNode(PlainNode):
         self._output = self.create_publisher(
             message_class(topic.type), topic.relative, offered
         )
-        self._diagnostics = DiagnosticsPublisher(self, ())
-        self._latched = create_publisher(self, topics.WATCHDOG_STATE)
+        self._diagnostics = DiagnosticsPublisher(self, (), topics.WATCHDOG_STATE)
         self._controller = f'{self.get_namespace().rstrip("/")}/{CONTROLLER}'
         self._timer = PollingTimer(self, _PERIOD, self._poll)
         create_steady_timer(self, _LOOK_PERIOD, self._look)
@@ -315,7 +307,7 @@ class WatchdogNode(PlainNode):
     def _look(self) -> None:
         """Report what this node can do if that has changed."""
         status = self.status()
-        if status == self._reported:
+        if status == self._diagnostics.key:
             return
         if status.level == OK:
             self.get_logger().info(status.text)
@@ -326,10 +318,7 @@ class WatchdogNode(PlainNode):
         takeovers = 0 if self.watchdog is None else self.watchdog.takeovers
         values = {'takeovers': takeovers, READY: status.is_ready}
         part = Part('torque', status.level, status.text, values)
-        message = self._diagnostics.publish(part)
-        if status != self._reported:
-            self._latched.publish(message)
-            self._reported = status
+        self._diagnostics.publish(part, key=status)
 
 
 main = partial(run, WatchdogNode)

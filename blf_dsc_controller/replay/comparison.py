@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.codecs import JOINT_STATE_FIELDS
-from blf_dsc_controller.replay.rerun import Rerun
+from blf_dsc_controller.replay.rerun import Difference, Rerun
 from blf_dsc_controller.run import Floats, Stamps
 
 _BLOCK = 4096  # messages compared at once
@@ -27,23 +26,6 @@ _COMPARED = {  # topic: fields
     topics.EXTERNAL_TORQUE: (2,),
 }
 _BY_STAMP = (topics.REFERENCE, topics.MONITOR, topics.EXTERNAL_TORQUE)
-
-
-class Difference(NamedTuple):
-    """The first number of a topic, or part of an event, that differs."""
-
-    topic: str
-    field: str
-    stamp: int  # ns
-    time: float  # s since the first state
-    recorded: float | str
-    replayed: float | str
-
-    def __str__(self) -> str:
-        return (
-            f'{self.time:.6f} s (stamp {self.stamp} ns), {self.topic}, {self.field}: '
-            f'recorded {self.recorded!r}, replayed {self.replayed!r}'
-        )
 
 
 @dataclass

@@ -24,7 +24,7 @@ from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages.errors import MessageError
 from blf_dsc_controller.messages.journal import MOTIONS, Event, EventType
-from blf_dsc_controller.messages.topics import TRACKING_ERROR, Message, Topic
+from blf_dsc_controller.messages.topics import JOURNAL, TRACKING_ERROR, Message, Topic
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.replay.guard_calls import GUARD_CALLS
 from blf_dsc_controller.run import Floats
@@ -46,13 +46,21 @@ _AXES = 3
 _MOST_TORQUES = 1_000_000  # of the watchdog: an hour without joint states
 
 
-class Alteration(NamedTuple):
-    """What a recorded event says otherwise than the replayed one."""
+class Difference(NamedTuple):
+    """The first number of a topic, or part of an event, that differs."""
 
-    event: Event
-    name: str  # of a part of its content
-    recorded: str
-    replayed: str
+    topic: str
+    field: str
+    stamp: int  # ns
+    time: float  # s since the first state
+    recorded: float | str
+    replayed: float | str
+
+    def __str__(self) -> str:
+        return (
+            f'{self.time:.6f} s (stamp {self.stamp} ns), {self.topic}, {self.field}: '
+            f'recorded {self.recorded!r}, replayed {self.replayed!r}'
+        )
 
 
 class Rerun:
@@ -66,8 +74,8 @@ class Rerun:
         first, last: stamps [ns] of its first and last sample; -1 before the first.
         answers: number of answers reached.
         skipped: number of joint states that the controller did not answer.
-        departure: how, and at which stamp [ns], the controller differed first from the recorded
-            one in what it started, stopped or accepted; this ends the replay.
+        departure: how the controller differed first from the recorded one in what it started,
+            stopped or accepted; this ends the replay.
         alteration: the first event that happened alike, but says something else; or None.
         end: any other reason why the replay ended before the bag, or empty.
     """
@@ -94,13 +102,12 @@ class Rerun:
         self.answers = 0
         self.first = -1
         self.last = -1
-        self.departure: tuple[str, int] | None = None
-        self.alteration: Alteration | None = None
+        self.departure: Difference | None = None
+        self.alteration: Difference | None = None
         self.end = ''
         self._loop = GuardedLoop(config, lambda: 0, lambda: 0)
         self._guard = self._loop.guard
         self._guard.journal.pending.clear()
-        self._telemetry = self._loop.telemetry
         self._states = states
         self._values = np.empty((0, 3, 0))
         self._loaded = range(0)
@@ -111,7 +118,6 @@ class Rerun:
         self._stamp = np.append(states.stamp, np.full(len(errors), -1))[self._row]
         self._unreadable = dict(enumerate(errors.values(), states.size))
         self._answered = answers.stamp
-        self._states_stamp = states.stamp
         self._commands = commands
         self._numbered = bool(answers.sequence.any())
         self._gap = _first_gap(answers)
@@ -166,7 +172,8 @@ class Rerun:
             return 0
         if not starts or size >= _commanded_by_states(events, self._commands):
             return size + 1
-        used = self._states_stamp[self._states_stamp >= starts[0]]
+        used = self._states.stamp
+        used = used[used >= starts[0]]
         unanswered = used[~np.isin(used, self._answered)]
         if not unanswered.size:
             return size + 1
@@ -275,7 +282,7 @@ class Rerun:
     def _command(self, stamp: int, torque: Floats | None) -> None:
         """Add a torque (n,) [N m], if any, commanded after this state's stamp [ns]."""
         if torque is not None:
-            self._add(stamp, self._telemetry.command(torque))
+            self._add(stamp, self._loop.telemetry.command(torque))
 
     def _add(self, stamp: int, message: Message) -> None:
         topic, raw = message
@@ -359,7 +366,8 @@ class Rerun:
         for name in filter(own.content.__contains__, event.content):
             texts = [json.dumps(each.content[name]) for each in (event, own)]
             if texts[0] != texts[1]:
-                self.alteration = Alteration(event, name, *texts)
+                field = f'{name} of event {event.number} ({event.type})'
+                self.alteration = self._difference(JOURNAL, field, event.stamp, *texts)
                 return
 
     def _report_departure(self, own: Event, event: Event | None) -> None:
@@ -374,7 +382,20 @@ class Rerun:
         self._depart(f'{what} ({text})', own.stamp)
 
     def _depart(self, what: str, stamp: int) -> None:
-        self.departure = self.departure or (what, stamp)
+        self.departure = self.departure or self._difference(
+            TRACKING_ERROR, what, stamp, 1.0, 0.0
+        )
+
+    def _difference(
+        self,
+        topic: Topic,
+        field: str,
+        stamp: int,
+        recorded: float | str,
+        replayed: float | str,
+    ) -> Difference:
+        time = (stamp - max(self.first, 0)) * 1e-9
+        return Difference(topic.resolved, field, stamp, time, recorded, replayed)
 
 
 def _first_gap(answers: JointStates) -> int:

@@ -24,8 +24,8 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.event_content import FORMAT
 from blf_dsc_controller.messages.journal import Event, EventType
-from blf_dsc_controller.replay.comparison import Comparison, Difference, compared
-from blf_dsc_controller.replay.rerun import Alteration, Rerun
+from blf_dsc_controller.replay.comparison import Comparison, compared
+from blf_dsc_controller.replay.rerun import Difference, Rerun
 
 _OTHERS = (topics.STATE, topics.DIAGNOSTICS, topics.EXTERNAL_WRENCH)
 _TRANSITIONS = (
@@ -105,14 +105,16 @@ def verify(
     if run.departure is None and not any(found.values for found in comparisons):
         raise _nothing_to_compare(content)
     end = run.end or other
-    newer = _newer_parameters(content, config)
+    newer = sorted(flatten(config).keys() - content.configurations[CONTROLLER].keys())
     changed_law = _changed_law(config, events[0])
     return Verification(
         samples=run.samples,
         duration=(run.last - run.first) * 1e-9,
         skipped=run.skipped,
         comparisons=comparisons,
-        not_compared=_names_of_others(content),
+        not_compared=tuple(
+            content.topics[topic].name for topic in _OTHERS if topic in content.topics
+        ),
         events=tuple(run.events),
         motions=run.motions,
         remarks=tuple(_remarks(content, end, newer, changed_law)),
@@ -147,28 +149,15 @@ def _rerun(
     return run, answers
 
 
-def _newer_parameters(content: Content, config: ControllerConfig) -> list[str]:
-    """Return the parameters that the recorded configuration does not have, by name."""
-    recorded = content.configurations[CONTROLLER]
-    return sorted(flatten(config).keys() - recorded.keys())
-
-
-def _names_of_others(content: Content) -> tuple[str, ...]:
-    """Return the names of the topics in the bag that are not compared."""
-    return tuple(
-        content.topics[topic].name for topic in _OTHERS if topic in content.topics
-    )
-
-
 def _first_difference(
     content: Content, run: Rerun, comparisons: Sequence[Comparison]
 ) -> Difference | None:
     """Return the earliest difference; of those with the same stamp, the departure."""
     differences = [found.difference for found in comparisons if found.difference]
     if run.departure is not None:
-        differences.insert(0, _departed(run, *run.departure))
+        differences.insert(0, run.departure)
     if run.alteration is not None and content.version == __version__:
-        differences.append(_altered(content, run, run.alteration))
+        differences.append(run.alteration)
     return min(differences, key=lambda found: found.stamp, default=None)
 
 
@@ -193,21 +182,6 @@ def _check_first_state(
             f'{path} does not hold the first state that the controller used, with the stamp '
             f'{starts[0]} ns, so its outputs cannot be reproduced: start the recorder first'
         )
-
-
-def _departed(run: Rerun, what: str, stamp: int) -> Difference:
-    """Return the departure of a replay as a difference."""
-    time = (stamp - max(run.first, 0)) * 1e-9
-    return Difference(topics.TRACKING_ERROR.resolved, what, stamp, time, 1.0, 0.0)
-
-
-def _altered(content: Content, run: Rerun, found: Alteration) -> Difference:
-    """Return an event that says something else as a difference."""
-    event = found.event
-    time = (event.stamp - max(run.first, 0)) * 1e-9
-    what = f'{found.name} of event {event.number} ({event.type})'
-    journal = content.topics[topics.JOURNAL].name
-    return Difference(journal, what, event.stamp, time, found.recorded, found.replayed)
 
 
 def _events(content: Content) -> tuple[list[Event], int, str]:
@@ -295,7 +269,7 @@ def _incomplete(
     events: Sequence[Event],
     comparisons: Sequence[Comparison],
     end: str,
-    alteration: Alteration | None,
+    alteration: Difference | None,
 ) -> Iterator[str]:
     """Yield what is missing in the recording: messages, its end, texts of this version."""
     for found in comparisons:
@@ -304,10 +278,7 @@ def _incomplete(
     if end:
         yield f'what follows: {end}'
     if alteration is not None and content.version != __version__:
-        yield (
-            f'{alteration.name} of event {alteration.event.number} '
-            f'({alteration.event.type}) as this version words it'
-        )
+        yield f'{alteration.field} as this version words it'
     if not end and events[-1].type is not EventType.RELEASE:
         yield (
             f'the end of the run: {content.topics[topics.JOURNAL].name} has no release, so the '

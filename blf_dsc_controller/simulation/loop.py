@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 
@@ -23,26 +24,38 @@ from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import errors_told_with_line
 from blf_dsc_controller.configuration.plant import PlantConfig
 from blf_dsc_controller.configuration.schema import flatten
+from blf_dsc_controller.configuration.tool_bound import tool_of
 from blf_dsc_controller.control.telemetry import ControllerTelemetry
 from blf_dsc_controller.errors import BlfDscError, StartError, check_type
 from blf_dsc_controller.factory.controller import begin, controller_of
-from blf_dsc_controller.factory.estimate import estimate_names
+from blf_dsc_controller.factory.estimate import estimate_names, learned_arm
 from blf_dsc_controller.law.controller import Controller
 from blf_dsc_controller.law.samples import sample_columns
 from blf_dsc_controller.law.state import Sample, sample_of
 from blf_dsc_controller.messages import topics
 from blf_dsc_controller.messages.journal import (
     Change,
+    Event,
     EventType,
     Journal,
-    contact_in,
-    oscillation_in,
+    found_in,
+    stops_in,
 )
-from blf_dsc_controller.messages.named_values import disturbance_names
-from blf_dsc_controller.messages.plant_telemetry import DECIMATION, PlantTelemetry
+from blf_dsc_controller.messages.named_values import (
+    disturbance_names,
+    external_names,
+    monitored,
+)
+from blf_dsc_controller.messages.plant_telemetry import PlantTelemetry
 from blf_dsc_controller.messages.topics import Message
-from blf_dsc_controller.run import FIRST_STAMP, Run, Series, Stop
-from blf_dsc_controller.simulation.sampled_run import run_of
+from blf_dsc_controller.run import (
+    FIRST_STAMP,
+    Contact,
+    Floats,
+    Oscillation,
+    Run,
+    Series,
+)
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.warnings.table import refuse
 from sim_plant.plant import plant_of
@@ -116,73 +129,70 @@ def run_alone(record: Record, plant: Plant, *, perceives: bool = True) -> None:
     q, dq, _ = plant.measure().reshape(3, -1)
     begin(controller, record.config, q, dq)
     dt = plant.period_ns * 1e-9
-    last = record.stamps.size - 1
+
+    def answer(row: int, measurement: Floats) -> Floats:
+        torque = controller.update(int(record.stamps[row]) * 1e-9, dt, measurement)
+        if perceives:
+            controller.perceive(dt)
+        record.samples[row] = controller.sample_vector
+        return torque
+
     with errors_told_with_line(record.config.law):
-        for row, stamp in enumerate(record.stamps.tolist()):
-            measurement = plant.measure()
-            record.measurements[row] = measurement
-            record.truths[row] = plant.truth()
-            torque = controller.update(stamp * 1e-9, dt, measurement)
-            if perceives:
-                controller.perceive(dt)
-            record.samples[row] = controller.sample_vector
-            if row < last:
-                plant.step(torque)
+        _fill(record, plant, answer)
+
+
+def _fill(
+    record: Record, plant: Plant, answer: Callable[[int, Floats], Floats | None]
+) -> None:
+    """Fill the rows of a record; `answer` gives a torque (n,) [N m] for each row's measurement.
+
+    Without one the run ends.
+    """
+    for row in range(record.stamps.size):
+        measurement = plant.measure()
+        record.measurements[row] = measurement
+        record.truths[row] = plant.truth()
+        if record.motors.size:
+            record.motors[row] = plant.motor_reading
+        torque = answer(row, measurement)
+        if torque is None:
+            return
+        plant.step(torque)
 
 
 def _run_supervised(
     guard: Guard, plant: Plant, rows_of: Callable[[range], Record], size: int
 ) -> Iterator[Record]:
     """Run `size` samples in chunks; fill and yield the rows of each, which come from `rows_of`."""
-    bound = np.zeros(len(guard.config.joints))
     for first in (0, *range(1, size, _CHUNK)):
         chunk = range(first, min(first + _CHUNK, size) if first else 1)
         record = rows_of(chunk)
-        is_end = chunk.stop == size
         with errors_told_with_line(guard.config.law):
-            _run_guarded(guard, plant, record, bound, is_end=is_end)
+            _fill(record, plant, partial(_answer, guard, record))
         if guard.starting.error is not None:
             raise guard.starting.error
         if guard.supervisor.stops and not guard.commanding:  # nothing would ever move
             raise StartError(guard.supervisor.text)
-        if is_end:
-            _release(guard, record)
-        bound[:] = record.sample(-1).bound
+        if chunk.stop == size and (torque := guard.release()) is not None:
+            record.left[:] = torque  # as a node leaves an arm
         yield record
 
 
-def _release(guard: Guard, record: Record) -> None:
-    """End the run as a node does: with the torque of an arm at rest, and an event."""
-    torque = guard.release()
-    if torque is not None:
-        record.left[:] = torque
-
-
-def _run_guarded(
-    guard: Guard, plant: Plant, record: Record, bound: np.ndarray, *, is_end: bool
-) -> None:
-    """Run the samples of a chunk as the nodes do; `bound` (n,) is that of the sample before."""
-    settings = guard.controller.settings
-    size = record.stamps.size
-    for row in range(size):
-        measurement = plant.measure()
-        record.measurements[row] = measurement
-        record.truths[row] = plant.truth()
-        if record.motors.size:
-            record.motors[row] = plant.motor_reading
-        torque = guard.update(FIRST_STAMP + int(record.stamps[row]), measurement)
-        guard.perceive()
-        if torque is None:
-            return
-        if guard.has_sample:
-            record.samples[row] = guard.controller.sample_vector
-        else:
-            record.samples[row] = np.nan
-            sample = sample_of(record.samples[row], settings)
-            sample.torque[:] = torque
-            sample.bound[:] = record.sample(row - 1).bound if row else bound
-        if not (is_end and row + 1 == size):
-            plant.step(torque)
+def _answer(
+    guard: Guard, record: Record, row: int, measurement: Floats
+) -> Floats | None:
+    """Answer a measurement as the nodes do, and keep the sample in a row."""
+    torque = guard.update(FIRST_STAMP + int(record.stamps[row]), measurement)
+    guard.perceive()
+    if torque is None:
+        return None
+    record.samples[row] = guard.controller.sample_vector
+    if not guard.has_sample:
+        bound = np.array(record.sample(row).bound)
+        record.samples[row] = np.nan
+        record.sample(row).bound[:] = bound
+        record.sample(row).torque[:] = torque
+    return torque
 
 
 @dataclass(frozen=True)
@@ -205,9 +215,8 @@ class Record:
     @property
     def stopped(self) -> float:
         """When the law was stopped first [s], since the start; infinity: not yet."""
-        stops = (e.stamp for e in self.journal.pending if e.type is EventType.STOP)
-        first = next(stops, None)
-        return math.inf if first is None else 1e-9 * (first - FIRST_STAMP)
+        stop = next(stops_in(self._events(), 0), None)
+        return math.inf if stop is None else 1e-9 * stop.stamp
 
     def rows(self, chosen: range) -> Record:
         """Return some rows, as views."""
@@ -233,36 +242,55 @@ class Record:
         return np.asarray(self.truths[:, p + n : p + 2 * n] - qr)
 
     def run(self) -> Run:
-        """Return all samples as a `Run`, with the truth and the terms of (29) that the law has."""
-        config = self.config
-        run = run_of(
-            config, self.controller, self.stamps, self.measurements, self.samples
-        )
-        contacts = tuple(
-            contact_in(event)._replace(stamp=event.stamp - FIRST_STAMP)
-            for event in self.journal.pending
-            if event.type is EventType.CONTACT
-        )
+        """Return all samples as a `Run`, with the truth and the terms of (29) that the law has.
+
+        Rows of states that the law did not use are NaN except for bound and torque.
+        """
+        config, events = self.config, self._events()
+        samples = sample_columns(self.samples, self.controller.settings)
+        used = ~np.isnan(samples.qr[:, 0])
+        stamps = self.stamps[used]
+        position, velocity, effort = np.split(self.measurements, 3, axis=1)
+        tool = tool_of(config)
+        external, contacts = None, None
+        if config.contact.enabled:
+            torques = samples.external[used], samples.external_interval[used]
+            names = external_names(config.joints)
+            external = Series(names, stamps, np.hstack(torques))
+            contacts = found_in(events, EventType.CONTACT, Contact)
+        parts = monitored(config, estimate_names(config))
+        monitor = np.hstack([getattr(samples, part)[used] for part in parts])
         true = (*self.parameters, *disturbance_names(config.joints))
-        return replace(
-            run,
+        return Run(
+            joints=config.joints,
+            stamp=self.stamps,
+            received=self.stamps,
+            position=position,
+            velocity=velocity,
+            torque=samples.torque,
+            reference=samples.qr,
+            error=samples.xi1,
+            bound=samples.bound,
+            torque_limit=np.broadcast_to(config.torque.limit, position.shape),
+            monitor=Series(tuple(chain.from_iterable(parts.values())), stamps, monitor),
+            external=external,
+            arm=learned_arm(config),
+            tool=tool.errors if tool else None,
+            learns=config.traits.learns and config.learning.enabled,
+            effort=effort,
+            sliding=config.robot.sliding(config.joints),
+            xi2=samples.xi2,
+            parameters=flatten(config),
             truth=Series(true, self.stamps, self.truths[:, : len(true)]),
-            contacts=contacts if config.contact.enabled else None,
-            oscillations=tuple(
-                oscillation_in(event)._replace(stamp=event.stamp - FIRST_STAMP)
-                for event in self.journal.pending
-                if event.type is EventType.OSCILLATION
-            ),
-            stops=tuple(
-                Stop(
-                    event.stamp - FIRST_STAMP,
-                    f'{event.content["reason"]}',
-                    event.content['text'],
-                )
-                for event in self.journal.pending
-                if event.type is EventType.STOP
-            ),
+            contacts=contacts,
+            oscillations=found_in(events, EventType.OSCILLATION, Oscillation),
+            stops=tuple(stops_in(events, 0)),
         )
+
+    def _events(self) -> list[Event]:
+        """Return the events, with their stamps since the start [ns]."""
+        pending = self.journal.pending
+        return [each._replace(stamp=each.stamp - FIRST_STAMP) for each in pending]
 
 
 def new_record(
@@ -293,17 +321,24 @@ def new_record(
 
 def write_bag(
     path: Path,
-    record: Record,
+    record: Record | Iterable[Record],
     plant: PlantConfig | None = None,
     *,
     compression: str = 'none',
 ) -> None:
     """Write the messages that the nodes would have published in a run as a bag.
 
-    It has the configuration of the controller and, if given, of the plant;
-    `compression` is `none` or `zstd`. Raises BagError if `path` exists already.
+    Its record may come in parts.  The bag has the configuration of the controller and, if
+    given, of the plant; `compression` is `none` or `zstd`. Raises BagError if `path` exists.
     """
-    _write_bag(path, [record], plant, compression)
+    bag = BagWriter(path, compression=compression, flush_interval=None)
+    with closing(TopicRecorder(bag)) as recorder:
+        if plant is not None:
+            configured = Change(FIRST_STAMP, flatten(plant), configured=True).encode()
+            recorder.write(FIRST_STAMP, topics.CHANGES, configured)
+        parts = [record] if isinstance(record, Record) else record
+        for stamp, message in _messages(parts):
+            recorder.write(stamp, *message)
 
 
 def simulate_into_bag(
@@ -326,29 +361,7 @@ def simulate_into_bag(
     size = steps_of(plant) + 1
     parts = _run_supervised(guard, plant_of(plant), rows_of, size)
     first = next(parts)  # before there is a bag: it may not start
-    _write_bag(path, chain([first], parts), plant, compression)
-
-
-def _write_bag(
-    path: Path, parts: Iterable[Record], plant: PlantConfig | None, compression: str
-) -> None:
-    """Write the messages of the parts of a record, one after the other."""
-    bag = BagWriter(path, compression=compression, flush_interval=None)
-    with closing(TopicRecorder(bag)) as recorder:
-        if plant is not None:
-            configured = Change(FIRST_STAMP, flatten(plant), configured=True).encode()
-            recorder.write(FIRST_STAMP, topics.CHANGES, configured)
-        for stamp, message in _messages(parts):
-            recorder.write(stamp, *message)
-
-
-def _measured(
-    record: Record, k: int, stamp: int, plant: PlantTelemetry
-) -> Iterator[tuple[int, Message]]:
-    """Yield what the arm measures in row k; its motors are NaN where nothing read them."""
-    if record.motors.size and not np.isnan(record.motors[k, 0, 0]):
-        yield stamp, plant.motor_states(stamp, record.motors[k])
-    yield stamp, plant.joint_states(stamp, record.measurements[k])
+    write_bag(path, chain([first], parts), plant, compression=compression)
 
 
 def _messages(parts: Iterable[Record]) -> Iterator[tuple[int, Message]]:
@@ -369,10 +382,16 @@ def _messages(parts: Iterable[Record]) -> Iterator[tuple[int, Message]]:
             while events and events[0].messages <= row:
                 yield stamp, (topics.JOURNAL, events.popleft().encode())
                 noted += 1
-            yield from _measured(record, k, stamp, plant)
+            motors = record.motors[k] if record.motors.size else None
+            for message in plant.states(
+                row,
+                stamp,
+                record.measurements[k],
+                motors,
+                partial(record.truths.__getitem__, k),
+            ):
+                yield stamp, message
             yield stamp, controller.command(sample.torque)
-            if row % DECIMATION == 0:
-                yield stamp, plant.truth(stamp, record.truths[k])
             row += 1
             if np.isnan(sample.qr[0]):  # stopped
                 yield stamp, controller.answer(stamp, sample.torque)
