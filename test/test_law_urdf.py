@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from nights import at_night
 from paper_case import configured, several
 from random_arm import PANDA_TEXT
 
@@ -153,7 +154,7 @@ def test_bound_holds_from_the_start_with_an_undeclared_rated_load():
     assert not result.stops
 
 
-@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
+@pytest.mark.parametrize('preset', ['panda_rigid', *at_night('ur5e_rigid')])
 def test_drives_much_lighter_than_guessed_oscillate_and_stop_unless_they_are_given(
     preset,
 ):
