@@ -13,11 +13,9 @@ from blf_dsc_controller import (
     ConfigurationError,
     ControllerConfig,
     change,
-    controller_of,
     load_loop,
     simulate,
 )
-from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.estimate import (
     columns_of,
@@ -113,20 +111,6 @@ def test_urdf_may_be_given_as_text_or_file(tmp_path):
 def test_problems_with_an_arm_are_reported(changes, message):
     with pytest.raises(ConfigurationError, match=message):
         build(ControllerConfig, ARM | changes)
-
-
-def test_gravity_is_compensated_with_the_initial_estimate():
-    """At rest on the reference the torque is G of the URDF, whatever the gains."""
-    config = panda(robot__gravity=[0.0, -9.81, 0.0])
-    q = np.array(config.reference.offset)
-    chain = config.robot.chain(config.joints)
-    base = parameters_of(config.robot, chain)
-    H = np.zeros((7, base.model.p))
-    base.model.regressor(q, *np.zeros((3, 7)), H)
-    gravity = H @ base.of(chain.inertias, config.robot.rotors(chain))
-    assert np.abs(gravity).max() > 5.0
-    torque = controller_of(config).update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
-    np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
 
 
 def test_bound_starts_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():

@@ -104,14 +104,6 @@ def test_change_must_not_worsen_an_existing_warning_nor_cause_one(gain, accepted
     )
 
 
-def test_change_must_not_cause_a_warning_that_the_start_did_not_have():
-    before = blf.load_loop('recommended').controller
-    assert not config_warnings(before)
-    stiffer = change(before, {'two_link.feedback_gain': [60.0, 120.0]})
-    (found,) = worsened(before, stiffer)
-    assert 'K_p over the inertia is 1.48e+03 1/s' in found
-
-
 def test_reference_load_predicts_the_torque_of_the_run():
     """True parameters, no disturbance: the run's largest torque, up to the filter's lag."""
     loop = configured('recommended', 7.0, KNOWN, NO_DISTURBANCE)
