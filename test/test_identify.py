@@ -570,7 +570,7 @@ def test_offset_for_which_a_urdf_has_no_place_is_named(plain):
     assert not mentions(found, f'{PANDA[1]} has an offset')
 
 
-@pytest.mark.parametrize('what', ['gain', 'elasticity'])
+@pytest.mark.parametrize('what', ['elasticity', *at_night('gain')])
 def test_intervals_hold_where_the_arm_is_not_as_its_model_says(what):
     """Torques of sensors whose gains are up to 20 % off, and motors behind springs.
 

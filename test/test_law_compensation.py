@@ -264,6 +264,7 @@ def test_friction_that_grows_with_the_load_is_learned():
     assert largest[0] < 0.7 * largest[1]
 
 
+@pytest.mark.nightly
 def test_weak_ripple_that_is_listed_costs_nothing():
     """Of 0.16 % of the rated torque, while little is learned yet; 1.38 times if doubted by 5 %."""
     gears = {'joint.stiffness': [1e4] * 7, 'disturbance.stribeck': 0.14}

@@ -285,6 +285,7 @@ def test_load_is_weighed_though_gears_lose_15_percent_of_the_torque_they_carry()
     assert np.nanmedian(by_rows(load[t > LONG - 5.0])) < 0.1
 
 
+@pytest.mark.nightly
 def test_load_is_weighed_though_friction_falls_by_40_percent():
     """It was 2.61 +- 0.40 kg after 8 s."""
     warm = {'disturbance.warm_factor': 0.6, 'disturbance.warm_time': 10.0}
