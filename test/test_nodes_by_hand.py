@@ -83,8 +83,8 @@ def test_safe_torque_is_repeated_when_the_arm_falls_silent(ros, monkeypatch):
 
 
 def test_cleanup_commands_the_torque_that_a_driver_may_hold(ros):
-    """In a ramp, whose last torque would else be held for as long as the node waits."""
-    node = ros.add(ControllerNode, {'safety.deactivation_ramp': 10.0})
+    """While it fades, whose last torque would else be held for as long as the node waits."""
+    node = ros.add(ControllerNode)
     arm = Arm(ros)
     arm.torque_for(0, START)
     assert deactivate(ros, node)

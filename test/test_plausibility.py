@@ -149,8 +149,8 @@ def test_joints_without_an_effort_have_that_of_an_arm_of_their_weight():
         ({'barrier.bound': each(0.5)}, 'barrier.bound: 0.5 rad is 28.6 degrees'),
         ({'safety.state_timeout': 40.0}, 'safety.state_timeout: in 40 s .* Give 0.04'),
         (
-            {'safety.deactivation_ramp': 500.0},
-            'safety.deactivation_ramp: in 500 s .* in ms',
+            {'safety.saturation_time': 500.0},
+            'safety.saturation_time: in 500 s .* in ms',
         ),
     ],
 )

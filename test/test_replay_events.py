@@ -178,7 +178,7 @@ def test_every_kind_of_event_and_watchdog_torques_replay(tmp_path):
 
 def test_dropped_states_are_detected(tmp_path):
     """In real time: what the controller did not answer was dropped."""
-    rig = Recorder({**DAMPED, 'safety.deactivation_ramp': 1.0})
+    rig = Recorder(DAMPED)
     rig.drops = (20, 70, 130)
     rig.step(50)
     rig.guard.deactivate()

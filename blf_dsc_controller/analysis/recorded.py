@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,15 @@ from blf_dsc_controller.messages.journal import (
     oscillation_in,
 )
 from blf_dsc_controller.reference.turns import turns_freely
-from blf_dsc_controller.run import Contact, LearnedArm, Run, Series, Stop, ToolErrors
+from blf_dsc_controller.run import (
+    Contact,
+    Floats,
+    LearnedArm,
+    Run,
+    Series,
+    Stop,
+    ToolErrors,
+)
 
 _ARRAYS = {  # of a run, with a column per joint: messages, field
     'position': ('states', 0),
@@ -141,8 +150,18 @@ def _arrays(
         # positions may wrap, the controller's is whole turns off.
         if known is None or may_wrap:
             known = states.select(np.full(states.size, -1))
-        arrays['reference'] = Values(known, 0, (states.field(0), errors.field(0)))
+        arrays['reference'] = Values(
+            partial(_reference, known.field(0), states.field(0), errors.field(0))
+        )
     return arrays
+
+
+def _reference(known: Values, positions: Values, errors: Values, key: Any) -> Floats:
+    """Return the reference at an index: the one that is known, or else q - xi1."""
+    values = known[key]
+    if np.isnan(values).any():
+        values = np.where(np.isnan(values), positions[key] - errors[key], values)
+    return values
 
 
 def _torques(content: Content, states: JointStates) -> JointStates:

@@ -293,15 +293,20 @@ def read_content(
             raise _missing_topic(wanted, topics.JOINT_STATES.type, bag.held)
         if not bag.counts[states]:
             raise BagError(f'{path} is empty: it holds no message of {states}')
-        found[topics.MOTOR_STATES] = _beside(states, topics.MOTOR_STATES, bag.held)
-        kept = {
-            topic: TopicMessages(name, bag.held[name])
-            for topic, name in found.items()
+        motors = topics.MOTOR_STATES
+        found[motors] = (
+            _find(motors, bag.held, namespace, names)
+            if motors.leaf in names.topics
+            else _beside(states, motors, bag.held)
+        )
+        messages = {
+            name: TopicMessages(name, bag.held[name])
+            for name in found.values()
             if name is not None and bag.counts[name]
         }
-        adds = {messages.name: messages.add for messages in kept.values()}
-        for message in bag.messages(adds):
-            adds[message.topic](message)
+        for message in bag.messages(messages):
+            messages[message.topic].add(message)
+    kept = {topic: messages[name] for topic, name in found.items() if name in messages}
     return Content(path, names, kept, bag.counts)
 
 

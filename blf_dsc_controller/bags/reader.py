@@ -14,7 +14,6 @@ from blf_dsc_controller.bags.sources import BagError
 from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.messages import topics
-from blf_dsc_controller.run import Stamps
 
 _MOST_FALLS = 10  # of the stamps, by resets of a simulator
 _ALTERNATING = 0.9  # ratio of the intervals to and from the state of another publisher
@@ -87,18 +86,12 @@ def single_run(content: Content, joints: Sequence[str]) -> SingleRun:
     repeated = in_run.size - run.size
     if repeated:
         notes.append(f'{repeated} joint states left out: they repeat the stamp before')
-    return SingleRun(run, tuple(notes), _span(states.received, first, last))
-
-
-def _span(received: Stamps, first: int, last: int) -> tuple[int, int]:
-    """Return when [ns] the messages of the states `first` to `last` - 1 were received.
-
-    Before the first state of the bag and after its last one nothing bounds the run.
-    """
+    # Before the first state of the bag and after its last one nothing bounds the run.
     no_bound = np.iinfo(np.int64)
+    received = states.received
     begin = int(received[first]) if first else no_bound.min
-    end = int(received[last]) if last < received.size else no_bound.max
-    return begin, end
+    end = int(received[last]) if last < states.size else no_bound.max
+    return SingleRun(run, tuple(notes), (begin, end))
 
 
 def _check_publisher(topic: str, states: JointStates, falls: NDArray[np.intp]) -> None:

@@ -110,78 +110,60 @@ def _no_file(folder: Path) -> str:
     return 'there is no file in .mcap: give the folder that has one, or the file'
 
 
-class _Copy:
-    """Copy of what a damaged file holds to a clean bag.
-
-    Attributes:
-        last: latest time of a message copied [ns]; -1 before the first.
-        found: number of messages of each channel.
-        lost: number of messages that are not copied, by what they are.
-    """
-
-    def __init__(self, bag: BagWriter, summary: Summary) -> None:
-        self.last = -1
-        self.found = Counter[int]()
-        self.lost = Counter[str]()
-        self._bag = bag
-        self._summary = summary
-        # by number of the channel; 0 where its topic is unknown
-        self._handles: dict[int, int] = {}
-
-    def add(self, message: Any) -> None:
-        """Copy a message."""
-        number, sequence, received, published, raw = message
-        self.found[number] += 1
-        channel = self._summary.channels.get(number)
-        if channel and channel.message_encoding != CDR:
-            encoding = channel.message_encoding or 'unknown'
-            self.lost[f'messages of {channel.topic}: they are {encoding}, not CDR'] += 1
-            return
-        if not self._handles.get(number):  # its topic may have become known
-            self._handles[number] = _handle(self._bag, self._summary, number)
-        handle = self._handles[number]
-        if not handle:
-            self.lost['messages of topics whose name or type is unknown'] += 1
-            return
-        try:
-            plain = _plain(raw)
-        except (ValueError, ZstdError):
-            self.lost['compressed messages that cannot be unpacked'] += 1
-            return
-        self.last = max(self.last, received)
-        self._bag.write(handle, plain, received, published, sequence)
-
-
 def _copied(path: Path, bag: BagWriter) -> Iterator[str]:
     """Copy what a damaged file holds to a clean bag, and yield its losses."""
     is_closed = False
+    last = -1  # latest time of a message copied [ns]
+    found = Counter[int]()  # messages of each channel
+    lost = Counter[str]()  # messages that are not copied, by what they are
+    handles: dict[int, int] = {}  # by number of the channel; 0 where it is unknown
     with path.open('rb') as stream:
         size = stream.seek(0, SEEK_END)
         summary = _summary(stream, size)
-        copy = _Copy(bag, summary)
         for record in _records(stream, size, summary):
             if isinstance(record, tuple):
-                copy.add(record)
+                number, sequence, received, published, raw = record
+                found[number] += 1
+                if not handles.get(number):  # its topic may have become known
+                    handles[number] = _handle(bag, summary, number)
+                plain = _plain(raw, summary.channels.get(number), handles[number])
+                if isinstance(plain, str):
+                    lost[plain] += 1
+                else:
+                    last = max(last, received)
+                    bag.write(handles[number], plain, received, published, sequence)
             elif not isinstance(record, str):
                 _note(record, summary)
             elif not is_closed:
-                yield record + _after(copy.last)
+                after = '' if last < 0 else f', after {last * 1e-9:.6f} s'
+                yield record + after
             is_closed |= isinstance(record, DataEnd)
     if not is_closed:
         ends = 'nothing in it could be read'
-        if copy.last >= 0:
-            ends = f'it ends at {copy.last * 1e-9:.6f} s'
+        if last >= 0:
+            ends = f'it ends at {last * 1e-9:.6f} s'
         yield (
             f'the recording was not closed; {ends}. Later messages are lost: usually the last '
             '0.1 s before a kill, more if the computer was overloaded or lost power'
         )
-    for kind, count in copy.lost.items():
+    for kind, count in lost.items():
         yield f'{count} {kind}'
-    yield from _missing(summary, copy.found)
+    yield from _missing(summary, found)
 
 
-def _after(last: int) -> str:
-    return '' if last < 0 else f', after {last * 1e-9:.6f} s'
+def _plain(raw: bytes, channel: Channel | None, handle: int) -> bytes | str:
+    """Return a message, decompressed if needed; if it cannot be copied, what it is."""
+    if channel and channel.message_encoding != CDR:
+        encoding = channel.message_encoding or 'unknown'
+        return f'messages of {channel.topic}: they are {encoding}, not CDR'
+    if not handle:
+        return 'messages of topics whose name or type is unknown'
+    if not raw.startswith(FRAME_HEADER):  # CDR never begins like that
+        return raw
+    try:
+        return unpacked(raw, 'zstd')
+    except (ValueError, ZstdError):
+        return 'compressed messages that cannot be unpacked'
 
 
 def _note(record: Any, summary: Summary) -> None:
@@ -210,16 +192,11 @@ def _missing(summary: Summary, found: Counter[int]) -> Iterator[str]:
         yield f'{count} of {stated[number]} messages of {topic}'
 
 
-def _plain(raw: bytes) -> bytes:
-    """Return a message, decompressed if needed: CDR never begins like that."""
-    return unpacked(raw, 'zstd') if raw.startswith(FRAME_HEADER) else raw
-
-
 def _handle(bag: BagWriter, summary: Summary, number: int) -> int:
-    """Return the handle of a channel in the clean bag, 0 if it is unknown."""
+    """Return the handle of a channel in the clean bag, 0 if it is unknown or not CDR."""
     channel = summary.channels.get(number)
     schema = summary.schemas.get(channel.schema_id) if channel else None
-    if channel is None or schema is None:
+    if channel is None or schema is None or channel.message_encoding != CDR:
         return 0
     earlier = [*bag.message_counts]  # from other files
     if channel.topic in earlier:

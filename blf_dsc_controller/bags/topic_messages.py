@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -58,29 +58,14 @@ class UnreadableMessageError(BagError):
 
 
 class Values:
-    """Values (N, n) of states, which are read when they are indexed.
+    """Values (N, n) of states, which are read when they are indexed; NaN where unknown."""
 
-    Where they are unknown, they are NaN, or the difference of two others if these are
-    given.
-    """
-
-    def __init__(
-        self,
-        states: JointStates,
-        field: int,
-        difference: tuple[Values, Values] | None = None,
-    ) -> None:
-        self._states = states
-        self._field = field
-        self._difference = difference
+    def __init__(self, read: Callable[[Any], Floats]) -> None:
+        """Take a function that reads the values at an index."""
+        self._read = read
 
     def __getitem__(self, key: Any) -> Floats:
-        rows, columns = key if isinstance(key, tuple) else (key, _ALL)
-        values = self._states.select(rows).read(self._field, columns)
-        if self._difference is not None and np.isnan(values).any():
-            first, second = (each[key] for each in self._difference)
-            values = np.where(np.isnan(values), first - second, values)
-        return values
+        return self._read(key)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> NDArray[Any]:
         """Return all of them."""
@@ -126,7 +111,12 @@ class JointStates:
 
     def field(self, k: int) -> Values:
         """Return positions (0), velocities (1) or efforts (2) as `Values` (N, n)."""
-        return Values(self, k)
+
+        def read(key: Any) -> Floats:
+            rows, columns = key if isinstance(key, tuple) else (key, _ALL)
+            return self.select(rows).read(k, columns)
+
+        return Values(read)
 
     def read(self, field: int, columns: Any = _ALL) -> Floats:
         """Return some columns of a field (N, k), or one (N,); NaN where it is unknown."""
@@ -356,7 +346,11 @@ class TopicMessages:
         layouts = self.words(_LAYOUT, np.arange(self.size, dtype=np.int32))
         is_read = ~np.isin(layouts, [*problems, _UNREADABLE])
         number = np.flatnonzero(is_read).astype(np.int32)
-        foreign = [k for k, each in problems.items() if _is_foreign(each, names)]
+        foreign = [
+            k
+            for k, each in problems.items()
+            if isinstance(each, MissingJointError) and each.is_foreign(names)
+        ]
         is_bad = ~is_read & ~np.isin(layouts, foreign if number.size else [])
         errors = {
             k: self._unreadable.get(k) or problems[layouts[k]]
@@ -381,7 +375,3 @@ class TopicMessages:
             )
             raise UnreadableMessageError(self.name, 0, unnamed)
         return names
-
-
-def _is_foreign(problem: MessageError, names: Collection[str]) -> bool:
-    return isinstance(problem, MissingJointError) and problem.is_foreign(names)

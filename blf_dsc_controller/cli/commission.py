@@ -247,5 +247,3 @@ def _prove(path: Path) -> None:
         f'with these gains the simulated arm follows its own motion for {made.duration:g} s, '
         f'with {largest_error(made.error, loop.controller.units)} at most'
     )
-    for each in made.cycles:
-        print(page.of_limit_cycle(each))

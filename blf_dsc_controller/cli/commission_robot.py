@@ -19,7 +19,6 @@ from blf_dsc_controller.commissioning.commissioning import (
     REPEATS,
     Commissioning,
 )
-from blf_dsc_controller.commissioning.limit_cycle import HOLD
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.postures import SPEED, PostureByPosture
 from blf_dsc_controller.commissioning.proof import (
@@ -104,18 +103,15 @@ def prove(
 ) -> None:
     """Prove the gains of a configuration on a robot.
 
-    Print the errors of each step, those of the last one beside those to expect, and the limit
-    cycles at rest and in the last step.
+    Print the errors of each step, and those of the last one beside those to expect.
 
     Raises as `measured_on`.
     """
-    for step, errors, cycles in arm.proof(planned):
+    for step, errors in arm.proof(planned):
         worst = largest_error(errors.measured, config.units)
         print(f'{step.name}: calm, errors of {worst} at most', flush=True)
         if step is planned[-1]:
             print(page.errors_table(config, errors))
-        for each in cycles:
-            print(page.of_limit_cycle(each))
 
 
 def prepared_folder(options: Namespace) -> Path:
@@ -160,7 +156,7 @@ def of_proof(options: Namespace, config: ControllerConfig) -> Iterator[str]:
     )
     yield (
         f'then the arm follows the reference of {options.config}, for {seconds():g} s in all, with '
-        f'{", ".join(map(name_of, SHARES))}; before the last it holds still for {HOLD:g} s'
+        f'{", ".join(map(name_of, SHARES))}'
     )
     yield (
         'an oscillation, any other check of the controller, or Ctrl-C brings the arm to rest and '

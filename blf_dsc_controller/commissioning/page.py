@@ -11,7 +11,6 @@ from blf_dsc_controller.analysis.output import aligned
 from blf_dsc_controller.commissioning.better_known import FAR_ABOVE, known_friction
 from blf_dsc_controller.commissioning.commissioned import CREEPING, Commissioned
 from blf_dsc_controller.commissioning.findings import LONGEST_LAG
-from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.observer_pole import ENOUGH, POLES
 from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import Errors
@@ -322,16 +321,6 @@ def _wider(found: Commissioned) -> dict[str, list[str]]:
         if wide > usual
     ]
     return {'barrier.bound': wider}
-
-
-def of_limit_cycle(cycle: LimitCycle) -> str:
-    """Return in a sentence how a joint shakes, and what to do."""
-    return (
-        f'{cycle.joint} oscillates by {1e3 * cycle.amplitude:.2g} m{cycle.unit} at '
-        f'{two_digits(cycle.frequency)} Hz {cycle.when}: friction makes it stick and slip, '
-        'which no check stops. More feedback.joint_damping of this joint makes it smaller, at '
-        'the cost of the margin; softer gains make it larger'
-    )
 
 
 def errors_table(config: ControllerConfig, errors: Errors) -> str:

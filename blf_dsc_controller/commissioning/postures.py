@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
-from blf_dsc_controller.commissioning.limit_cycle import HOLD, LimitCycle
 from blf_dsc_controller.commissioning.measurement import (
     OSCILLATES,
     Measured,
@@ -33,7 +32,6 @@ from blf_dsc_controller.commissioning.planned import Planned
 from blf_dsc_controller.commissioning.proof import (
     Errors,
     Step,
-    cycles_in,
     errors_of,
     start_of,
 )
@@ -95,13 +93,10 @@ class Move(NamedTuple):
     duration: float  # s, with the rest at its end
 
 
-def move(
-    config: ControllerConfig, here: Floats, there: Floats, rest: float = _REST
-) -> Move:
+def move(config: ControllerConfig, here: Floats, there: Floats) -> Move:
     """Return the slow way from rest at `here` (n,) [rad] to rest at `there` (n,).
 
-    It has the gains of the configuration, is straight in the angles of the joints, and rests at
-    its end for `rest` [s].
+    It has the gains of the configuration, and is straight in the angles of the joints.
     """
     (target,), _ = short_way(there[None], here, config)
     far = np.abs(target - here)
@@ -113,7 +108,7 @@ def move(
         'reference.times': [0.0, duration],
         'reference.waypoints': [*here.tolist(), *target.tolist()],
     }
-    return Move(change(config, values), duration + rest)
+    return Move(change(config, values), duration + _REST)
 
 
 def plan_repeat_by_bag(
@@ -316,13 +311,8 @@ class PostureByPosture:
                 self._commissioning.soften(error.oscillation)
             return None
 
-    def proof(
-        self, steps: Sequence[Step]
-    ) -> Iterator[tuple[Step, Errors, list[LimitCycle]]]:
+    def proof(self, steps: Sequence[Step]) -> Iterator[tuple[Step, Errors]]:
         """Yield the errors of each step, to whose start the arm goes slowly.
-
-        Before the last one it rests there for longer; its limit cycles by then, and in this step,
-        are yielded, too.
 
         Raises EndedError or BlfDscError as `runs`.
         """
@@ -331,13 +321,10 @@ class PostureByPosture:
             self._left = f'The gains are not proven: {held}; bags are in {self._folder}'
             here = self.position()
             there = start_of(step.config, here)
-            is_last = step is steps[-1]
-            rest = HOLD if is_last else _REST
-            way = self.aside(move, step.config, here, there, rest)
-            still = self._run(way.config, way.duration, f'way with {step.name}')
+            way = self.aside(move, step.config, here, there)
+            self._run(way.config, way.duration, f'way with {step.name}')
             bag = self._run(step.config, step.duration, step.name)
-            cycles = self.aside(cycles_in, still, bag, step.config) if is_last else []
-            yield step, self.aside(errors_of, bag, step.config), cycles
+            yield step, self.aside(errors_of, bag, step.config)
             held = f'{step.share:.0%} of them were calm'
 
     def _run(self, config: ControllerConfig, duration: float, name: str) -> Path:

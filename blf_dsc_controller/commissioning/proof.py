@@ -2,9 +2,8 @@
 """The proof of commissioned gains: raised in three steps, along the arm's own reference.
 
 Half of the gains first, then three quarters, with bounds that soft gains keep; then all of
-them, with the configured bounds.  Before these it rests for some seconds, to see whether it shakes
-(`limit_cycle`).  An oscillation ends it, whatever the file says.  The errors
-of the last step are compared with those that the linear loop lets expect.
+them, with the configured bounds.  An oscillation ends it, whatever the file says.  The errors of
+the last step are compared with those that the linear loop lets expect.
 """
 
 from __future__ import annotations
@@ -17,12 +16,6 @@ from numpy.typing import NDArray
 
 from blf_dsc_controller.analysis.recorded import read_run
 from blf_dsc_controller.commissioning.chosen import as_parameters, with_gains
-from blf_dsc_controller.commissioning.limit_cycle import (
-    IN_MOTION,
-    STILL,
-    LimitCycle,
-    limit_cycles,
-)
 from blf_dsc_controller.commissioning.run_parameters import undisturbed_parameters
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.schema import Value, change
@@ -30,7 +23,6 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.reference.approach import reference_of
 from blf_dsc_controller.reference.terms import sampled
-from blf_dsc_controller.run import Run
 from blf_dsc_controller.warnings.expected_errors import expected_errors
 
 Floats = NDArray[np.float64]
@@ -99,18 +91,6 @@ def start_of(config: ControllerConfig, here: Floats) -> Floats:
     if config.reference.type == 'hold':
         return here
     return np.asarray(sampled(reference_of(config), np.zeros(1))[0, 0])
-
-
-def cycles_of(run: Run, config: ControllerConfig) -> list[LimitCycle]:
-    """Return the limit cycles of a run along the reference of its configuration."""
-    rests = config.reference.type == 'hold'
-    return limit_cycles(run, STILL if rests else IN_MOTION)
-
-
-def cycles_in(still: Path, moved: Path, config: ControllerConfig) -> list[LimitCycle]:
-    """Return the limit cycles in bags of an arm that rests, and follows its reference."""
-    at_rest = limit_cycles(read_run(still), STILL)
-    return at_rest + cycles_of(read_run(moved), config)
 
 
 def errors_of(bag: Path, config: ControllerConfig) -> Errors:

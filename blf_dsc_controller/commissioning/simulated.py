@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.commissioning.commissioning import REPEATS, Commissioning
-from blf_dsc_controller.commissioning.limit_cycle import LimitCycle
 from blf_dsc_controller.commissioning.measurement import Measured, oscillation_in
 from blf_dsc_controller.commissioning.planned import Planned
-from blf_dsc_controller.commissioning.proof import cycles_of
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import LoopConfig
 from blf_dsc_controller.configuration.plant import PlantConfig, pick_ups
@@ -32,7 +30,6 @@ class Proof(NamedTuple):
     duration: float  # s
     error: Floats  # (n,) rad, the largest of each joint
     stop: str  # empty: none
-    cycles: list[LimitCycle]  # of an arm that does not stop
 
 
 def measured(
@@ -87,11 +84,10 @@ def proof(loop: LoopConfig) -> Proof:
     duration = min(plant.duration or _PROOF, _PROOF)
     run = simulate(loop.controller, change(plant, {'duration': duration})).run()
     stop = next((each.text for each in run.stops), '')
-    cycles = [] if stop else cycles_of(run, loop.controller)
     largest = np.zeros(len(run.joints))
     if run.error is not None:
         largest = np.nanmax(np.abs(run.error), axis=0)
-    return Proof(duration, largest, stop, cycles)
+    return Proof(duration, largest, stop)
 
 
 def runs_of(

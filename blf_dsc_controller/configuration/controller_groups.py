@@ -96,18 +96,15 @@ class Safety:
         'their limit',
     )
     torque: Literal['zero', 'damping', 'hold_gravity'] = parameter(
-        'zero', 'safe torque: zero, damping -D dq, or the learned gravity with damping'
+        'zero',
+        'safe torque: zero, damping -D dq, or the learned gravity with damping; without gravity, '
+        'what the law held fades within 0.5 s when it is deactivated',
     )
     damping: PerJoint = non_negative(
         (2.0, 1.0),
         'damping in the safe torque, at most the inertia of the joint over 0.03 s',
         'N m s/rad',
         'D',
-    )
-    deactivation_ramp: float = non_negative(
-        0.5,
-        'ramp to the safe torque when the node is deactivated; a fault has none',
-        's',
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.control.guarded_loop import GuardedLoop
 from blf_dsc_controller.control.outputs import Outputs
 from blf_dsc_controller.messages import topics
@@ -32,7 +33,7 @@ class LoopOutputs(Outputs):
         self._motors = JointStateEncoder(joints, ('position', 'velocity'))
         self._recorder: TopicRecorder | None = None
         if record is not None:
-            self._recorder = TopicRecorder(Path(record), in_background=True)
+            self._recorder = TopicRecorder(BagWriter(record, in_background=True))
             self.add(self._recorder)
 
     def write_state(

@@ -9,7 +9,6 @@ that are not small, nor zero in all joints at once.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,40 +23,29 @@ _NOT_SMALL = 0.1  # of a joint's largest torque, beside such zeros ...
 _STEPS = 5.0  # ... and times its least one, which may be a step
 
 
-class Extremes(NamedTuple):
-    """Least and largest known value of each column (n,); inf and -inf if it has none."""
+def extremes(values: Floats) -> tuple[Floats, Floats]:
+    """Return least and largest known value of each column (n,) of values (N, n).
 
-    least: Floats
-    most: Floats
-
-    @property
-    def largest(self) -> Floats:
-        """The largest distance from zero."""
-        return np.maximum(-self.least, self.most)
-
-
-def extremes(values: Floats) -> Extremes:
-    """Return the extremes of values (N, n)."""
+    They are inf and -inf where none is known.
+    """
     known = np.isfinite(values)
-    return Extremes(
-        np.min(values, axis=0, initial=np.inf, where=known),
-        np.max(values, axis=0, initial=-np.inf, where=known),
-    )
+    least = np.min(values, axis=0, initial=np.inf, where=known)
+    return least, np.max(values, axis=0, initial=-np.inf, where=known)
 
 
 def stand_ins(values: Floats, names: Sequence[str]) -> tuple[Flags, list[str]]:
     """Return the rows (N,) of values (N, k) of one kind that have stand-ins, and what to say."""
     rows = np.zeros(len(values), dtype=bool)
     said: list[str] = []
-    found = extremes(values)
+    lowest, highest = extremes(values)
     with np.errstate(over='ignore'):  # of values such as 1e308
-        spread = np.maximum(found.most - found.least, 0.0)
+        spread = np.maximum(highest - lowest, 0.0)
         doubtful = np.flatnonzero(spread >= _FAR).tolist()
         left = {k: np.unique(values[np.isfinite(values[:, k]), k]) for k in doubtful}
         spread[doubtful] = 0.0
         for _ in range(_MOST):
             apart = {k: _apart(each) for k, each in left.items() if each.size > 1}
-            least = max([spread.max(), *(each.spread for each in apart.values())])
+            least = max([spread.max(), *(own for _, _, own in apart.values())])
             for k, (value, distance, own) in apart.items():
                 if distance > max(_FAR, _TIMES * own, least):
                     at = values[:, k] == value
@@ -67,21 +55,16 @@ def stand_ins(values: Floats, names: Sequence[str]) -> tuple[Flags, list[str]]:
     return rows, said
 
 
-class _Apart(NamedTuple):
-    """The value of a column that is farthest from all others, which have this spread."""
+def _apart(known: Floats) -> tuple[float, float, float]:
+    """Return what may be a stand-in of different values (k,) in their order: an end of them.
 
-    value: float
-    distance: float
-    spread: float
-
-
-def _apart(known: Floats) -> _Apart:
-    """Return what may be a stand-in of different values (k,) in their order: an end of them."""
+    Also how far it is from the others, and their spread.
+    """
     middle = np.median(known)
     value = max(known[[0, -1]], key=lambda end: (abs(end - middle), abs(end)))
     others = known[known != value]
     centre = np.median(others)
-    return _Apart(value, abs(value - centre), np.abs(others - centre).max())
+    return value, abs(value - centre), np.abs(others - centre).max()
 
 
 def unrecorded(torque: Floats) -> Flags:

@@ -18,12 +18,9 @@ from itertools import chain, combinations, islice, permutations, product
 
 import numpy as np
 
-from blf_dsc_controller.arms.base_parameters import base_parameters
-from blf_dsc_controller.arms.urdf import Chain
-from blf_dsc_controller.configuration.robot import Robot
-from blf_dsc_controller.identification.mounting import gravity_columns
+from blf_dsc_controller.identification.mounting import gravity_torques
+from blf_dsc_controller.identification.problem import Problem
 from blf_dsc_controller.identification.recording import TURN, Recording
-from blf_dsc_controller.identification.windows import rows_of, split
 from blf_dsc_controller.run import Floats
 
 _QUARTERS = (0, 1, 2, -1)  # turns over 4, of a zero
@@ -70,28 +67,20 @@ def converted(recording: Recording, convention: Convention) -> Recording:
 
 
 def likely_conventions(
-    recording: Recording, robot: Robot, unexplained: Sequence[int]
+    problem: Problem, gravity: Sequence[float], unexplained: Sequence[int]
 ) -> list[Convention]:
     """Return ways in which the joints may count, the best first.
 
-    `unexplained` are joints, the worst first, that may count the other way round
-    whatever gravity says.
+    `gravity` (3,) is in the base [m/s^2].  `unexplained` are joints, the worst first, that may
+    count the other way round whatever gravity says.
     """
-    arm = robot.chain(recording.joints)
-    rows = rows_of(recording, base_parameters(arm, robot.gravity).model)
-    fit = split(rows).fit
-    fit = fit[:: max(1, fit.size // _POSTURES)]
-    q = rows.postures[fit]
-    columns = rows.friction(fit, _FRICTION)
-    gravity = _Gravity(arm, np.array(robot.gravity), q, rows.u(0.0)[fit], columns)
-    gravity.search()
-    most = _BETTER * gravity.cost(gravity.as_is)
-    likely = (each for each in gravity.best() if gravity.cost(each) < most)
-    turned = (
-        gravity.turned(gravity.as_is, i) for i in unexplained if i in gravity.turning
-    )
-    ways = chain(islice(likely, _CANDIDATES), islice(turned, _CANDIDATES))
-    return list(dict.fromkeys(ways))
+    ways = _Gravity(problem, gravity)
+    ways.search()
+    most = _BETTER * ways.cost(ways.as_is)
+    likely = (each for each in ways.best() if ways.cost(each) < most)
+    turned = (ways.turned(ways.as_is, i) for i in unexplained if i in ways.turning)
+    both = chain(islice(likely, _CANDIDATES), islice(turned, _CANDIDATES))
+    return list(dict.fromkeys(both))
 
 
 def _with(ways: Convention, i: int, way: Way) -> Convention:
@@ -99,35 +88,32 @@ def _with(ways: Convention, i: int, way: Way) -> Convention:
 
 
 class _Gravity:
-    """Torques (k, n) of postures q, and how well the URDF's gravity explains them."""
+    """Torques (k, n) in postures of a motion, and how well the URDF's gravity explains them."""
 
-    def __init__(
-        self, chain: Chain, g: Floats, q: Floats, u: Floats, friction: Floats
-    ) -> None:
-        """Take friction (k, c, n): c columns of each joint, which explain what they can."""
-        self._chain = chain
-        self.as_is: Convention = (_AS_IS,) * q.shape[1]
-        kinds = [joint.kind for joint in chain.joints]
+    def __init__(self, problem: Problem, gravity: Sequence[float]) -> None:
+        """Take the torques as they were recorded; friction explains what it can of them."""
+        rows, fit = problem.rows, problem.windows.fit
+        fit = fit[:: max(1, fit.size // _POSTURES)]
+        kinds = [joint.kind for joint in problem.chain.joints]
+        self.as_is: Convention = (_AS_IS,) * len(kinds)
         self.turning = [i for i, kind in enumerate(kinds) if kind != 'prismatic']
-        self._g = g
-        self._q = q
-        self._u = u
+        self._torques = gravity_torques(problem.chain, np.array(gravity))
+        self._q = rows.postures[fit]
+        self._u = np.where(problem.reversed, -1.0, 1.0) * rows.u(0.0)[fit]
         # what friction does not explain of each joint, in units of its torque
-        joints = range(q.shape[1])
-        self._bases = [np.linalg.qr(friction[:, :, i])[0] for i in joints]
-        self._scale = np.maximum(np.linalg.norm(u, axis=0), 1e-9)
+        friction = np.moveaxis(rows.friction(fit, _FRICTION), 2, 0)
+        self._bases = np.linalg.qr(friction)[0]  # (n, k, c)
+        self._scale = np.maximum(np.linalg.norm(self._u, axis=0), 1e-9)
         self._known: dict[Convention, float] = {}
 
     def cost(self, ways: Convention) -> float:
         """Return the squares that remain if joints count in other ways."""
         if ways not in self._known:
             signs, offsets = signs_and_offsets(ways)
-            weight = gravity_columns(self._chain, signs * self._q + offsets) @ self._g
+            weight = self._torques(signs * self._q + offsets)
             left = (self._u - signs * weight) / self._scale
-            explained = [Q.T @ own for Q, own in zip(self._bases, left.T, strict=True)]
-            self._known[ways] = float(
-                np.sum(left**2) - sum(each @ each for each in explained)
-            )
+            explained = np.einsum('ikc,ki->ic', self._bases, left)
+            self._known[ways] = float(np.sum(left**2) - np.sum(explained**2))
         return self._known[ways]
 
     def turned(self, ways: Convention, i: int) -> Convention:

@@ -15,7 +15,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from blf_dsc_controller.arms.inertia import pseudo_inertia, rotational_inertia
+from blf_dsc_controller.arms.inertia import moved, pseudo_inertia, rotational_inertia
 from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.run import Floats
 
@@ -52,7 +52,7 @@ def _inertial(J: Floats) -> str:
     centre = J[:3, 3] / mass
     T = np.eye(4)
     T[:3, 3] = -centre
-    I = rotational_inertia(T @ J @ T.T)
+    I = rotational_inertia(moved(J, T))
     tensor = ' '.join(
         f'i{"xyz"[a]}{"xyz"[b]}="{I[a, b]:.12g}"'
         for a, b in combinations_with_replacement(range(3), 2)

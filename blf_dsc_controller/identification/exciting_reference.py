@@ -91,30 +91,25 @@ class ExcitationProblem:
         upper = np.array(config.limits.position_upper)
         self._middle = 0.5 * (lower + upper)
         self.reach = 0.5 * (upper - lower)
-        self.limits = self._usable_limits(config)
+        limits = config.limits
+        self.limits = np.array(
+            (
+                self.reach - settings.barrier.bound,
+                _SPEED * np.array(limits.velocity),
+                _SPEED * np.array(limits.acceleration),
+                _TORQUE * settings.torque.limit,
+            )
+        )
         self._base = 2.0 * np.pi / config.learning.window
-        self._units = self._largest_amplitudes()
+        # (n, h) what alone would reach a limit of motion
+        rates = self._base * np.arange(1, harmonics + 1)
+        reached = [np.outer(self.limits[k], rates**-k) for k in range(3)]
+        self._units = np.min(reached, axis=0)
         samples = _SAMPLES_PER_HARMONIC * max(harmonics, 2)
         self._times = np.arange(samples) * (config.learning.window / samples)
         omega = self._base * np.arange(samples // 2 + 1)
         # two poles in series
         self._filter = 1.0 / (1.0 + 1j * omega / settings.row.filter_pole) ** 2
-
-    def _usable_limits(self, config: ControllerConfig) -> np.ndarray:
-        """Return limits (4, n) of position from the middle, velocity, acceleration, torque."""
-        limits = config.limits
-        position = self.reach - self._settings.barrier.bound
-        velocity = _SPEED * np.array(limits.velocity)
-        acceleration = _SPEED * np.array(limits.acceleration)
-        torque = _TORQUE * self._settings.torque.limit
-        return np.array((position, velocity, acceleration, torque))
-
-    def _largest_amplitudes(self) -> np.ndarray:
-        """Return for each joint and harmonic (n, h) what alone would reach a limit of motion."""
-        rates = self._base * np.arange(1, self.harmonics + 1)
-        motion = self.limits[:3]  # of position, and of its first two derivatives
-        reached = [np.outer(limit, rates**-k) for k, limit in enumerate(motion)]
-        return np.asarray(np.min(reached, axis=0))
 
     def start(self, random: np.random.Generator) -> np.ndarray:
         """Return a random x around the middle of each joint's range; see `parameters`."""

@@ -15,7 +15,7 @@ from blf_dsc_controller.arms.urdf import Tree
 from blf_dsc_controller.bags.content import Content, NameMap, read_content
 from blf_dsc_controller.bags.reader import applied_torque, single_run
 from blf_dsc_controller.bags.sources import BagError
-from blf_dsc_controller.bags.topic_messages import JointStates, TopicMessages
+from blf_dsc_controller.bags.topic_messages import JointStates
 from blf_dsc_controller.identification.bad_values import stand_ins
 from blf_dsc_controller.identification.motion import Group, Motion, checked
 from blf_dsc_controller.identification.recording import GAP, interpolated
@@ -49,7 +49,7 @@ def motion_of_bag(
         BlfDscError: the bag cannot be read, has no torques or too few states, or has the joints
             of no arm.
     """
-    names, units, motors = _split(path, names)
+    names, units = _split(path, names)
     content = read_content(path, namespace, names)
     messages = content.topics[JOINT_STATES]
     named = messages.name_lists()
@@ -58,28 +58,24 @@ def motion_of_bag(
     groups = _groups(theirs, named)
     bag = _Bag(content, dict(zip(theirs, joints, strict=True)), units)
     source = f'effort of {messages.name}'
-    if not _has_stamps(messages, groups[0]):
+    stamp = messages.joint_states(groups[0], ('position',)).stamp
+    if stamp.size > 1 and (stamp == stamp[0]).all():
         messages.is_stamped = False
         source += ' (without stamps: by the times of reception)'
+    states = [single_run(content, group).states for group in groups]
+    parts = [bag.motion(each, each, source, _OF_EFFORTS) for each in states]
     if len(groups) == 1:
-        motion = _of_one(bag, theirs, source, commanded=commanded)
+        (motion,) = parts
+        if commanded or not np.nan_to_num(motion.tau.values).any():
+            motion = _of_commands(bag, states[0])
     elif commanded:
         raise BagError(
             f'{path}: the joints come in {len(groups)} messages, to which commands cannot be '
             'assigned: leave out --effort command'
         )
     else:
-        states = [single_run(content, group).states for group in groups]
-        parts = [bag.motion(each, each, source, _OF_EFFORTS) for each in states]
         motion = _together([checked(part, tree) for part in parts], joints)
-    other = _motor_states(content, theirs, namespace, motors)
-    if other is None:
-        return motion
-    source = (
-        f'{motion.source}, positions of motors of {other.topics[JOINT_STATES].name}'
-    )
-    theta = _motors_at(motion.stamp, other, theirs)
-    return motion._replace(theta=motion.q._replace(values=theta), source=source)
+    return _with_motors(motion, content, theirs)
 
 
 class _Bag(NamedTuple):
@@ -115,14 +111,8 @@ class _Bag(NamedTuple):
         )
 
 
-def _of_one(
-    bag: _Bag, joints: Sequence[str], source: str, *, commanded: bool
-) -> Motion:
-    """Return the motion of joints that come in one message, with efforts, or else commands."""
-    states = single_run(bag.content, joints).states
-    motion = bag.motion(states, states, source, _OF_EFFORTS)
-    if not commanded and np.nan_to_num(motion.tau.values).any():
-        return motion
+def _of_commands(bag: _Bag, states: JointStates) -> Motion:
+    """Return the motion of states with commanded torques."""
     source, efforts = applied_torque(bag.content, states)
     motion = bag.motion(states, efforts, source, _OF_COMMANDS)
     if not np.nan_to_num(motion.tau.values).any():
@@ -132,50 +122,49 @@ def _of_one(
     return motion
 
 
-def _split(path: Path, names: NameMap) -> tuple[NameMap, dict[str, Column], str]:
-    """Return names of the bag, units of q and tau, and the topic of the motors, if given.
+def _split(path: Path, names: NameMap) -> tuple[NameMap, dict[str, Column]]:
+    """Return names of the bag, and units of q and tau, if given.
 
     `names.joints` is what `--map` gives, such as `q=[deg]` and `theta=motors` among the
-    joints.  A unit is a `Column`, whose name is empty if none was given: rad or N m.
+    joints; the latter is the topic of the motors.  A unit is a `Column`, whose name is
+    empty if none was given: rad or N m.
 
     Raises:
         BlfDscError: a unit is not known.
     """
-    joints = dict(names.joints)
-    motors = joints.pop('theta', '')
+    topics, joints = dict(names.topics), dict(names.joints)
+    if motors := joints.pop('theta', ''):
+        topics[MOTOR_STATES.leaf] = '/' + motors.lstrip('/')
     units = {'q': Column('', 1.0), 'tau': Column('', 1.0)}
     for kind in units:
         if given := _BRACKETED.fullmatch(joints.get(kind, '')):
             units[kind] = Column(given[1], factor_of(path, given[1], kind))
             del joints[kind]
-    return NameMap(names.topics, joints), units, motors
+    return NameMap(topics, joints), units
 
 
-def _motors_at(stamp: Stamps, content: Content, joints: Sequence[str]) -> Floats:
-    """Return the positions of motors (N, n) at these stamps."""
-    states = single_run(content, joints).states
-    values = np.asarray(states.field(0))
-    missing, _ = stand_ins(values, joints)
-    return _at(stamp, states.stamp[~missing], values[~missing])
+def _with_motors(motion: Motion, content: Content, joints: Sequence[str]) -> Motion:
+    """Return the motion with the positions of its motors, if the bag has these.
 
-
-def _motor_states(
-    content: Content, joints: Sequence[str], namespace: str, topic: str
-) -> Content | None:
-    """Return a bag with the states of motors as its joint states; None if it has none of these.
-
-    They are on `topic`, by default on `motor_states` beside the joint states.
+    They are on the topic that is given, or on `motor_states` beside the joint states.
     """
-    if topic:
-        topics = {**content.names.topics, JOINT_STATES.leaf: '/' + topic.lstrip('/')}
-        names = NameMap(topics, content.names.joints)
-        return read_content(content.path, namespace, names)
+    given = content.names.topics.get(MOTOR_STATES.leaf)
     messages = content.topics.get(MOTOR_STATES)
     if messages is None:
-        return None
-    if not any({*joints} <= {*names} for names in messages.name_lists()):
-        return None
-    return replace(content, topics={**content.topics, JOINT_STATES: messages})
+        if given:
+            raise BagError(f'{content.path} holds no message of {given}')
+        return motion
+    if not given and not any({*joints} <= {*each} for each in messages.name_lists()):
+        return motion
+    other = replace(content, topics={**content.topics, JOINT_STATES: messages})
+    states = single_run(other, joints).states
+    values = np.asarray(states.field(0))
+    missing, _ = stand_ins(values, joints)
+    theta = _at(motion.stamp, states.stamp[~missing], values[~missing])
+    return motion._replace(
+        theta=motion.q._replace(values=theta),
+        source=f'{motion.source}, positions of motors of {messages.name}',
+    )
 
 
 def _groups(
@@ -193,21 +182,12 @@ def _groups(
             groups.append(group)
             left = [name for name in left if name not in group]
     if left and len(groups) > 1:
+        listed = ', '.join(sorted(set().union(*named)))
         raise BagError(
-            f'no message has {", ".join(left)} (the bag names {_listed(named)}): give the names '
+            f'no message has {", ".join(left)} (the bag names {listed}): give the names '
             f'of these joints there, as in --map {left[0]}=ITS_NAME, or a --tip before them'
         )
     return [joints] if left else groups
-
-
-def _listed(named: Sequence[tuple[str, ...]]) -> str:
-    return ', '.join(sorted(set().union(*named)))
-
-
-def _has_stamps(messages: TopicMessages, joints: Sequence[str]) -> bool:
-    """Return whether not all states of these joints have one stamp."""
-    stamp = messages.joint_states(joints, ('position',)).stamp
-    return stamp.size < 2 or bool((stamp != stamp[0]).any())
 
 
 def _together(parts: Sequence[Motion], joints: Sequence[str]) -> Motion:
@@ -236,16 +216,14 @@ def _together(parts: Sequence[Motion], joints: Sequence[str]) -> Motion:
 
 def _at(stamp: Stamps, own: Stamps, values: Floats) -> Floats:
     """Return values (k, n) at their stamps (k,) at other ones (N,); NaN where unknown."""
-    found = np.full((stamp.size, values.shape[1]), np.nan)
     if own.size < 2:
-        return found
+        return np.full((stamp.size, values.shape[1]), np.nan)
     after = np.clip(np.searchsorted(own, stamp), 1, own.size - 1)
     pause = own[after] - own[after - 1]
-    is_known = (pause <= GAP * np.median(np.diff(own))) & (stamp <= own[-1])
-    is_known &= stamp >= own[0]
-    seconds = (own - own[0]) * 1e-9
-    at = (stamp[is_known] - own[0]) * 1e-9
-    found[is_known] = interpolated(at, seconds, values)
+    is_unknown = pause > GAP * np.median(np.diff(own))
+    is_unknown |= (stamp < own[0]) | (stamp > own[-1])
+    found = interpolated((stamp - own[0]) * 1e-9, (own - own[0]) * 1e-9, values)
+    found[is_unknown] = np.nan
     return found
 
 

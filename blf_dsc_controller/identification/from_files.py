@@ -55,14 +55,17 @@ def identify_bag(
             little of it, or no motion; or they are currents, and there are no gains.
     """
     begin(READING)
-    paths = [path] if isinstance(path, Path) else list(path)
-    recordings = _read(
-        [*paths, *([loaded] if loaded else [])],
-        robot,
-        namespace,
-        names,
-        commanded=effort == 'command',
-    )
+    paths = [path] if isinstance(path, Path) else [*path]
+    joints: tuple[str, ...] = ()
+    if robot.tip:
+        joints = tuple(joint.name for joint in robot.chain(()).joints)
+    recordings: list[Recording] = []
+    for each in [*paths, *([loaded] if loaded else [])]:
+        found = read_recording(
+            each, robot.text, joints, namespace, names, commanded=effort == 'command'
+        )
+        recordings.append(found)
+        joints = found.joints
     recording, begins = joined(*recordings)
     picked_up = float('nan') if pick_up else None
     if loaded:
@@ -70,40 +73,13 @@ def identify_bag(
     if len(gains):
         recording = _with_gains(recording, gains)
     elif any(each.currents for each in recordings):
-        raise _not_torques(recording)
+        raise BlfDscError(
+            f'{recording.source}: these are currents or percentages, from which no mass in kg can '
+            f'be told: give --gains [N m/A or N m/%] of {", ".join(recording.joints)}; 1 for each '
+            'if they are torques'
+        )
     return identify_arm(
         recording, robot, effort, picked_up, find_signs=not len(gains), begin=begin
-    )
-
-
-def _read(
-    paths: Sequence[Path],
-    robot: Robot,
-    namespace: str,
-    names: NameMap,
-    *,
-    commanded: bool,
-) -> list[Recording]:
-    """Return the recordings of one arm."""
-    joints: tuple[str, ...] = ()
-    if robot.tip:
-        joints = tuple(joint.name for joint in robot.chain(()).joints)
-    recordings: list[Recording] = []
-    for path in paths:
-        recordings.append(
-            read_recording(
-                path, robot.text, joints, namespace, names, commanded=commanded
-            )
-        )
-        joints = recordings[-1].joints
-    return recordings
-
-
-def _not_torques(recording: Recording) -> BlfDscError:
-    return BlfDscError(
-        f'{recording.source}: these are currents or percentages, from which no mass in kg can be '
-        f'told: give --gains [N m/A or N m/%] of {", ".join(recording.joints)}; 1 for each if '
-        'they are torques'
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from blf_dsc_controller.arms.base_parameters import BaseParameters
 from blf_dsc_controller.arms.urdf import Chain
+from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.ripple import Ripples
 from blf_dsc_controller.identification.stiffness import Compliance
 from blf_dsc_controller.identification.values import Parts, indices, parts
@@ -52,8 +53,7 @@ class Identified(NamedTuple):
     duration: float  # s
     chain: Chain
     parameters: BaseParameters
-    prior: Floats  # (17 n + 14,)
-    prior_covariance: Floats  # (17 n + 14, 17 n + 14)
+    prior: Prior  # of the values
     values: Floats  # (17 n + 14,) from all windows in motion
     covariance: Floats  # (17 n + 14, 17 n + 14) given the recording
     left_out: Floats  # (kinds, n) rms torque of what the model leaves out, N m or N

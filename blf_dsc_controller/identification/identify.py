@@ -36,26 +36,12 @@ from blf_dsc_controller.identification.problems import (
 )
 from blf_dsc_controller.identification.recording import Recording
 from blf_dsc_controller.identification.regression import Fit, fitted
-from blf_dsc_controller.identification.ripple import (
-    PER_HOP,
-    ROWS,
-    SAMPLES,
-    SHORT,
-    Ripples,
-    ripples_of,
-)
+from blf_dsc_controller.identification.ripple import ripples_of
 from blf_dsc_controller.identification.scoring import nearest_friction, scored
 from blf_dsc_controller.identification.selection import Selected, select
-from blf_dsc_controller.identification.stiffness import Compliance, compliance_of
-from blf_dsc_controller.identification.values import parts
+from blf_dsc_controller.identification.stiffness import compliance_of
 from blf_dsc_controller.identification.wider_model import doubt
-from blf_dsc_controller.identification.windows import (
-    COLUMNS,
-    HOP,
-    STILL,
-    shortened,
-)
-from blf_dsc_controller.run import Floats
+from blf_dsc_controller.identification.windows import COLUMNS, HOP, STILL
 
 STAGES = READING, CHECKING, SELECTING, FITTING, INTERVALS, OTHERS = (
     'reading',
@@ -100,7 +86,6 @@ def identify_arm(
         effort=effort,
         picked_up=picked_up,
         find_signs=find_signs,
-        begin=tell_nobody,
     )
     first = trained(begin=begin)
     found = _completed(first, begin)
@@ -127,7 +112,7 @@ def identify_arm(
         return found
     better = _better_convention(
         explained,
-        likely_conventions(recording, robot, unexplained.tolist()),
+        likely_conventions(first.problem, robot.gravity, unexplained.tolist()),
         lambda convention: trained(recording=converted(recording, convention)),
     )
     if better is None:
@@ -138,7 +123,6 @@ def identify_arm(
 class _Trained(NamedTuple):
     """An arm fitted to the first four fifths of a recording, and scored on the rest."""
 
-    recording: Recording
     problem: Problem
     selected: Selected
     fit: Fit
@@ -151,7 +135,7 @@ def _better_load(score: Score, trained: _Trained) -> str:
     carried = trained.problem.carried
     if carried is None or not error < _BETTER * score.total[2]:
         return ''
-    changing = _completed(trained, tell_nobody)
+    changing = _completed(trained)
     mass, deviation = (float(each[0]) for each in changing.load)
     if mass < _SHOWN * deviation or not is_usable(changing):
         return ''
@@ -163,31 +147,26 @@ def _better_convention(
     likely: Sequence[Convention],
     trained_as: Callable[[Convention], _Trained],
 ) -> tuple[Convention, Score] | None:
-    """Return the first of likely ones that explains the torques far better, and its score."""
+    """Return the first of likely ones that explains the torques far better, and its score.
+
+    Signs and offsets that are not needed are left out of it.
+    """
     for convention in likely:
         other = trained_as(convention)
-        is_better = _left(other.score) < _BETTER * _left(explained)
-        if not is_better:
-            continue
         # zeros that are not needed are left out below, so ranges mean nothing yet
-        completed = _completed(other, tell_nobody)._replace(outside=())
-        if is_usable(completed):
-            return _simplest(convention, other.score, trained_as)
-    return None
-
-
-def _simplest(
-    convention: Convention,
-    score: Score,
-    trained_as: Callable[[Convention], _Trained],
-) -> tuple[Convention, Score]:
-    """Return the convention without signs and offsets that are not needed, and its score."""
+        if _left(other.score) < _BETTER * _left(explained) and is_usable(
+            _completed(other)._replace(outside=())
+        ):
+            break
+    else:
+        return None
+    score = other.score
     most = _AS_GOOD * _left(score)
     for i in range(len(convention)):
-        for other in simpler(convention, i):
-            trained = trained_as(other)
+        for without in simpler(convention, i):
+            trained = trained_as(without)
             if _left(trained.score) < most:
-                convention, score = other, trained.score
+                convention, score = without, trained.score
                 break
     return convention, score
 
@@ -204,54 +183,48 @@ def _trained(
     effort: Effort,
     picked_up: float | None,
     find_signs: bool,
-    begin: Callable[[str], None],
+    begin: Callable[[str], None] = tell_nobody,
 ) -> _Trained:
     """Return the arm that is fitted to a part of the recording: enough to compare others."""
     begin(CHECKING)
     problem = problem_of(recording, robot, effort, picked_up, find_signs=find_signs)
     windows = problem.windows
     begin(SELECTING)
-    selected = _selected(problem)
+    selected = select(problem.rows, windows.fit, problem.prior)
     begin(FITTING)
     trained = fitted(selected.rows, windows.fit, selected.prior, selected.found)
     score = scored(selected.rows, windows, problem.prior, trained.values)
-    return _Trained(recording, problem, selected, trained, score)
+    return _Trained(problem, selected, trained, score)
 
 
-def _selected(problem: Problem) -> Selected:
-    """Return the model of an arm."""
-    return select(problem.rows, problem.windows.fit, problem.prior)
-
-
-def _final_fit(problem: Problem, selected: Selected) -> Fit:
-    """Return the fit to all of a recording."""
-    moving = problem.windows.moving
-    return fitted(selected.rows, moving, selected.prior, selected.found)
-
-
-def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
+def _completed(
+    trained: _Trained, begin: Callable[[str], None] = tell_nobody
+) -> Identified:
     """Return the arm that is fitted to all of the recording, with its intervals."""
-    recording, problem, selected, fit, score = trained
+    problem, selected, fit, score = trained
+    recording = problem.recording
     windows = problem.windows
+    moving = windows.moving
+    model = problem.parameters.model
     fits = fit_alone(fit.rows, windows.fit, problem.prior, COLUMNS)
-    final = _final_fit(problem, selected)
+    final = fitted(selected.rows, moving, selected.prior, selected.found)
     rows = final.rows
-    dynamics = nearest_friction(rows, windows, final.values)
-    size = shares(rows, windows.moving, problem.P, final.theta[: rows.p])
-    compliance = _compliance(problem, recording, final)
+    gravity, inertia = shares(rows, moving, problem.P, final.theta[: rows.p])
+    compliance = None
+    if recording.twist is not None:
+        compliance = compliance_of(rows, recording.twist, moving, final, problem.prior)
     begin(INTERVALS)
-    doubted = doubt(problem, selected.prior, final)
+    covariance, torques = doubt(problem, selected.prior, final)
     return Identified(
         source=recording.source,
         duration=recording.duration,
         chain=problem.chain,
         parameters=problem.parameters,
-        prior=problem.prior.mean,
-        prior_covariance=problem.prior.D @ problem.prior.D.T,
+        prior=problem.prior,
         values=final.values,
-        covariance=doubted.covariance,
-        left_out=doubted.torques,
-        dynamics=dynamics,
+        covariance=covariance,
+        left_out=torques,
+        dynamics=nearest_friction(rows, windows, final.values),
         score=score,
         alone=errors_alone(rows, windows.test, fits),
         distances=selected.distances,
@@ -260,40 +233,15 @@ def _completed(trained: _Trained, begin: Callable[[str], None]) -> Identified:
         still=_named(recording.joints, rows.speed < STILL),
         reversed=_named(recording.joints, problem.reversed),
         lasting=final.problem.lasting,
-        rest=(rows.time.size - windows.moving.size) * HOP,
-        clipped=rows.clipped[windows.moving].mean(axis=0),
-        gravity=size.gravity,
-        inertia=size.inertia,
+        rest=(rows.time.size - moving.size) * HOP,
+        clipped=rows.clipped[moving].mean(axis=0),
+        gravity=gravity,
+        inertia=inertia,
         other='',
         carried=problem.carried,
         compliance=compliance,
-        ripples=ripples_left(problem, selected.distances, final),
+        ripples=ripples_of(rows, moving, model, selected.distances, final.theta),
     )
-
-
-def _compliance(problem: Problem, recording: Recording, fit: Fit) -> Compliance | None:
-    """Return the compliances of the gears, if there are positions of motors and links."""
-    if recording.twist is None:
-        return None
-    links = fit.values.copy()
-    parts(links).terms[:] = 0.0
-    parts(links).coupling[:] = 0.0
-    theta = problem.prior.G @ links
-    moving = problem.windows.moving
-    return compliance_of(fit.rows, recording.twist, moving, theta, fit.values[-1])
-
-
-def ripples_left(problem: Problem, distances: Floats, fit: Fit) -> tuple[Ripples, ...]:
-    """Return the ripple of each joint in the torques that a fit leaves.
-
-    `distances` (n,) are those of its contacts.
-    """
-    length = max(SHORT, SAMPLES * fit.rows.period)
-    moving = problem.windows.moving
-    model = problem.parameters.model
-    parts = max(1, min(PER_HOP, ROWS // moving.size))
-    short = shortened(fit.rows, moving, model, distances, length, parts)
-    return ripples_of(short.with_load(fit.theta), fit.theta)
 
 
 def _named(joints: tuple[str, ...], which: np.ndarray) -> tuple[str, ...]:

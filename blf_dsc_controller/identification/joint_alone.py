@@ -66,29 +66,24 @@ def fit_alone(
     """Return the fits to the torques in some windows, with these columns of friction."""
     weighted = Weighted(rows, fit, 0.0)
     (products,) = weighted.products(1)
-    scale = _WEAK * np.linalg.norm(prior.G @ prior.D, axis=1)
-    scale[-1] = _DELAY
+    deviations = _WEAK * np.linalg.norm(prior.G @ prior.D, axis=1)
+    deviations[-1] = _DELAY
     counted = np.sum(rows.weight[fit] ** 2, axis=0)
     fits = []
     for i, of_joint in enumerate(products):
         used = [*range(rows.p), *_unknowns_of(rows, i, columns), rows.unknowns]
-        own = np.zeros_like(scale)
-        own[used] = scale[used]
+        own = np.zeros_like(deviations)
+        own[used] = deviations[used]
         fits.append(_fitted(of_joint, own, float(counted[i])))
-    values = np.array([each.values for each in fits])
+    values = np.array([each.scale * each.z for each in fits])
     of_residuals = np.column_stack((values, np.full(len(values), -1.0)))
     lengths = correlation_lengths(sums_of(weighted.blocks(), of_residuals))
     signs = [
         _sign(each, _unknowns_of(rows, i, SIMPLE[:2]), float(lengths[i]))
         for i, each in enumerate(fits)
     ]
-    return Alone(
-        products,
-        values,
-        np.array([each.residual for each in fits]),
-        np.array([each.torque for each in fits]),
-        np.array(signs),
-    )
+    residual, torque = np.transpose([(each.residual, each.torque) for each in fits])
+    return Alone(products, values, residual, torque, np.array(signs))
 
 
 def errors_alone(rows: Rows, test: Indices, alone: Alone) -> Floats:
@@ -111,11 +106,6 @@ class _Fit(NamedTuple):
     counted: float  # rows
     residual: float
     torque: float
-
-    @property
-    def values(self) -> Floats:
-        """Values (m + 1,)."""
-        return self.scale * self.z
 
 
 def _unknowns_of(rows: Rows, joint: int, columns: Collection[str]) -> list[int]:

@@ -36,6 +36,7 @@ from blf_dsc_controller.identification.windows import (
     STILL,
     Rows,
     add_windows,
+    of_each_joint,
     smoothing_width,
     weighting,
 )
@@ -65,14 +66,8 @@ class LeftOut(NamedTuple):
 
     def matrix(self, windows: Indices) -> Floats:
         """Return the columns (k, n, e n + n) of some windows."""
-        own = self.own[windows]
-        k, e, n = own.shape
-        found = np.zeros((k, n, (e + 1) * n))
-        joints = np.arange(n)
-        for c in range(e):
-            found[:, joints, c * n + joints] = own[:, c]
-        found[:, :, e * n :] = self.elastic[windows]
-        return found
+        own = of_each_joint(self.own[windows])
+        return np.concatenate((own, self.elastic[windows]), axis=2)
 
 
 def left_out(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> LeftOut:
@@ -93,7 +88,8 @@ def _of_friction(rows: Rows, values: Floats) -> Iterator[tuple[str, Floats]]:
     coulomb = np.maximum(terms[COULOMB], least)
     speed = np.maximum(rows.speed, STILL)
     viscous = np.maximum(terms[VISCOUS], least / speed)
-    sliding = [_contact(rows, distance) for distance in DISTANCES]
+    contacts = (np.full(speed.size, distance) for distance in DISTANCES)
+    sliding = [rows.with_sliding(each).columns['Coulomb'] for each in contacts]
     for fading in _FADINGS:
         yield 'fading', coulomb * rows.stribeck(*fading)
     for a, b in pairwise(sliding):
@@ -112,11 +108,6 @@ def _of_torque(rows: Rows, theta: Floats) -> Iterator[tuple[str, Floats]]:
     loads = np.abs(rows.torques(everything, of_bodies))
     yield 'load', loads * rows.columns['Coulomb']
     yield 'gain', rows.torques(everything, theta)
-
-
-def _contact(rows: Rows, distance: float) -> Floats:
-    """Return the column (R, n) of Coulomb friction for a distance."""
-    return rows.with_sliding(np.full(rows.speed.size, distance)).columns['Coulomb']
 
 
 def _elastic(rows: Rows, model: SerialChain, G: Floats, values: Floats) -> Floats:

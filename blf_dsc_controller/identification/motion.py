@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is checked of a motion as a file has it, a bag or a table, before it is resampled.
+"""A motion as a file has it, a bag or a table: what is checked of it, and its even samples.
 
 Positions in degrees are told from those in rad by how far and how fast the joints would
 turn.  In degrees, a joint seems 57 times as fast: one that moves with 6 % of its speed
@@ -22,13 +22,20 @@ from blf_dsc_controller.identification.bad_values import (
     unrecorded,
 )
 from blf_dsc_controller.identification.recording import (
+    GAP,
+    LONGEST_PERIOD,
     TURN,
     Flags,
+    Indices,
     Recording,
-    resampled,
+    interpolated,
 )
 from blf_dsc_controller.run import Floats, Stamps
 
+_JITTER = 1.2  # times `LONGEST_PERIOD`, median that is accepted
+_LEAST_PERIOD = 1e-5  # s, likewise
+_FEWEST = 10  # states
+_SPARSE = 100.0  # times the intervals between states: longest bag
 _BEYOND = 2.0  # times what a joint reaches, and at least turns: no angle in rad
 _FAST = 3.0  # times its limit: no speed of most joints in rad/s
 _SHARE = 0.9  # of the time, in which joints are slower than the speed that is compared
@@ -84,21 +91,97 @@ class Motion(NamedTuple):
 def recording_of(motion: Motion, tree: Tree) -> Recording:
     """Return the sound states of a motion as a recording, in rad and N m.
 
+    It is sampled evenly, interpolated over uneven stamps and up to two lost states.  Positions
+    of joints that turn may be wrapped to one turn.
+
     Raises:
         BlfDscError: positions or torques cannot be what they are said to be, or there are
             too few.
     """
     sound = checked(motion, tree)
     joints = tuple(sound.joints)
-    return resampled(
-        joints,
-        sound.stamp,
-        sound.q.scaled,
-        sound.tau.scaled,
-        '; '.join([sound.source, *sound.said]),
-        tree.turning(joints),
-        sound.theta and sound.theta.scaled,
-    )._replace(currents=sound.currents)
+    turning = tree.turning(joints)
+    stamp = sound.stamp
+    groups = [
+        each.scaled for each in (sound.q, sound.tau, sound.theta) if each is not None
+    ]
+    order = _order(stamp, groups)
+    if not np.array_equal(order, np.arange(stamp.size)):
+        stamp = stamp[order]
+        groups = [each[order] for each in groups]
+    q, torque, *motors = groups
+    source = '; '.join([sound.source, *sound.said])
+    time, even, period, gap = _grid_of(stamp)
+    turns = _turns(q, turning)
+    if turns.any():
+        q = q + TURN * turns
+        names = ', '.join(np.array(joints)[turns.any(axis=0)])
+        source = f'{source} (positions of {names} are wrapped: full turns added)'
+    twist = None
+    if motors:
+        twist = interpolated(even, time, _twist(q, motors[0], turning))
+    q, torque = (interpolated(even, time, each) for each in (q, torque))
+    return Recording(joints, period, q, torque, gap, source, sound.currents, twist)
+
+
+def _order(stamp: Stamps, groups: Sequence[Floats]) -> Indices:
+    """Return the rows in which all values are known, each stamp once, in their order."""
+    known = [np.isfinite(each).all(axis=1) for each in groups]
+    order = np.flatnonzero(np.all(known, axis=0))
+    return order[np.unique(stamp[order], return_index=True)[1]]
+
+
+def _turns(q: Floats, turning: Flags) -> Floats:
+    """Return the full turns (N, n) that the encoders of joints have left out.
+
+    From one state to the next, a joint turns by less than half a turn.  A larger step is
+    the end of the encoder's range.
+    """
+    turns = np.diff(q, axis=0, prepend=q[:1])
+    turns /= -TURN
+    np.round(turns, out=turns)
+    turns *= turning
+    return np.cumsum(turns, axis=0, out=turns)
+
+
+def _grid_of(stamp: Stamps) -> tuple[Floats, Floats, float, Flags]:
+    """Return the times [s] of states at these stamps, which increase, and even ones.
+
+    Also the period of the latter [s], and whether nothing was recorded at each.
+
+    Raises:
+        BlfDscError: there are too few, or they cannot be of one clock.
+    """
+    if stamp.size < _FEWEST:
+        raise BlfDscError(
+            f'there are {stamp.size} joint state(s) with a position, a torque and a unique '
+            'stamp; hundreds are needed'
+        )
+    time = (stamp - stamp[0]) * 1e-9
+    intervals = np.diff(time)
+    period = float(np.median(intervals))
+    if period > _JITTER * LONGEST_PERIOD:
+        raise BlfDscError(
+            f'the joint states are {period:.3g} s apart; at least one in {LONGEST_PERIOD:g} s is '
+            f'needed: record them at {1.0 / LONGEST_PERIOD:.0f} Hz or more'
+        )
+    if period < _LEAST_PERIOD or time[-1] > _SPARSE * period * time.size:
+        raise BlfDscError(
+            f'{time.size} joint states are {period:.3g} s apart, but the last one comes '
+            f'{time[-1]:.3g} s after the first: are their stamps of one clock? Cut the recording '
+            'where they jump'
+        )
+    even = np.arange(0.0, time[-1], period)
+    gap = (intervals > GAP * period)[np.searchsorted(time, even, side='right') - 1]
+    return time, even, period, gap
+
+
+def _twist(links: Floats, motors: Floats, turning: Flags) -> Floats:
+    """Return motors minus links (N, n), without what their zeros differ by, and full turns."""
+    twist = motors - links
+    twist -= np.median(twist, axis=0)
+    twist -= TURN * np.round(twist / TURN) * turning
+    return twist
 
 
 def checked(motion: Motion, tree: Tree) -> Motion:
@@ -128,8 +211,8 @@ def checked(motion: Motion, tree: Tree) -> Motion:
 
 def _check_known(motion: Motion, group: Group) -> None:
     """Raise BlfDscError if a column has no numbers."""
-    known = extremes(group.values)
-    empty = np.flatnonzero(known.least > known.most)
+    least, most = extremes(group.values)
+    empty = np.flatnonzero(least > most)
     if empty.size:
         raise BlfDscError(
             f'{motion.path}: {group.names[int(empty[0])]} has no numbers: {motion.others}'
@@ -139,7 +222,8 @@ def _check_known(motion: Motion, group: Group) -> None:
 def _check_angles(motion: Motion, tree: Tree) -> None:
     """Raise BlfDscError if positions are far beyond what the joints can reach."""
     reach = np.where(tree.turning(motion.joints), tree.reaches(motion.joints), np.inf)
-    found = extremes(motion.q.values).largest * motion.q.factors
+    least, most = extremes(motion.q.values)
+    found = np.maximum(-least, most) * motion.q.factors
     beyond = np.flatnonzero(found > _BEYOND * np.maximum(reach, TURN))
     if beyond.size:
         k = int(beyond[0])

@@ -9,9 +9,14 @@ is within two degrees.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import product
+
 import numpy as np
 
-from blf_dsc_controller.arms.urdf import Chain, frames
+from blf_dsc_controller.arms.model import regressors_at
+from blf_dsc_controller.arms.serial_chain import serial_chain
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.identification.joint_alone import SIMPLE, Alone
 from blf_dsc_controller.identification.plausibility import inertial_torques
 from blf_dsc_controller.identification.recording import Indices
@@ -41,10 +46,8 @@ def other_mounting(
     if strength < _LEAST * size or found @ gravity > _APART * strength * size:
         return None
     direction = found / strength
-    axis = np.zeros(3)
-    main = int(np.argmax(np.abs(direction)))
-    axis[main] = np.sign(direction[main])
-    return size * (axis if direction @ axis > _SNAP else direction)
+    axis = np.trunc(direction / _SNAP) + 0.0  # zero, not -0, if none is near
+    return size * (axis if axis.any() else direction)
 
 
 def _shown_gravity(
@@ -55,10 +58,12 @@ def _shown_gravity(
     # what friction does not show is taken to be as in most joints
     most = np.sign(np.sum(alone.friction)) or 1.0
     signs = np.where(alone.friction == 0.0, most, alone.friction)
+    q = rows.postures[fit]
+    of_gravity = [gravity_torques(chain, axis)(q) for axis in np.eye(3)]
     columns = np.concatenate(
         (
             np.swapaxes(rows.friction(fit, SIMPLE), 1, 2),
-            gravity_columns(chain, rows.postures[fit]),
+            np.stack(of_gravity, axis=2),
             inertial[:, :, None],
             (signs * rows.u(alone.delay)[fit])[:, :, None],
         ),
@@ -67,36 +72,27 @@ def _shown_gravity(
     columns *= (rows.weight[fit] / alone.deviation)[:, :, None]
     R = np.asarray(np.linalg.qr(np.moveaxis(columns, 1, 0), mode='r'))
     left = R[:, len(SIMPLE) :, len(SIMPLE) :]  # for any friction
-    A = np.concatenate((_towards(given), *left))
+    # what the torques do not show is as given
+    weight = _UNSEEN / float(np.linalg.norm(given))
+    towards = weight * np.column_stack((np.eye(3), np.zeros(3), given))
+    A = np.concatenate((towards, *left))
     found, *_ = np.linalg.lstsq(A[:, :-1], A[:, -1], rcond=None)
     # without friction, inertia shows whether all efforts are of the opposite sign
     is_opposite = not alone.friction.any() and found[3] < 0.0
     return np.asarray(-found[:3] if is_opposite else found[:3])
 
 
-def _towards(given: Floats) -> Floats:
-    """Return rows (3, 5) by which what the torques do not show is as given."""
-    weight = _UNSEEN / float(np.linalg.norm(given))
-    return np.column_stack((weight * np.eye(3), np.zeros(3), weight * given))
+def gravity_torques(chain: Chain, gravity: Floats) -> Callable[[Floats], Floats]:
+    """Return what gives the torques (k, n) [N m or N] of gravity (3,) [m/s^2] at q (k, n).
 
+    They are those of the masses and centres of the URDF.
+    """
+    joints = range(len(chain.joints))
+    model = serial_chain(chain, tuple(gravity), list(product(joints, range(4))))
+    moments = chain.inertias[:, :4].ravel()
 
-def gravity_columns(chain: Chain, q: Floats) -> Floats:
-    """Return the torques (..., n, 3) [N m or N] that each m/s^2 of gravity needs at q (..., n)."""
-    placements = frames(chain, q)[1:-1]
-    mass = 0.0
-    first = np.zeros((*q.shape[:-1], 3))  # moments of all beyond a joint, in the base
-    columns = np.zeros((*q.shape, 3))
-    for i in reversed(range(len(chain.joints))):
-        joint = chain.joints[i]
-        rotation = placements[i][..., :3, :3]
-        origin = placements[i][..., :3, 3]
-        m = float(joint.inertia[0])
-        mass += m
-        first = first + rotation @ joint.inertia[1:4] + m * origin
-        axis = rotation @ joint.axis
-        if joint.kind == 'prismatic':
-            columns[..., i, :] = -mass * axis
-        else:
-            arm = first - mass * origin
-            columns[..., i, :] = -np.cross(axis, arm)
-    return columns
+    def torques(q: Floats) -> Floats:
+        still = np.zeros_like(q)
+        return np.asarray(regressors_at(model, q, still, still, still) @ moments)
+
+    return torques

@@ -9,6 +9,7 @@ from typing import Any
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.identified import Identified
 from blf_dsc_controller.identification.values import ROTOR_INERTIA
+from blf_dsc_controller.run import Floats
 
 _DIGITS = 6  # significant
 
@@ -21,16 +22,16 @@ def robot_parameters(found: Identified, robot: Robot, urdf: Path) -> dict[str, A
         'base': found.chain.base,
         'tip': found.chain.tip,
         'gravity': tuple(robot.gravity),
-        'rotor_inertia': found.parts.terms[ROTOR_INERTIA],
-        'viscous': viscous,
-        'coulomb': coulomb,
+        'rotor_inertia': _rounded(found.parts.terms[ROTOR_INERTIA]),
+        'viscous': _rounded(viscous),
+        'coulomb': _rounded(coulomb),
     }
-    names = ['rotor_inertia', 'viscous', 'coulomb']
     compliance = found.compliance
     if compliance and compliance.is_twist and compliance.is_known.all():
-        names.append('joint_stiffness')
-        values['joint_stiffness'] = compliance.stiffness[0]
-    for name in names:
-        values[name] = tuple(float(f'{value:.{_DIGITS}g}') for value in values[name])
+        values['joint_stiffness'] = _rounded(compliance.stiffness[0])
     parameters = {f'robot.{name}': value for name, value in values.items()}
     return {'joints': tuple(found.joints), **parameters}
+
+
+def _rounded(values: Floats) -> tuple[float, ...]:
+    return tuple(float(f'{value:.{_DIGITS}g}') for value in values)

@@ -40,11 +40,6 @@ class Cones(NamedTuple):
     E: Floats  # (g, k, d, d)
     power: Floats  # (g,) of their determinants in the density of the prior
 
-    @classmethod
-    def of(cls, each: Sequence[tuple[Indices, Floats, Floats, float]]) -> Cones:
-        """Return the cones with these entries (k,), J0, E and powers."""
-        return cls(*map(np.array, zip(*each, strict=True)))
-
     def but(self, entries: Sequence[int]) -> Cones:
         """Return the cones that depend on none of these entries."""
         is_kept = ~np.isin(self.entries, entries).any(axis=1)

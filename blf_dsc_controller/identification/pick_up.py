@@ -32,13 +32,13 @@ def carried_load(rows: Rows, windows: Split, prior: Prior) -> Carried:
     steps = max(moving.size // _per_step(moving), 2)
     found = regression(rows, moving, prior)
     load = prior.at.load
-    with_load, empty = [], found.products
-    for products in Weighted(found.rows, moving, found.delay).products(steps):
-        added = _columns(of_prior(products, found.deviation, prior.T), load)
-        with_load.append(added)
-        empty -= added
+    added = [
+        _columns(of_prior(products, found.deviation, prior.T), load)
+        for products in Weighted(found.rows, moving, found.delay).products(steps)
+    ]
     # of the load in all steps before each
-    before = np.concatenate((np.zeros((1, *empty.shape)), np.cumsum(with_load, axis=0)))
+    before = np.cumsum([np.zeros_like(added[0]), *added], axis=0)
+    empty = found.products - before[-1]
 
     def cost(begin: int, end: int) -> float:
         products = empty + before[end] - before[begin]

@@ -10,7 +10,6 @@ its share is near 0.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,19 +28,17 @@ _TOLERANCE = 0.05  # rad or m, beyond the limits of a joint
 _FAINT = 0.02  # of the torque of the URDF, least part that says anything
 
 
-class Shares(NamedTuple):
-    """Shares of the URDF's torques; NaN where that of the URDF would be faint."""
+def shares(
+    rows: Rows, fit: Indices, urdf: Floats, found: Floats
+) -> tuple[float, float]:
+    """Return the shares of the URDF's gravity, and inertial torques, of P (p,) in some windows.
 
-    gravity: float
-    inertia: float
-
-
-def shares(rows: Rows, fit: Indices, urdf: Floats, found: Floats) -> Shares:
-    """Return the shares of base parameters (p,) in some windows."""
+    They are NaN where the URDF's would be faint.
+    """
     gravity, inertial = inertial_torques(rows, fit, urdf)
     found_gravity, found_inertial = inertial_torques(rows, fit, found)
     size = float(np.sqrt(np.mean((gravity + inertial) ** 2)))
-    return Shares(
+    return (
         _share(_varying(found_gravity), _varying(gravity), size),
         _share(found_inertial, inertial, size),
     )

@@ -26,20 +26,16 @@ from blf_dsc_controller.arms.base_parameters import (
     payload_inertia,
 )
 from blf_dsc_controller.arms.inertia import inertia_of, moved, pseudo_inertia
-from blf_dsc_controller.arms.urdf import Chain, Joint
+from blf_dsc_controller.arms.urdf import Chain
 from blf_dsc_controller.configuration.robot import Robot
 from blf_dsc_controller.identification.physical import Cones
 from blf_dsc_controller.identification.values import (
     COULOMB,
-    JOINT_TERMS,
     LOAD,
-    LOAD_FRICTION,
     OFFSET,
     OPTIONAL,
     POSITIVE,
-    QUADRATIC,
     ROTOR_INERTIA,
-    STRIBECK,
     VISCOUS,
     Parts,
     base_matrix,
@@ -144,7 +140,7 @@ def prior_of(
     bodies = []  # entries, J0, E and power of their cones
     blocks = []
     for i, joint in enumerate(chain.joints):
-        D = _of_body(joint)
+        D = deviations(pseudo_inertia(joint.inertia), LINKS, CENTRE)
         if i == n - 1:
             D = _with_payload(D, chain, robot.payload)
         blocks.append(D)
@@ -169,18 +165,14 @@ def prior_of(
     )
     of_load = np.zeros((LOAD, LOAD))
     if load:
-        of_load = _of_load(chain, robot.payload)
+        J = payload_inertia(max(robot.payload, _LIGHTEST))
+        of_load = deviations(moved(J, chain.tip_placement), 1.0, 2.0 * PAYLOAD_SIZE)
         bodies.append((at.load, np.zeros((4, 4)), _pseudo_inertias(of_load), 0.0))
     start[at.load[0]] = _FIRST
     of_terms = np.diag(np.append(spread, coupling))
     D = block_diag(*blocks, of_terms, of_load, _DELAY)
-    cones = Cones.of(bodies), terms
+    cones = Cones(*map(np.array, zip(*bodies, strict=True))), terms
     return Prior(base_matrix(parameters, n), mean, D, cones, start)
-
-
-def _of_body(joint: Joint) -> Floats:
-    """Return the deviations (10, 10) of a body."""
-    return deviations(pseudo_inertia(joint.inertia), LINKS, CENTRE)
 
 
 def _with_payload(D: Floats, chain: Chain, payload: float) -> Floats:
@@ -190,25 +182,21 @@ def _with_payload(D: Floats, chain: Chain, payload: float) -> Floats:
     return np.transpose(np.linalg.qr(both.T, mode='r'))
 
 
-def _of_load(chain: Chain, payload: float) -> Floats:
-    """Return the deviations (10, 10) of a load that is picked up."""
-    J = moved(payload_inertia(max(payload, _LIGHTEST)), chain.tip_placement)
-    return deviations(J, 1.0, 2.0 * PAYLOAD_SIZE)
-
-
 def _of_terms(rotors: Floats, torque: Floats, speed: Floats) -> Floats:
     """Return the deviations (7, n) of JOINT_TERMS."""
     coulomb = _FRICTION * torque
     viscous = coulomb / speed
-    spread = np.zeros((len(JOINT_TERMS), torque.size))
-    spread[ROTOR_INERTIA] = np.maximum(rotors, torque / _ROTOR)
-    spread[VISCOUS] = viscous
-    spread[COULOMB] = coulomb
-    spread[LOAD_FRICTION] = _LOAD
-    spread[OFFSET] = _OFFSET * torque
-    spread[STRIBECK] = coulomb
-    spread[QUADRATIC] = viscous / speed
-    return spread
+    return np.array(
+        (
+            np.maximum(rotors, torque / _ROTOR),
+            viscous,
+            coulomb,
+            np.full_like(torque, _LOAD),
+            _OFFSET * torque,
+            coulomb,  # Stribeck
+            viscous / speed,  # quadratic
+        )
+    )
 
 
 def _pseudo_inertias(D: Floats) -> Floats:

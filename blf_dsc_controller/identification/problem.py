@@ -39,6 +39,7 @@ _TINY = 1e-6  # N m or N, least torque that scales a prior
 class Problem(NamedTuple):
     """What is fitted: torques of the rows, by values whose prior is that of the URDF."""
 
+    recording: Recording
     chain: Chain
     parameters: BaseParameters
     rows: Rows
@@ -76,6 +77,7 @@ def problem_of(
     speed = np.maximum(rows.speed, STILL)
     load = picked_up is not None
     problem = Problem(
+        recording=recording,
         chain=chain,
         parameters=parameters,
         rows=rows,

@@ -37,7 +37,10 @@ def problems_of(found: Identified, effort: str) -> Iterator[str]:
         yield found.other
         return
     yield from _size_problems(found, effort)
-    if not is_explained(found):
+    # better than the URDF, and not much worse than models of joints alone
+    urdf, _, total = found.score.total
+    alone = 100.0 * np.sqrt(np.sum(found.alone**2) / np.sum(found.score.torque**2))
+    if not total <= min(100.0 * _POOR, max(100.0 * _GOOD, _FAR * alone), urdf):
         yield (
             'DO NOT USE this URDF: it does not explain the torques held back. Are the efforts in '
             'N m or N (currents need --gains), is --gravity given in the base frame, are the '
@@ -211,14 +214,3 @@ def unexplained_joints(found: Identified) -> Indices:
 def is_usable(found: Identified) -> bool:
     """Whether the model explains the torques held back, and is of the size of the URDF's."""
     return not any(problems_of(found, ''))
-
-
-def is_explained(found: Identified) -> bool:
-    """Whether the model explains the torques held back.
-
-    It must be better than the URDF, and not much worse than models of joints alone.
-    """
-    urdf, _, total = found.score.total
-    alone = 100.0 * np.sqrt(np.sum(found.alone**2) / np.sum(found.score.torque**2))
-    most = max(100.0 * _GOOD, _FAR * float(alone))
-    return bool(total <= min(100.0 * _POOR, most, urdf))

@@ -22,14 +22,12 @@ def scored(rows: Rows, windows: Split, prior: Prior, values: Floats) -> Score:
     """Return the score of values that were fitted to `windows.fit`."""
     rows = rows.with_load(prior.G @ values)
     moving = windows.moving
-    urdf = np.zeros_like(values)
-    parts(urdf).bodies[:] = parts(prior.mean).bodies
-    corrected = np.zeros_like(values)
-    parts(corrected).bodies[:] = parts(values).bodies
-    parts(corrected).load[:] = parts(values).load
-    predicted = np.array(
-        [rows.torques(moving, prior.G @ model) for model in (urdf, corrected, values)]
-    )
+    models = np.zeros((3, values.size))  # URDF, corrected URDF, all values
+    parts(models[0]).bodies[:] = parts(prior.mean).bodies
+    parts(models[1]).bodies[:] = parts(values).bodies
+    parts(models[1]).load[:] = parts(values).load
+    models[2] = values
+    predicted = np.array([rows.torques(moving, prior.G @ model) for model in models])
     columns = _columns_of_urdf(rows, moving)
     friction_of_urdf = parts(prior.mean).terms[[VISCOUS, COULOMB]]
     predicted[0] += np.sum(columns * friction_of_urdf, axis=1)

@@ -36,18 +36,46 @@ def likely_signs(alone: Alone, prior: Prior) -> Signs:
 
     Of signs that are as good, those of most joints are alike, and as recorded.
     """
-    fit = _Fit(alone, prior)
+    mean, half = _products(alone, prior)
+
+    def physical(products: Floats) -> Floats:
+        return solve(products, prior.cones, prior.start)
+
+    def cost(signs: Signs, solution: Callable[[Floats], Floats]) -> float:
+        """Return the squared residuals and deviations of the solution for products."""
+        products = mean + np.tensordot(signs, half, 1)
+        z = solution(products)
+        return left_of(products, z) + float(z @ z)
+
     combinations = list(_combinations(alone))
-    bounds = np.array([fit.cost(signs, most_likely) for signs in combinations])
+    bounds = np.array([cost(signs, most_likely) for signs in combinations])
     costs: dict[int, float] = {}
     least = np.inf
     for k in np.argsort(bounds)[:_MOST].tolist():
         if bounds[k] > _AS_GOOD * least:
             break
-        costs[k] = fit.cost(combinations[k], fit.physical)
+        costs[k] = cost(combinations[k], physical)
         least = min(costs.values())
-    as_good = [combinations[k] for k, cost in costs.items() if cost <= _AS_GOOD * least]
+    as_good = [
+        combinations[k] for k, found in costs.items() if found <= _AS_GOOD * least
+    ]
     return min(as_good, key=_oddity)
+
+
+def _products(alone: Alone, prior: Prior) -> tuple[Floats, Floats]:
+    """Return [A | b]^T [A | b] of the whole arm: mean of both signs, and n halves of differences.
+
+    Torques have no delay but that of `alone`.
+    """
+    of_joints = alone.products / alone.deviation[:, None, None] ** 2
+    both = []
+    for sign in (1.0, -1.0):
+        T = prior.T.copy()
+        T[-2:] = 0.0
+        T[-2:, -1] = -sign * alone.delay, sign
+        both.append(0.5 * (T.T @ of_joints @ T))
+    recorded, opposite = both
+    return (recorded + opposite).sum(axis=0), recorded - opposite
 
 
 def _combinations(alone: Alone) -> Iterator[Signs]:
@@ -69,33 +97,3 @@ def _oddity(signs: Signs) -> tuple[int, int]:
     """Return how many joints differ from most others, and how many are reversed."""
     opposite = int(np.sum(signs < 0.0))
     return min(opposite, signs.size - opposite), opposite
-
-
-class _Fit:
-    """The fit of the whole arm to torques with given signs, without their delay."""
-
-    def __init__(self, alone: Alone, prior: Prior) -> None:
-        k = prior.mean.size
-        # from rows of `Weighted` to those of z, of the prior's mean, and of the torques
-        T = np.zeros((alone.products.shape[1], k + 2))
-        T[:-2, :-1] = prior.T[:-2]
-        T[-2:, -1] = -alone.delay, 1.0
-        deviation = alone.deviation[:, None, None]
-        products = T.T @ (alone.products / deviation**2) @ T  # (n, k + 2, k + 2)
-        self._alike = products.sum(axis=0)
-        self._with_torque = products[:, -1]  # (n, k + 2), of which each has a sign
-        self._prior = prior
-
-    def cost(self, signs: Signs, solution: Callable[[Floats], Floats]) -> float:
-        """Return the squared residuals and deviations of the solution for products."""
-        crossed = signs @ self._with_torque
-        products = self._alike[:-1, :-1].copy()
-        products[-1] += crossed[:-1]
-        products[:, -1] += crossed[:-1]
-        products[-1, -1] += self._alike[-1, -1]
-        z = solution(products)
-        return left_of(products, z) + float(z @ z)
-
-    def physical(self, products: Floats) -> Floats:
-        """Return the most likely z of a physical arm."""
-        return solve(products, self._prior.cones, self._prior.start)

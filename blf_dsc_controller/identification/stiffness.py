@@ -22,8 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from blf_dsc_controller.identification.prior import Prior
 from blf_dsc_controller.identification.recording import Indices
-from blf_dsc_controller.identification.regression import correlation_length
+from blf_dsc_controller.identification.regression import Fit, correlation_length
+from blf_dsc_controller.identification.values import parts
 from blf_dsc_controller.identification.windows import Rows
 from blf_dsc_controller.numerics.intervals import TWO_SIDED
 from blf_dsc_controller.run import Floats
@@ -77,16 +79,15 @@ class Compliance(NamedTuple):
 
 
 def compliance_of(
-    rows: Rows, twist: Floats, windows: Indices, links: Floats, delay: float
+    rows: Rows, twist: Floats, windows: Indices, fit: Fit, prior: Prior
 ) -> Compliance:
-    """Return the compliances by the twist (N, n) in some windows.
-
-    `links` are the identified values without friction, rotors, and the delay [s] of the
-    torques.
-    """
+    """Return the compliances by the twist (N, n) in some windows, for the values of a fit."""
+    links = fit.values.copy()
+    parts(links).terms[:] = 0.0
+    parts(links).coupling[:] = 0.0
     twists = rows.over_windows(lambda at: twist[at])[windows]
-    u = rows.u(delay)[windows]
-    needed = rows.torques(windows, links)
+    u = rows.u(fit.values[-1])[windows]
+    needed = rows.torques(windows, prior.G @ links)
     rate = np.gradient(needed, rows.time[windows], axis=0)
     others = np.stack((
         *np.moveaxis(rows.friction(windows), 1, 0),

@@ -40,19 +40,6 @@ _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not expl
 
 _NOTHING = 1e-3  # of half of its interval, value that is printed as 0 ...
 _ROUNDING = 1e-9  # ... and value of a URDF
-_OF_JOINTS = (
-    (
-        ', for which a URDF has no place: calibrate the torque sensors, or let the controller '
-        'learn them (learning.bias)'
-    ),
-    ': these are torques, not noise, and may have shifted values beyond their intervals',
-    ' did not move: rotors and friction of these are guesses',
-    ', so the error in % means little there',
-    (
-        ' are not explained: do not trust the values there before sign, unit and zero are those '
-        'of the URDF'
-    ),
-)  # offsets, lasting residuals, joints that are still, idle, poorly explained
 _OF_REPEATED = (
     'the motion repeats, and with it whatever model and friction err by, which may look like a '
     'ripple: use only what a minute of motion that does not repeat shows, too'
@@ -113,14 +100,9 @@ def load_table(found: Identified) -> Iterator[str]:
 
 def _mass_and_centre(values: Floats, deviations: Floats) -> Iterator[str]:
     """Yield mass [kg] and centre [mm] of values in kg and m (4,), with their intervals."""
-    for value, deviation, scale, digits in zip(
-        values,
-        deviations,
-        (1.0, 1e3, 1e3, 1e3),
-        ('.3f', '.1f', '.1f', '.1f'),
-        strict=True,
-    ):
-        yield interval(scale * value, scale * deviation, digits)
+    yield interval(values[0], deviations[0], '.3f')
+    for value, deviation in zip(1e3 * values[1:], 1e3 * deviations[1:], strict=True):
+        yield interval(value, deviation, '.1f')
 
 
 def bodies_table(found: Identified) -> str:
@@ -216,9 +198,9 @@ def base_table(found: Identified) -> Iterator[str]:
     """Yield the base parameters before and after, and which of them the recording shows."""
     parameters = found.parameters
     K = base_matrix(parameters, len(found.chain.joints))[: len(parameters.combinations)]
-    before = K @ found.prior
+    before = K @ found.prior.mean
     after = K @ found.values
-    prior = np.einsum('ia,ab,ib->i', K, found.prior_covariance, K)
+    prior = np.sum((K @ found.prior.D) ** 2, axis=1)
     posterior = np.einsum('ia,ab,ib->i', K, found.covariance, K)
     yield 'base parameters (all that torques can show), in kg, kg m, kg m^2:'
     for k, name in enumerate(parameters.combinations):
@@ -301,34 +283,41 @@ def _delay_notes(found: Identified) -> Iterator[str]:
 
 def _joint_notes(found: Identified) -> Iterator[str]:
     """Yield what is odd with joints: one note for all that share it."""
-    score = found.score
-    share = score.errors[2] / score.torque
-    unexplained = unexplained_joints(found)
-    shared: dict[str, list[str]] = {ending: [] for ending in _OF_JOINTS}
-    offsets, lasting, still, idle, poor = shared.values()
-    for i, joint in enumerate(found.chain.joints):
-        name = joint.name
-        unit = units_of(joint.kind)[OFFSET]
-        offset = found.parts.terms[OFFSET, i]
-        if abs(offset) > _LARGE_OFFSET * score.torque[i]:
-            offsets.append(f'{name} has an offset of {offset:.2g} {unit}')
-        if found.clipped[i]:
-            yield (
-                f'the torque of {name} is clipped, as by a limit: {100.0 * found.clipped[i]:.0f} % '
-                'of its rows were left out'
-            )
-        if found.lasting[i] > _LASTING:
-            of = f'that of {name}' if lasting else f'the residual of {name} lasts'
-            lasting.append(f'{of} ({found.lasting[i]:.2g} s)')
-        if name in found.still:
-            still.append(name)
-        elif share[i] > _ALL_WRONG and score.torque[i] < IDLE * score.torque.max():
-            idle.append(f'{name} hardly needs a torque ({score.torque[i]:.2g} {unit})')
-        elif i in unexplained:
-            poor.append(f'{100.0 * share[i]:.0f} % of the torque of {name}')
-    for ending, joints in shared.items():
-        if joints:
-            yield ', '.join(joints) + ending
+    torque = found.score.torque
+    share = found.score.errors[2] / torque
+    names = found.joints
+    units = [units_of(joint.kind)[OFFSET] for joint in found.chain.joints]
+    offsets = found.parts.terms[OFFSET]
+    is_still = np.isin(names, found.still)
+    is_idle = (share > _ALL_WRONG) & (torque < IDLE * torque.max()) & ~is_still
+    for i in np.flatnonzero(found.clipped):
+        yield (
+            f'the torque of {names[i]} is clipped, as by a limit: {100.0 * found.clipped[i]:.0f} % '
+            'of its rows were left out'
+        )
+    notes = {
+        ', for which a URDF has no place: calibrate the torque sensors, or let the controller '
+        'learn them (learning.bias)': [
+            f'{names[i]} has an offset of {offsets[i]:.2g} {units[i]}'
+            for i in np.flatnonzero(np.abs(offsets) > _LARGE_OFFSET * torque)
+        ],
+        ': these are torques, not noise, and may have shifted values beyond their intervals': [
+            f'{"that of" if k else "the residual of"} {names[i]}{"" if k else " lasts"} '
+            f'({found.lasting[i]:.2g} s)'
+            for k, i in enumerate(np.flatnonzero(found.lasting > _LASTING))
+        ],
+        ' did not move: rotors and friction of these are guesses': found.still,
+        ', so the error in % means little there': [
+            f'{names[i]} hardly needs a torque ({torque[i]:.2g} {units[i]})'
+            for i in np.flatnonzero(is_idle)
+        ],
+        ' are not explained: do not trust the values there before sign, unit and zero are those '
+        'of the URDF': [
+            f'{100.0 * share[i]:.0f} % of the torque of {names[i]}'
+            for i in np.sort(unexplained_joints(found))
+        ],
+    }
+    yield from (', '.join(joints) + what for what, joints in notes.items() if joints)
 
 
 def _doubt_notes(found: Identified) -> Iterator[str]:
@@ -370,21 +359,14 @@ def _stiffness_notes(found: Identified) -> Iterator[str]:
             'was not computed'
         )
         return
-    equal = names[compliance.largest == 0.0]
-    if equal.size:
-        yield (
-            f'{", ".join(equal)}: motors and links have the same positions, as where a robot has '
-            'one encoder and reports it twice'
-        )
-    against = names[compliance.is_negative]
-    if against.size:
-        yield (
-            f'{", ".join(against)} twist against their torques: are the positions of motors '
-            '(theta) and links (q) exchanged?'
-        )
-    computed = names[compliance.is_computed]
-    if computed.size:
-        yield (
-            f'{", ".join(computed)} twist so exactly by their torques that the robot computes one '
-            'position from the other: their stiffness is the one that it assumes'
-        )
+    notes = {
+        ': motors and links have the same positions, as where a robot has one encoder and '
+        'reports it twice': compliance.largest == 0.0,
+        ' twist against their torques: are the positions of motors (theta) and links (q) '
+        'exchanged?': compliance.is_negative,
+        ' twist so exactly by their torques that the robot computes one position from the '
+        'other: their stiffness is the one that it assumes': compliance.is_computed,
+    }
+    for what, which in notes.items():
+        if which.any():
+            yield ', '.join(names[which]) + what

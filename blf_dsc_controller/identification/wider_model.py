@@ -29,7 +29,6 @@ like another such factor.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,16 +59,14 @@ _LOST = 0.6  # of the mean load friction: gears lose more driving than driven
 _FLOOR = 1e-4  # of a joint's torque, least residual
 
 
-class Doubt(NamedTuple):
-    """What the wider model says of the values, and of what the model leaves out."""
+def doubt(problem: Problem, prior: Prior, fit: Fit) -> tuple[Floats, Floats]:
+    """Return what the wider model says of a fit to all motion with this prior.
 
-    covariance: Floats  # (17 n + 14, 17 n + 14) of the values
-    # (kinds, n) rms torque of each kind of `left_out`, N m or N
-    torques: Floats
+    That is the covariance of its values (17 n + 14, 17 n + 14), and the rms torque of each kind
+    of `left_out` (kinds, n) [N m or N].
+    """
+    from scipy.special import stdtrit
 
-
-def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
-    """Return the doubt in a fit to all motion with this prior."""
     model = problem.parameters.model
     columns = left_out(fit.rows, model, prior.G, fit.values)
     z, H, spread = _wider_fit(problem, prior, fit, columns)
@@ -78,20 +75,13 @@ def doubt(problem: Problem, prior: Prior, fit: Fit) -> Doubt:
     covariance = prior.D @ H[:k, :k] @ prior.D.T + np.outer(d, d)
     scaled = fit.values.copy()
     parts(scaled).delay[:] = 0.0
-    factor = _deviation_of_mean(spread, problem.rows.speed.size)
+    n = problem.rows.speed.size
+    factor = 0.0  # deviation of the mean of the gains; of a single one nothing is known
+    if n > 1:
+        factor = float(stdtrit(n - 1, _QUANTILE)) / TWO_SIDED * spread / np.sqrt(n)
     lost = _LOST * float(parts(fit.values).terms[LOAD_FRICTION].mean())
     covariance += (factor**2 + lost**2) * np.outer(scaled, scaled)
-    return Doubt(covariance, _torques(problem, columns, z[k:]))
-
-
-def _deviation_of_mean(spread: float, n: int) -> float:
-    """Return the deviation of the mean of n values for a 95 % interval; 0 of a single one."""
-    from scipy.special import stdtrit
-
-    if n == 1:
-        return 0.0
-    t = float(stdtrit(n - 1, _QUANTILE)) / TWO_SIDED
-    return t * spread / float(np.sqrt(n))
+    return covariance, _torques(problem, columns, z[k:])
 
 
 def _wider_fit(
@@ -114,7 +104,8 @@ def _wider_fit(
     narrow, _ = _solved(products, (kinds == len(KINDS)) * 1.0, deviation**2)
     sizes = np.append(np.full(len(KINDS), _FIRST), 1.0)
     z = np.zeros(kinds.size)
-    relative = _relative(kinds.size, gains)
+    relative = np.eye(kinds.size + 1)  # to columns of gains relative to their mean
+    relative[np.ix_(gains, gains)] -= 1.0 / gains.size
     for turn in range(_MOST_ROUNDS):
         about = _linearised(narrow, z, k, gains) @ relative
         linear = np.swapaxes(about, 1, 2) @ products @ about
@@ -130,13 +121,6 @@ def _wider_fit(
             break
     z, H = _solved(linear, sizes[kinds], deviation**2 * lengths)
     return z, H, float(sizes[KINDS.index('gain')])
-
-
-def _relative(size: int, of_gains: Indices) -> Floats:
-    """Return E (c, c): columns, times E, are of gains relative to their mean; c = size + 1."""
-    E = np.eye(size + 1)
-    E[np.ix_(of_gains, of_gains)] -= 1.0 / of_gains.size
-    return E
 
 
 def _linearised(narrow: Floats, z: Floats, k: int, of_gains: Indices) -> Floats:
@@ -183,12 +167,12 @@ def _solved(products: Floats, scale: Floats, variance: Floats) -> tuple[Floats, 
 
 def _sizes(kinds: Floats, z: Floats, H: Floats, sizes: Floats) -> Floats:
     """Return the size of each kind: its sum of squares over the number of values that are shown."""
-    found = []
-    for kind, size in enumerate(sizes[:-1]):
-        own = kinds == kind
-        shown = np.sum(1.0 - np.diag(H)[own] / size**2)
-        found.append(np.sqrt(np.sum(z[own] ** 2) / max(shown, _LEAST)))
-    return np.asarray(np.clip(found, _LEAST, LARGEST))
+    squares, shown = (
+        np.bincount(kinds, each)[:-1]
+        for each in (z**2, 1.0 - np.diag(H) / sizes[kinds] ** 2)
+    )
+    found = np.sqrt(squares / np.maximum(shown, _LEAST))
+    return np.clip(found, _LEAST, LARGEST)
 
 
 def _residual(
@@ -203,11 +187,13 @@ def _residual(
 
 
 def _torques(problem: Problem, columns: LeftOut, z: Floats) -> Floats:
-    """Return `Doubt.torques` for the values z of the columns left out."""
+    """Return the rms torque (kinds, n) of the values z of the columns left out."""
     moving = problem.windows.moving
-    found = np.zeros((len(KINDS), moving.size, problem.rows.speed.size))
-    for block in problem.rows.blocks(moving):
-        X = columns.matrix(moving[block]) * z
-        for kind, torques in enumerate(found):
-            torques[block] = X[:, :, columns.kind == kind].sum(axis=2)
-    return problem.rows.rms(found, moving)
+    of_kinds = columns.kind[:, None] == np.arange(len(KINDS))
+    found = np.concatenate(
+        [
+            columns.matrix(moving[block]) * z @ of_kinds
+            for block in problem.rows.blocks(moving)
+        ]
+    )
+    return problem.rows.rms(np.moveaxis(found, 2, 0), moving)

@@ -142,12 +142,9 @@ class Rows(NamedTuple):
         X = np.zeros((windows.size, n, self.unknowns))
         inertial = self.inertial[windows]
         X[:, :, :p] = inertial
-        joints = np.arange(n)
-        for c, name in enumerate(COLUMNS):
-            X[:, joints, p + c * n + joints] = self.columns[name][windows]
         at = X.shape[2] - LOAD - COUPLING
-        if n > 1:
-            X[:, -2:, at : at + COUPLING] = self.coupling[windows]
+        X[:, :, p:at] = of_each_joint(self.friction(windows))
+        X[:, -2:, at : at + COUPLING] = self.coupling[windows]
         with_load = self.carried.at(self.time[windows])
         X[with_load, :, -LOAD:] = inertial[with_load] @ self.load
         return X
@@ -287,6 +284,13 @@ class Rows(NamedTuple):
             yield block, slice(int(starts[0]), int(starts[-1]) + self.g.size)
 
 
+def of_each_joint(columns: Floats) -> Floats:
+    """Return columns (k, n, c n) that are zero but for their own joint, from these (k, c, n)."""
+    k, _, n = columns.shape
+    found: Floats = np.einsum('kcn,in->kicn', columns, np.eye(n))
+    return found.reshape(k, n, -1)
+
+
 def rows_of(recording: Recording, model: SerialChain) -> Rows:
     """Return the rows of all windows of a recording without gaps.
 
@@ -312,7 +316,7 @@ def rows_of(recording: Recording, model: SerialChain) -> Rows:
         period=h,
         gravity=Samples(_at_rest(q[::every], model)),
         every=every,
-        speed=_fast(dq, ~near_gap),
+        speed=np.percentile(np.abs(dq[~near_gap]), 95.0, axis=0, overwrite_input=True),
         load=np.zeros((model.p, LOAD)),
         carried=Carried(),
         starts=starts,
@@ -397,11 +401,6 @@ def _smoothed(recording: Recording) -> tuple[Samples, Samples]:
 def smoothing_width(h: float) -> int:
     """Return the number of samples, one each h seconds, over which positions are smoothed."""
     return 2 * max(2, round(0.5 * SMOOTHING / h)) + 1
-
-
-def _fast(dq: Samples, chosen: Flags) -> Floats:
-    """Return the 95th percentile of each joint's speed (n,) in the chosen samples."""
-    return np.percentile(np.abs(dq[chosen]), 95.0, axis=0, overwrite_input=True)
 
 
 def _inertial(rows: Rows, model: SerialChain) -> Iterator[Floats]:

@@ -31,6 +31,7 @@ from typing import Annotated, NamedTuple
 
 from blf_dsc_controller.compiled.jit import inner
 from blf_dsc_controller.compiled.layout import Array, Cell
+from blf_dsc_controller.law import half_waves
 from blf_dsc_controller.law.lag import filter_gain
 
 WAVES = 6
@@ -53,7 +54,6 @@ _TIME_CONSTANT = 0.5 / (pi * _LOWEST_FREQUENCY)  # s, of the lags
 _LONGEST_HALF_WAVE = 0.5 / _LOWEST_FREQUENCY  # s, half period
 _FAST_FREQUENCY = 20.0  # Hz, from which a velocity may lag far behind its positions
 _MIN_AMPLITUDE = 0.05  # of the torque limit, amplitude of its torque
-_TURNED_BACK = 0.25  # of a half wave, by which p turns back at its end
 # a half wave that is longer is one of the arm: standard deviations of the sensor's
 # noise, which the loop makes larger, and steps of the sensor
 _NOISE_SIGMAS = 10.0
@@ -76,12 +76,7 @@ class State(NamedTuple):
     span: Annotated[Array, 'n']  # s, since then
     before: Annotated[Array, 2, 'n']  # N m s and s, `sum` and `span` of that half wave
     amplitude: Annotated[Array, 'n']  # N m, of u in the last half wave
-    # of p in the present half wave: 1, -1; 0: none yet
-    direction: Annotated[Array, 'n']
-    turn: Annotated[Array, 'n']  # rad, p at its beginning
-    farthest: Annotated[Array, 'n']  # rad, p farthest from there so far
-    since: Annotated[Array, 'n']  # s, since the beginning
-    farthest_at: Annotated[Array, 'n']  # s, of `farthest`, likewise
+    present: half_waves.State  # of p, rad
     travel: Annotated[Array, 4, 'n']  # rad, of the last half waves
     half: Annotated[Array, 'n']  # s, mean half period
     waves: Annotated[Array, 'n']  # half waves in a row that count
@@ -120,25 +115,20 @@ def watch(
         state.square[i] += dt * u * u
         state.sum[i] += dt * u
         state.span[i] += dt
-        state.since[i] += dt
+        state.present.since[i] += dt
         state.calm[i] += dt
-        if state.since[i] > 1.5 * _LONGEST_HALF_WAVE:  # with the quarter to turn back
+        if (
+            state.present.since[i] > 1.5 * _LONGEST_HALF_WAVE
+        ):  # with the quarter to turn back
             forget(state, i, p)
-        ahead = state.direction[i] * (p - state.farthest[i])
-        if ahead >= 0.0:
-            state.farthest[i] = p
-            state.farthest_at[i] = state.since[i]
-            if state.direction[i] == 0.0:
-                state.direction[i] = 1.0
+        back = half_waves.follow(state.present, i, p)
+        if back == 0.0:
             continue
         threshold = max(_NOISE_SIGMAS * sqrt(noise[i]), _SENSOR_STEPS * resolution[i])
-        travel = abs(state.farthest[i] - state.turn[i])
-        if -ahead > max(threshold, _TURNED_BACK * travel):
-            end_half_wave(
-                state, i, travel, travel > threshold, _MIN_AMPLITUDE * limit[i]
-            )
-            state.farthest[i] = p
-            state.farthest_at[i] = state.since[i]
+        travel = half_waves.travel(state.present, i)
+        if back > max(threshold, half_waves.TURNED_BACK * travel):
+            count(state, i, travel, travel > threshold, _MIN_AMPLITUDE * limit[i])
+            half_waves.end(state.present, i, p)
 
 
 @inner
@@ -147,7 +137,7 @@ def begin(state: State, error: Array, torque: Array) -> None:
     state.wait[0] = 0.0
     for i in range(error.size):
         state.slow[0, i] = error[i]
-        state.slow[1, i] = state.direction[i] = 0.0
+        state.slow[1, i] = state.present.direction[i] = 0.0
         state.torque[i] = torque[i]
         state.calm[i] = inf
         forget(state, i, 0.0)
@@ -198,8 +188,7 @@ def forget(state: State, i: int, p: float) -> None:
     state.waves[i] = state.grown[i] = state.amplitude[i] = 0.0
     state.square[i] = state.sum[i] = state.span[i] = 0.0
     state.before[0, i] = state.before[1, i] = 0.0
-    state.since[i] = state.farthest_at[i] = 0.0
-    state.turn[i] = state.farthest[i] = p
+    half_waves.begin(state.present, i, p)
 
 
 @inner
@@ -207,7 +196,7 @@ def forget_all(state: State) -> None:
     """Forget the half waves of all joints; the next begin where they are."""
     state.wait[0] = 0.0
     for i in range(state.waves.size):
-        forget(state, i, state.farthest[i])
+        forget(state, i, state.present.farthest[i])
         state.calm[i] = inf
 
 
@@ -231,9 +220,7 @@ def end_span(state: State, i: int) -> float:
 
 
 @inner
-def end_half_wave(
-    state: State, i: int, travel: float, is_clear: bool, strong: float
-) -> None:
+def count(state: State, i: int, travel: float, is_clear: bool, strong: float) -> None:
     """Count the half wave of joint i that has ended if it is one of an oscillation.
 
     Args:
@@ -241,7 +228,7 @@ def end_half_wave(
         is_clear: it is larger than noise and steps of the sensor.
         strong: smallest amplitude of its torque [N m].
     """
-    half = state.farthest_at[i]
+    half = state.present.farthest_at[i]
     state.amplitude[i] = end_span(state, i)
     k = int(state.waves[i])
     counts = is_clear and half < _LONGEST_HALF_WAVE and state.amplitude[i] > strong
@@ -266,9 +253,6 @@ def end_half_wave(
     state.waves[i] = k + 1.0 if counts else 0.0
     if state.waves[i] >= FEW:
         state.calm[i] = 0.0
-    state.direction[i] = -state.direction[i]
-    state.turn[i] = state.farthest[i]
-    state.since[i] -= half
 
 
 @inner

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from blf_dsc_controller.bags.topic_recorder import TopicRecorder
+from blf_dsc_controller.bags.writer import BagWriter
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.law_file import errors_told_with_line
@@ -328,13 +329,13 @@ def _write_bag(
     path: Path, parts: Iterable[Record], plant: PlantConfig | None, compression: str
 ) -> None:
     """Write the messages of the parts of a record, one after the other."""
-    bag = TopicRecorder(path, compression=compression, flush_interval=None)
-    with closing(bag):
+    bag = BagWriter(path, compression=compression, flush_interval=None)
+    with closing(TopicRecorder(bag)) as recorder:
         if plant is not None:
             configured = Change(FIRST_STAMP, flatten(plant), configured=True).encode()
-            bag.write(FIRST_STAMP, topics.CHANGES, configured)
+            recorder.write(FIRST_STAMP, topics.CHANGES, configured)
         for stamp, message in _messages(parts):
-            bag.write(stamp, *message)
+            recorder.write(stamp, *message)
 
 
 def _measured(

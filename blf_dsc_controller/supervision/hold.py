@@ -181,8 +181,8 @@ class Hold:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the ramp is over and the arm at rest, as far as its states show."""
-        is_over = self._elapsed >= self._duration
+        """Whether the arm is at rest, as far as its states show, and with it what it holds."""
+        is_over = self._source is not Load.UNTIL_MOVED or self._rested > _RESTED
         return (
             is_over
             and self._last.age == 0.0

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.controller_groups import Safety
 from blf_dsc_controller.law.controller import Controller
+from blf_dsc_controller.law.sensor import FILTER
 from blf_dsc_controller.supervision.held_torque import HeldTorque
-from blf_dsc_controller.supervision.hold import Hold, Load
+from blf_dsc_controller.supervision.hold import FADE_TIME, Hold, Load
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.supervisor import Doubtful, Reason, is_in_doubt
 from blf_dsc_controller.supervision.swing import SwingNames
 
 Vector = NDArray[np.float64]
 
-_FASTER = 0.1  # rad/s, of a joint while the torque of a deactivation ramps down
 # rad/s over twice the speed at the stop, for _SPEEDS_UP: a load that is new makes less of it
 _SPED_UP = 0.5
 _GROWING = 0.95  # of the largest speed so far
@@ -108,14 +108,11 @@ class SafeStop:
     def begin_deactivation(self, safety: Safety) -> None:
         """Begin the ramp of a law that leaves command in order.
 
-        A linear ramp of R from the torque of an acceleration a makes a joint faster by
-        a R / 2.  It is so short that this is at most `_FASTER`.
+        Without the gravity of the model, what the law held the arm by fades.  With it the ramp is
+        short, since it begins with what accelerates the arm.
         """
         self._swings.begin()
-        fastest = float(np.abs(self._controller.signals.ddqr).max())
-        ramp = safety.deactivation_ramp
-        if safety.torque == 'hold_gravity' and fastest * ramp > 2.0 * _FASTER:
-            ramp = 2.0 * _FASTER / fastest
+        ramp = FILTER if safety.torque == 'hold_gravity' else FADE_TIME
         self._hold.begin(self._held.load(), ramp=ramp, source=Load.UNTIL_MOVED)
 
     def begin_anew(self, load: Vector) -> None:

@@ -34,11 +34,11 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.law import half_waves
 from blf_dsc_controller.law.sensor import FILTER
 
 Vector = NDArray[np.float64]
 
-_SWING_TURNED = 0.25  # of a half wave, by which v turns back at its end
 _SWING_RATIO = 0.5  # of the half wave before
 _SWINGS_IN_A_ROW = 2
 _LEAST_SWING = 0.03  # rad/s, of a half wave
@@ -65,13 +65,7 @@ class Swing:
         self.share = np.ones(n)
         self.has_swung = np.zeros(n, dtype=np.bool_)
         self._follows = False  # whether the next v follows the last one
-        self._direction = np.ones(n)
-        # rad/s, v at the last turning point, and farthest from there so far
-        self._turn = np.zeros(n)
-        self._farthest = np.zeros(n)
-        # s, since the turning point, and of `farthest`, likewise
-        self._since = np.zeros(n)
-        self._farthest_at = np.zeros(n)
+        self._present = half_waves.State(*np.zeros((5, n)))  # of v, rad/s
         # rad/s and s, of the half wave before
         self._travel = np.zeros(n)
         self._half = np.zeros(n)
@@ -97,55 +91,50 @@ class Swing:
         if not self._follows:
             self._begin_at(v)
             return
-        self._since += dt
+        self._present.since[:] += dt
         self._steady += dt
-        farther = self._direction * (v - self._farthest) >= 0.0
-        self._farthest[farther] = v[farther]
-        self._farthest_at[farther] = self._since[farther]
-        travel = np.abs(self._farthest - self._turn)
         unsure = np.maximum(_SWING_SIGMAS * np.sqrt(noise), _SWING_STEPS * resolution)
         least = np.maximum(_LEAST_SWING, unsure / FILTER)
-        back = np.abs(v - self._farthest)
-        ends = back > np.maximum(0.5 * least, _SWING_TURNED * travel)
-        if ends.any():
-            self._end_half_waves(ends, travel, travel > least)
-            self._farthest[ends] = v[ends]
-            self._farthest_at[ends] = self._since[ends]
-        steady_for = np.clip(2.0 * self._half, _LONGEST_SWING, _SLOWEST_SWING)
-        returns = (self._steady > steady_for) & (np.abs(v) > 0.5 * least)
-        if returns.any():
-            self.share[returns] = np.minimum(1.0, 2.0 * self.share[returns])
-            self._steady[returns] = 0.0
+        for i in range(v.size):
+            self._follow(i, v[i], least[i])
 
     def _begin_at(self, v: Vector) -> None:
         """Begin with the next half waves at v (n,) [rad/s]."""
         self._follows = True
-        self._direction[:] = np.where(v > 0.0, -1.0, 1.0)
-        self._turn[:] = self._farthest[:] = v
-        for each in (self._since, self._farthest_at, self._travel, self._half):
+        self._present.direction[:] = np.where(v > 0.0, -1.0, 1.0)
+        for i in range(v.size):
+            half_waves.begin(self._present, i, v[i])
+        for each in (self._travel, self._half, self._lasting, self._steady):
             each[:] = 0.0
-        self._lasting[:] = self._steady[:] = 0.0
 
-    def _end_half_waves(
-        self, ends: NDArray[np.bool_], travel: Vector, is_clear: NDArray[np.bool_]
-    ) -> None:
-        """End the half waves of some joints (n,), over `travel` (n,) [rad/s]."""
-        half = np.maximum(self._farthest_at, self._half)
-        returns = self._turn * self._farthest < 0.0
-        lasts = ends & is_clear & returns & (self._half > 0.0)
-        lasts &= travel > _SWING_RATIO * self._travel
-        self._lasting[ends] = np.where(lasts, self._lasting + 1.0, 0.0)[ends]
-        swings = lasts & (self._lasting >= _SWINGS_IN_A_ROW) & (half < _SLOWEST_SWING)
-        less = np.minimum(_GAIN_MARGIN, (half / _LONGEST_SWING) ** 2)
-        self.share[swings] = np.maximum(_LEAST_DAMPING, self.share * less)[swings]
-        self.has_swung |= swings
-        self._lasting[swings] = 0.0
-        self._travel[ends] = travel[ends]
-        self._half[ends] = self._farthest_at[ends]
-        self._turn[ends] = self._farthest[ends]
-        self._since[ends] -= self._farthest_at[ends]
-        self._direction[ends] *= -1.0
-        self._steady[ends & returns] = 0.0
+    def _follow(self, i: int, v: float, least: float) -> None:
+        """Follow v [rad/s] of joint i, of which the `least` is no noise."""
+        back = half_waves.follow(self._present, i, v)
+        travel = half_waves.travel(self._present, i)
+        if back > max(0.5 * least, half_waves.TURNED_BACK * travel):
+            self._count(i, travel, is_clear=travel > least)
+            half_waves.end(self._present, i, v)
+        steady_for = min(max(2.0 * self._half[i], _LONGEST_SWING), _SLOWEST_SWING)
+        if self._steady[i] > steady_for and abs(v) > 0.5 * least:
+            self.share[i] = min(1.0, 2.0 * self.share[i])
+            self._steady[i] = 0.0
+
+    def _count(self, i: int, travel: float, *, is_clear: bool) -> None:
+        """Count the half wave of joint i that ends, over `travel` [rad/s], as one of a swing."""
+        _, turn, farthest, _, farthest_at = (each[i] for each in self._present)
+        half = max(farthest_at, self._half[i])
+        returns = turn * farthest < 0.0
+        lasts = is_clear and returns and self._half[i] > 0.0
+        lasts = lasts and travel > _SWING_RATIO * self._travel[i]
+        self._lasting[i] = self._lasting[i] + 1.0 if lasts else 0.0
+        if self._lasting[i] >= _SWINGS_IN_A_ROW and half < _SLOWEST_SWING:
+            less = min(_GAIN_MARGIN, (half / _LONGEST_SWING) ** 2)
+            self.share[i] = max(_LEAST_DAMPING, self.share[i] * less)
+            self.has_swung[i] = True
+            self._lasting[i] = 0.0
+        self._travel[i], self._half[i] = travel, farthest_at
+        if returns:
+            self._steady[i] = 0.0
 
 
 class SwingNames:

@@ -33,7 +33,6 @@ _WORDS = {
         'ext external error err offset',
     }.items()
 }
-_UNIT_OF = {'q': 'q', 'tau': 'tau', 'theta': 'q'}
 _SECONDS = re.compile('sec(ond)?s?', re.IGNORECASE)
 _NANOSECONDS = re.compile('n(ano)?sec(ond)?s?', re.IGNORECASE)
 _SHOWN = 60  # names of columns in a message
@@ -43,10 +42,11 @@ _NUMBER = re.compile(r'\d+')
 
 
 class Column(NamedTuple):
-    """A column, and the factor of its unit."""
+    """A column, and the factor of its unit, whose name is empty if it is not named."""
 
     name: str
     factor: float
+    unit: str = ''
 
 
 class Columns(NamedTuple):
@@ -86,29 +86,34 @@ def choose_columns(
     Raises:
         BlfDscError: they are not found, or their units are not known.
     """
-    q = _of_joints(path, names, 'q', given['q'], joints)
-    tau = _of_joints(path, names, 'tau', given['tau'], joints)
+    q, tau = (
+        _of_joints(path, names, kind, given[kind], joints) for kind in ('q', 'tau')
+    )
     if len(tau) != len(q):
         raise BlfDscError(
             f'{path} has {len(q)} positions ({", ".join(q)}) and {len(tau)} torques '
             f'({", ".join(tau)}): choose as many, as in --map tau=tau_*'
         )
     theta = _of_motors(path, names, given['theta'], joints, q)
-    _check_meanings(path, names, {'q': q, 'tau': tau, 'theta': theta}, joints)
-    words = set().union(*(_meaning(name, joints) for name in tau))
-    units = [_unit_of(name, 'tau', given['tau']) for name in tau]
+    chosen = {'q': q, 'tau': tau, 'theta': theta}
+    _check_meanings(path, names, chosen, joints)
     rate = _RATE.fullmatch(given['time'])
     if rate and not float(rate[1]):
         raise BlfDscError(
             f'--map time={given["time"]}: the rate of the rows must be above 0'
         )
+    time = [] if rate else _time(path, names, given['time'])
+    found = {
+        kind: _with_factors(path, each, kind, given[kind])
+        for kind, each in chosen.items()
+    }
+    words = set().union(*(_meaning(name, joints) for name in tau))
     return Columns(
-        time=[] if rate else _time(path, names, given['time']),
+        time=time,
         rate=float(rate[1]) if rate else 0.0,
-        q=_with_factors(path, q, 'q', given['q']),
-        tau=_with_factors(path, tau, 'tau', given['tau']),
-        theta=_with_factors(path, theta, 'q', given['theta']),
-        has_currents=bool(words & _WORDS['current']) or any(map(is_of_drive, units)),
+        **found,
+        has_currents=bool(words & _WORDS['current'])
+        or any(is_of_drive(each.unit) for each in found['tau']),
     )
 
 
@@ -158,7 +163,13 @@ def _of_motors(
     if given:
         theta = _of_joints(path, names, 'theta', given, joints)
     else:
-        found = [name for name in names if _is_of_motor(name, joints) and name not in q]
+        found = [
+            name
+            for name in names
+            if name not in q
+            and _is_named(name, 'theta', joints)
+            and ('theta' in _meaning(name, joints) or _is_named(name, 'q', joints))
+        ]
         theta = [name for joint in joints if (name := _of_joint(found, joint))]
         if len(theta) != len(q) and len(found) == len(q):
             theta = _by_number(found, 'q')
@@ -201,7 +212,7 @@ def _kind_of(name: str, joints: Sequence[str]) -> str:
 
 def _is_named(name: str, kind: str, joints: Sequence[str]) -> bool:
     """Return whether a column is q, tau or theta by its name."""
-    words = _meaning(split_unit(name, _UNIT_OF[kind]).stem, joints)
+    words = _meaning(split_unit(name, kind).stem, joints)
     return bool(_WORDS[kind] & words) and not words & _WORDS['rate']
 
 
@@ -223,11 +234,6 @@ def beginning(names: Sequence[str]) -> str:
     first, last = min(names), max(names)
     differs = (k for k in range(len(first)) if first[k] != last[k : k + 1])
     return first[: next(differs, len(first))]
-
-
-def _is_of_motor(name: str, joints: Sequence[str]) -> bool:
-    is_position = 'theta' in _meaning(name, joints) or _is_named(name, 'q', joints)
-    return is_position and _is_named(name, 'theta', joints)
 
 
 def _of_joint(columns: Sequence[str], joint: str) -> str | None:
@@ -275,8 +281,13 @@ def _meaning(column: str, joints: Sequence[str]) -> set[str]:
 
 
 def _time(path: Path, names: Sequence[str], given: str) -> list[Column]:
-    """Return the columns whose sum is the time."""
-    found = _matching(names, given, 'time') if given else _named_time(names)
+    """Return the columns whose sum is the time: by their names, of several, the stamps."""
+    if given:
+        found = _matching(names, given, 'time')
+    else:
+        named = [name for name in names if is_time(name)]
+        stamps = [name for name in named if 'stamp' in name.lower()]
+        found = stamps if len(named) > 1 and stamps else named
     pair = _seconds_and_nanoseconds(found)
     if pair:
         return pair
@@ -287,13 +298,6 @@ def _time(path: Path, names: Sequence[str], given: str) -> list[Column]:
             'or give the rate of the rows, as in --map time=100Hz'
         )
     return _with_factors(path, found, 'time', given)
-
-
-def _named_time(names: Sequence[str]) -> list[str]:
-    """Return the columns that are the time by their names; of several, the stamps."""
-    found = [name for name in names if is_time(name)]
-    stamps = [name for name in found if 'stamp' in name.lower()]
-    return stamps if len(found) > 1 and stamps else found
 
 
 def is_time(name: str) -> bool:
@@ -318,15 +322,11 @@ def _seconds_and_nanoseconds(columns: Sequence[str]) -> list[Column]:
 def _with_factors(
     path: Path, names: Sequence[str], kind: str, given: str
 ) -> list[Column]:
-    units = [_unit_of(name, kind, given) for name in names]
+    """Return columns with their units: the one given, or those of their names."""
+    common = split_unit(given, kind).unit if given not in names else ''
+    units = [common or split_unit(name, kind).unit for name in names]
     factors = [factor_of(path, unit, kind) for unit in units]
-    return list(map(Column, names, factors))
-
-
-def _unit_of(name: str, kind: str, given: str) -> str:
-    """Return the unit of a column: the one given, or that of its name."""
-    unit = split_unit(given, kind).unit if given != name else ''
-    return unit or split_unit(name, kind).unit
+    return list(map(Column, names, factors, units))
 
 
 def _listed(names: Sequence[str]) -> str:

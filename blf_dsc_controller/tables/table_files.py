@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import prod
 from os import SEEK_CUR
 from pathlib import Path
 from struct import Struct
@@ -112,12 +113,10 @@ class _Arrays:
 
 def _upright(values: Any) -> Floats:
     """Return a vector or matrix as columns (N, k), of which N is the larger."""
-    squeezed = np.squeeze(np.asarray(values))
-    if squeezed.ndim == 1:
-        squeezed = squeezed[:, None]
-    if squeezed.shape[0] < squeezed.shape[1]:
-        squeezed = squeezed.T
-    return squeezed.astype(np.float64, copy=False)
+    found = np.atleast_2d(np.squeeze(np.asarray(values)))
+    if found.shape[0] < found.shape[1]:
+        found = found.T
+    return found.astype(np.float64, copy=False)
 
 
 def _npz(path: Path) -> _Arrays:
@@ -133,8 +132,8 @@ def _npz(path: Path) -> _Arrays:
     def load(name: str) -> Any:
         _check_size(path, _size_of(shapes[name]))
         try:
-            with ZipFile(path) as archive, archive.open(f'{name}.npy') as stream:
-                return np.lib.format.read_array(stream, allow_pickle=False)
+            with np.load(path) as archive:
+                return archive[name]
         except Exception as error:  # as above
             raise BlfDscError(f'{path} cannot be read as npz: {error}') from error
 
@@ -181,7 +180,7 @@ def _mat(path: Path) -> _Arrays:
 
 def _size_of(shape: tuple[int, ...]) -> int:
     """Return the bytes of an array of floats."""
-    return int(np.prod(shape, dtype=float)) * _BYTES
+    return prod(shape) * _BYTES
 
 
 def _unpacked_sizes(path: Path) -> Iterator[int]:

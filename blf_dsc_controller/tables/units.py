@@ -42,10 +42,16 @@ _CURRENT = _table("""\
 _OTHERS = _table("""\
 nan count counts tick ticks inc increments raw digits v volt gon
 nan lbfin lbin ftlb lbft kgcm kgfcm ozin""")
-_OF = {'time': _TIME, 'q': _POSITION, 'tau': _TORQUE | _CURRENT, 'other': _OTHERS}
+_OF = {
+    'time': _TIME,
+    'q': _POSITION,
+    'tau': _TORQUE | _CURRENT,
+    'theta': _POSITION,
+    'other': _OTHERS,
+}
 _EXPECTED = {
     'time': 's, ms, us, ns, min or h',
-    'q': 'rad, mrad, deg, rev (or m, cm, mm)',
+    **dict.fromkeys(('q', 'theta'), 'rad, mrad, deg, rev (or m, cm, mm)'),
     'tau': 'N m, N cm, N mm, kN m (or N, kN), or A, mA or % with --gains',
 }
 _BRACKETED = re.compile(r'\s*[\[({<]\s*([^\[\](){}<>]+?)\s*[\])}>]\s*$')
@@ -62,7 +68,7 @@ class Named(NamedTuple):
 
 
 def split_unit(name: str, kind: str) -> Named:
-    """Return the name of a column of time, q or tau without its unit.
+    """Return the name of a column of one of KINDS without its unit.
 
     Other words in brackets, such as `(measured)`, belong to the name.
     """
@@ -82,7 +88,7 @@ def _is_unit(word: str) -> bool:
 
 
 def factor_of(path: Path, unit: str, kind: str) -> float:
-    """Return the unit of time, q or tau in s, rad (m), N m (N), A or %; empty: 1.
+    """Return the unit of one of KINDS in s, rad (m), N m (N), A or %; empty: 1.
 
     Raises:
         BlfDscError: it is not known.

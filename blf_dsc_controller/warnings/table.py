@@ -33,7 +33,7 @@ from blf_dsc_controller.warnings.case import Case, case_of
 _FIRST_ERROR = 1.5  # recommended bound over the first error
 _PERIODS = 0.02  # periods by which a window may differ from a whole number
 _LONG = 5.0  # s: a time in ms is a thousand times as long as it should be
-_TIMES = ('state_timeout', 'saturation_time', 'deactivation_ramp')
+_TIMES = ('state_timeout', 'saturation_time')
 _SLUGGISH = 1.0  # rad/s^2; the weakest joint of the presets has 60
 
 
