@@ -61,9 +61,9 @@ def motion():
 # Recordings.
 
 
-def write_both(path, motion, twist, names=PANDA):
-    """Write 3 s of links, and of motors with these names, twisted by `twist` of k."""
-    links, motors = JointStateEncoder(PANDA), JointStateEncoder(names)
+def write_both(path, motion, twist):
+    """Write 3 s of links, and of motors of the same names, twisted by `twist` of k."""
+    links, motors = JointStateEncoder(PANDA), JointStateEncoder(PANDA)
     with BagWriter(path, flush_interval=None) as bag:
         of_links, of_motors = (
             bag.add_topic(name, JOINT_STATE, [])

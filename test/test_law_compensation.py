@@ -156,13 +156,13 @@ def test_learning_breaks_no_bound_that_learned_friction_once_broke(name, run):
     assert found['above'] == []
 
 
-def falling(begin, joint=4, high=1.9, low=0.1):
-    """Return a UR5e with friction of a joint that falls, in times of what is assumed."""
+def falling(begin, joint=4):
+    """Return a UR5e with friction of a joint that falls from 1.9 to 0.1 times what is assumed."""
     assumed = [6.0, 6.0, 6.0, 1.1, 1.1, 1.1]
     change = [0.0] * 6
-    change[joint] = (low - high) * assumed[joint]
+    change[joint] = -1.8 * assumed[joint]
     before = list(assumed)
-    before[joint] *= high
+    before[joint] *= 1.9
     return {
         'events.payload': [],
         'events.begin': [begin],

@@ -105,11 +105,11 @@ CYCLE, CARRIED = 6.0, 3.0  # s, of pick and place, and with the load
 END_OF_CYCLES = 21.0  # s
 
 
-def cycles(name, first, mass):
-    """A load in the hand in every cycle, from the first on: picked up at `first` + k `CYCLE`."""
+def cycles(name, first):
+    """1.5 kg in the hand in every cycle, from the first on: picked up at `first` + k `CYCLE`."""
     begin = first + CYCLE * np.arange(4)
     durations = CARRIED + np.minimum(0.0, begin)
-    given = held(np.maximum(0.0, begin).tolist(), durations.tolist(), [mass] * 4)
+    given = held(np.maximum(0.0, begin).tolist(), durations.tolist(), [1.5] * 4)
     loop = blf.load_loop(name, {'sim_plant': given | {'duration': END_OF_CYCLES}})
     return begin, blf.simulate(loop.controller, loop.plant).run()
 
@@ -120,7 +120,7 @@ def cycles(name, first, mass):
 )
 def test_load_of_every_cycle_from_the_first_on_is_weighed(name, first, within):
     """No window of 5 s is of one arm.  It used to be 0.0 +- 0.03 kg, loaded or not."""
-    begin, run = cycles(name, first, 1.5)
+    begin, run = cycles(name, first)
     for pick_up in begin[1:3]:
         for until, mass in ((pick_up, 0.0), (pick_up + CARRIED, 1.5)):
             load = at(run, until - 0.05)
@@ -135,7 +135,7 @@ def test_load_of_every_cycle_from_the_first_on_is_weighed(name, first, within):
 
 
 def test_lightest_hand_is_taken_for_empty_if_the_run_begins_with_a_load():
-    begin, run = cycles('panda_rigid', -1.5, 1.5)
+    begin, run = cycles('panda_rigid', -1.5)
     lighter = at(run, begin[1] - 0.05)
     assert lighter[MASS] == pytest.approx(-1.5, abs=0.05)
     assert 'lighter than at the start' in format_table(blf.measure(run))

@@ -179,9 +179,9 @@ def test_brakes_that_close_still_stop_an_arm_whose_efforts_say_so():
     assert arm.reason in ('commands without effect', 'error past the bound')
 
 
-def warned(given, preset='panda'):
+def warned(given):
     """Return what is warned of the use of torque sensors."""
-    config = Scenario(preset, given).config
+    config = Scenario('panda', given).config
     return [text for text in config_warnings(config) if text.startswith(POLE)]
 
 
