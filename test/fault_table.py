@@ -14,6 +14,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -568,6 +569,12 @@ FAULTS = (
 )
 
 
+@cache
+def outcome_of(number: int) -> Outcome:
+    """Return the outcome of a fault of the table."""
+    return run(FAULTS[number])
+
+
 RULE = '| --- | --- |\n'
 
 
@@ -575,8 +582,8 @@ def measured() -> str:
     """Return a row of faults for each reason of a stop, and the list of the other faults."""
     stops: dict[str, list[str]] = {}
     tolerated = []
-    for fault in FAULTS:
-        outcome = run(fault)
+    for number, fault in enumerate(FAULTS):
+        outcome = outcome_of(number)
         if outcome.noticed < 0:
             tolerated.append(f'- {fault.name}\n')
         else:

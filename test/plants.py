@@ -41,19 +41,6 @@ ROUGH = {
     'stribeck': 0.5,
 }
 """Every kind of disturbance at once, different on each joint."""
-FULL = ROUGH | {
-    'position_noise': 1e-5,
-    'velocity_noise': 1e-3,
-    'resolution': 1e-5,
-    'torque_limit': (8.0, 3.0),
-    'ripple': 0.02,
-    'delay': 2,
-    'time_constant': 2e-3,
-    'torque_noise': 0.01,
-    'velocity_pole': 400.0,
-    'repeat_every': 7,
-}
-"""Every kind of imperfection."""
 
 
 def plant(**changes):

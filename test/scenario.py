@@ -25,6 +25,7 @@ import blf_dsc_controller as blf
 from sim_plant.plant import plant_of
 
 START = 1.0  # s, stamp of the first state
+RUNNING = blf.Phase.APPROACHING, blf.Phase.TRACKING
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ class Scenario:
         self._applied = np.zeros(self.n)
         self._answer: np.ndarray | None = None
         self._arrived = np.full((3, self.n), np.nan)
+        self._nothing = self._arrived[0]
 
     # The law between its checks, which a shell sees and a user of ArmController does not.
 
@@ -148,7 +150,7 @@ class Scenario:
     @property
     def is_running(self) -> bool:
         """Whether the law is in command."""
-        return self.controller.phase in {blf.Phase.APPROACHING, blf.Phase.TRACKING}
+        return self.controller.phase in RUNNING
 
     @property
     def events(self) -> list:
@@ -196,17 +198,17 @@ class Scenario:
             self._answer = self.controller.update(each.stamp, *self._arrived)
             if self._answer is not None:
                 self._applied = self._answer
-        in_command = self.is_running
-        nothing = np.full(self.n, np.nan)
+        phase = self.controller.phase
+        in_command = phase in RUNNING
         row = (
             elapsed,
             *truth,
             self._arrived,
-            nothing if self._answer is None else self._answer,
+            self._nothing if self._answer is None else self._answer,
             self.controller.reference.dq if in_command else np.zeros(self.n),
-            self.controller.error if in_command else nothing,
+            self.controller.error if in_command else self._nothing,
             self.controller.bound,
-            self.controller.phase,
+            phase,
         )
         self.plant.step(self._applied if reach is None else reach(self._applied))
         return row

@@ -87,6 +87,7 @@ def files_of(name, folder):
         'actuator.time_constant': 0.002,  # s
         'actuator.torque_noise': 0.005,
         'initial.position': arm['start'],
+        'duration': 10.0,
     }
     reference = {
         'reference.type': 'sinusoids',
@@ -114,7 +115,7 @@ def commission(name, folder, capsys):
 def largest(text, unit):
     """Return the largest error of the simulated arm with its new gains."""
     (found,) = re.findall(
-        rf'follows its own motion for 30 s, with ([\d.]+) {unit} at most', text
+        rf'follows its own motion for 10 s, with ([\d.]+) {unit} at most', text
     )
     return float(found)
 

@@ -306,8 +306,10 @@ def found_and_compiled(tmp_path):
 @compiling
 @pytest.mark.parametrize(
     'content',
-    [pickle.dumps(numba.__version__) + b'cblf_dsc_controller.errors\nGone\n.', b''],
-    ids=['type of another release', 'cut'],
+    [
+        pickle.dumps(numba.__version__) + b'cblf_dsc_controller.errors\nGone\n.',
+        *at_night(b''),
+    ],
 )
 def test_index_that_cannot_be_read_is_replaced(tmp_path, found_and_compiled, content):
     assert found_and_compiled() == ['0', '1']

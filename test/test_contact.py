@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from paper_case import configured
@@ -72,16 +74,17 @@ def free():
     return run_of(NOTHING)
 
 
+@cache
+def answered(reaction):
+    """Return a run with a push, which goes on where it takes the law out of command."""
+    end = END if reaction in ('stop', 'yield') else RELEASED
+    return run_of(pushed(PUSH, end=end), **{'contact.reaction': reaction})
+
+
 @pytest.fixture(scope='module')
 def held():
     """A push that makes the arm hold."""
-    return run_of(pushed(PUSH), **{'contact.reaction': 'hold'})
-
-
-@pytest.fixture(scope='module')
-def ignored():
-    """The same push, to which nothing reacts."""
-    return run_of(pushed(PUSH))
+    return answered('hold')
 
 
 @pytest.fixture(scope='module')
@@ -149,13 +152,9 @@ def test_empty_hand_that_is_pushed_up_has_no_load_that_explains_it(force, is_con
 
 
 @pytest.mark.parametrize('reaction', ['none', 'stop', 'hold', 'yield'])
-def test_contact_is_found_and_answered_as_chosen(reaction, held, ignored):
+def test_contact_is_found_and_answered_as_chosen(reaction):
     """20 N within 60 ms; after a stop nothing is commanded by the law."""
-    kept = {'hold': held, 'none': ignored}
-    if reaction in kept:
-        record = kept[reaction]
-    else:
-        record = run_of(pushed(PUSH), **{'contact.reaction': reaction})
+    record = answered(reaction)
     samples, t = columns(record)
     found = contacts(record)
     assert 0.0 < found[0] - TOUCHED < 0.06
@@ -172,14 +171,14 @@ def test_contact_is_found_and_answered_as_chosen(reaction, held, ignored):
     assert (moves > 0.0) == (reaction == 'none')
 
 
-def test_contact_is_not_learned_where_something_reacts(held, ignored):
+def test_contact_is_not_learned_where_something_reacts(held):
     """Nothing but d^3 changes from the detection on; without a reaction the model does."""
     samples, t = columns(held)
     (found, *_) = contacts(held)
     touched = (t > found + 2e-3) & (samples.contact[:, CONTACT] > 0.0)
     assert np.ptp(samples.estimate[touched], axis=0).max() == 0.0
     assert samples.changes[-1, 0] == 0.0
-    assert columns(ignored)[0].changes[-1, 0] > 0.0
+    assert columns(answered('none'))[0].changes[-1, 0] > 0.0
 
 
 def test_contact_ends_and_learning_goes_on(held):
@@ -193,8 +192,7 @@ def test_arm_that_yields_gives_way_and_one_that_stops_resists():
     """For a second each, pushed by 20 N from the contact on."""
     way = []
     for reaction in ('stop', 'yield'):
-        record = run_of(pushed(PUSH, end=END), **{'contact.reaction': reaction})
-        q = record.measurements[:, :7]
+        q = answered(reaction).measurements[:, :7]
         way.append(np.abs(q[-1] - q[round(1e3 * TOUCHED) + 200]).max())
     assert way[1] > 3.0 * way[0]
 

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from nights import at_night
 from random_arm import CONFIG
 
 import blf_dsc_controller as blf
@@ -144,8 +145,10 @@ def test_restart_on_a_drive_that_holds_a_torque():
     ('preset', 'model', 'worst', 'learned'),
     [
         ('panda_rigid', OTHER, 0.6, 0.07),
-        ('panda_rigid', {'drive.mass_factor': 2.0}, 0.6, 0.07),
-        ('ur5e_rigid', {'drive.mass_factor': 0.5}, 0.355, 0.3),
+        *at_night(
+            ('panda_rigid', {'drive.mass_factor': 2.0}, 0.6, 0.07),
+            ('ur5e_rigid', {'drive.mass_factor': 0.5}, 0.355, 0.3),
+        ),
     ],
 )
 def test_bound_holds_with_a_wrong_model_of_the_drive(preset, model, worst, learned):

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from nights import at_night
 from scenario import Scenario
 
 import blf_dsc_controller as blf
@@ -60,7 +61,7 @@ def test_the_box_of_before_costs_no_error():
     assert arm.is_running
 
 
-@pytest.mark.parametrize('there', [0.0, 2.0 * BOX], ids=['nothing', 'twice as much'])
+@pytest.mark.parametrize('there', [0.0, *at_night(2.0 * BOX)])
 def test_wrong_word_costs_no_more_than_none(there):
     """Of a gripper that has closed on nothing, or on two boxes."""
     arm = picking('ur5e', there)

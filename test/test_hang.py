@@ -107,7 +107,7 @@ def test_law_that_goes_on_does_not_pull_a_braked_arm_to_its_reference(
     assert excess(least, arm.run(0.6)) < SLACK
 
 
-@pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
+@pytest.mark.parametrize('preset', ['fr3', *at_night('ur5e_driver')])
 def test_controller_that_hung_takes_the_resting_arm_over_as_the_watchdog_holds_it(
     preset,
 ):

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio
 import pytest
 from friction_laws import with_friction
+from nights import at_night
 from random_arm import (
     FIELDS,
     GRAVITY,
@@ -53,7 +54,7 @@ from blf_dsc_controller.identification.values import base_matrix
 from blf_dsc_controller.simulation.loop import write_bag
 
 ROBOT = Robot(urdf=PANDA_TEXT)
-ARMS = 6 if os.environ.get('NIGHTLY') else 3
+ARMS = 6 if os.environ.get('NIGHTLY') else 2
 TRUTH = truth_of(PANDA_CHAIN, 1)
 
 
@@ -401,7 +402,8 @@ def test_rest_at_the_end_is_left_out(plain, simple):
     assert not list(problems_of(other, 'torque'))
 
 
-def test_efforts_without_gravity_are_named_and_used(plain, simple):
+@pytest.mark.nightly
+def test_efforts_with_and_without_gravity_are_named_if_the_other_was_said(plain):
     short = plain[:12_000]
     gravity = gravity_of(TRUTH.inertias, short[:, 0])
     without = short - gravity[:, None] * [[0.0], [0.0], [1.0]]
@@ -409,6 +411,9 @@ def test_efforts_without_gravity_are_named_and_used(plain, simple):
     assert 'GRAVITY IS MISSING' in next(problems_of(missing, 'torque'))
     whole = identified(short, 'without-gravity', every=10)
     assert 'GRAVITY IS DOUBLE' in next(problems_of(whole, 'without-gravity'))
+
+
+def test_efforts_without_gravity_are_used(plain, simple):
     # The drive compensates the gravity of the URDF exactly: then this is the whole torque.
     without = plain.copy()
     without[:, 2] -= gravity_of(PANDA_CHAIN.inertias, plain[:, 0])
@@ -546,7 +551,7 @@ def test_recording_without_faults_has_neither_problems_nor_these_notes(simple):
 
 
 @pytest.mark.parametrize(
-    ('milliseconds', 'late'), [(20, 'torques'), (-20, 'positions')]
+    ('milliseconds', 'late'), [(20, 'torques'), *at_night((-20, 'positions'))]
 )
 def test_long_delay_is_named_with_what_is_late(plain, milliseconds, late):
     samples = round(1e-3 * milliseconds / PERIOD)
@@ -565,7 +570,7 @@ def test_offset_for_which_a_urdf_has_no_place_is_named(plain):
     assert not mentions(found, f'{PANDA[1]} has an offset')
 
 
-@pytest.mark.parametrize('what', ['gain', 'elasticity'])
+@pytest.mark.parametrize('what', ['elasticity', *at_night('gain')])
 def test_intervals_hold_where_the_arm_is_not_as_its_model_says(what):
     """Torques of sensors whose gains are up to 20 % off, and motors behind springs.
 

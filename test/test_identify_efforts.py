@@ -74,7 +74,7 @@ def narrow():
 FACTORS = (0.1, 10.0, 1000.0) if os.environ.get('NIGHTLY') else (0.1, 10.0)
 
 
-@pytest.mark.parametrize('motion', ['wide', 'narrow'])
+@pytest.mark.parametrize('motion', ['narrow', *at_night('wide')])
 def test_efforts_in_other_units_are_refused_and_right_ones_are_not(
     motion, right, request
 ):

@@ -79,12 +79,11 @@ def test_an_offset_as_large_as_the_torque_is_named(states):
     assert 'counterbalance' in problem
 
 
-def test_exchanged_efforts_are_named():
-    robot = Robot(urdf=PANDA_TEXT, tip='panda_hand_tcp')
-    chain = robot.chain(PANDA)
-    states = measured(shake(chain, truth_of(chain, 1), reference_of(chain, 2), 15.0), 3)
-    states[:, TORQUE, [4, 6]] = states[:, TORQUE, [6, 4]]
-    assert any('IS NOT EXPLAINED' in each for each in problems(states, robot))
+def test_exchanged_efforts_are_named(states):
+    other = states.copy()
+    other[:, TORQUE, [1, 2]] = states[:, TORQUE, [2, 1]]
+    named = [each for each in problems(other) if 'IS NOT EXPLAINED' in each]
+    assert [each.split()[0] for each in named] == ['panda_joint2', 'panda_joint3']
 
 
 def test_efforts_times_a_factor_are_accepted_only_if_they_are_right(states):

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from nights import at_night
 from random_arm import measured, recording_of, reference_of, shake, truth_of
 
 from blf_dsc_controller import load_loop
@@ -39,7 +40,8 @@ def found_in(preset, cycles):
 
 
 @pytest.mark.parametrize(
-    ('preset', 'cycles'), [('ur5e', [12.5]), ('ur5e', [20.0, 50.0]), ('panda', [30.0])]
+    ('preset', 'cycles'),
+    [('ur5e', [20.0, 50.0]), ('panda', [30.0]), *at_night(('ur5e', [12.5]))],
 )
 def test_ripples_are_found(preset, cycles):
     found, amplitudes = found_in(preset, cycles)

@@ -71,8 +71,7 @@ def added(problem):
     ('n', 'offsets'),
     [
         (4, {4: QUARTER}),
-        (4, {2: QUARTER, 4: QUARTER}),
-        *at_night((7, {2: -QUARTER, 6: QUARTER})),
+        *at_night((4, {2: QUARTER, 4: QUARTER}), (7, {2: -QUARTER, 6: QUARTER})),
     ],
 )
 def test_zeros_that_are_quarter_turns_off_are_named_and_not_applied(n, offsets):
@@ -94,6 +93,7 @@ def test_a_joint_that_counts_the_other_way_from_another_zero_is_named():
     assert added(problem) == {4: QUARTER}  # recorded: quarter - q
 
 
+@pytest.mark.nightly
 def test_the_zero_of_one_joint_and_the_direction_of_another_are_named():
     """Pairs of joints that may count in any way at once lead elsewhere."""
     found = identified(states_of(7, 20.0), {2: -QUARTER}, [6], every=4)

@@ -103,7 +103,7 @@ def test_learning_is_worth_it_on_soft_arms_that_are_pushed_and_loaded(
     assert learning < most * without
 
 
-@pytest.mark.parametrize(('robot', 'number'), [('fr3', 15), ('panda', 42)])
+@pytest.mark.parametrize(('robot', 'number'), [('fr3', 15), *at_night(('panda', 42))])
 def test_soft_arm_whose_observer_oscillates_goes_on_without_it(robot, number):
     """Softer than its preset, with a load: it is said once, and no bound is near."""
     study = load_study(f'monte_carlo_elastic_changes_{robot}')

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from nights import at_night
 from paper_case import configured, several
 from random_arm import PANDA_TEXT
 
@@ -12,11 +13,9 @@ from blf_dsc_controller import (
     ConfigurationError,
     ControllerConfig,
     change,
-    controller_of,
     load_loop,
     simulate,
 )
-from blf_dsc_controller.configuration.robot import parameters_of
 from blf_dsc_controller.configuration.schema import build
 from blf_dsc_controller.factory.estimate import (
     columns_of,
@@ -114,20 +113,6 @@ def test_problems_with_an_arm_are_reported(changes, message):
         build(ControllerConfig, ARM | changes)
 
 
-def test_gravity_is_compensated_with_the_initial_estimate():
-    """At rest on the reference the torque is G of the URDF, whatever the gains."""
-    config = panda(robot__gravity=[0.0, -9.81, 0.0])
-    q = np.array(config.reference.offset)
-    chain = config.robot.chain(config.joints)
-    base = parameters_of(config.robot, chain)
-    H = np.zeros((7, base.model.p))
-    base.model.regressor(q, *np.zeros((3, 7)), H)
-    gravity = H @ base.of(chain.inertias, config.robot.rotors(chain))
-    assert np.abs(gravity).max() > 5.0
-    torque = controller_of(config).update(0.0, 1e-3, np.concatenate((q, np.zeros(14))))
-    np.testing.assert_allclose(torque, gravity, atol=0.02)  # P^(0) has four digits
-
-
 def test_bound_starts_as_a_funnel_where_an_unknown_load_makes_the_arm_sag():
     def started(**given):
         return settings_of_config(panda(**given)).barrier.initial_bound
@@ -153,7 +138,7 @@ def test_bound_holds_from_the_start_with_an_undeclared_rated_load():
     assert not result.stops
 
 
-@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
+@pytest.mark.parametrize('preset', ['panda_rigid', *at_night('ur5e_rigid')])
 def test_drives_much_lighter_than_guessed_oscillate_and_stop_unless_they_are_given(
     preset,
 ):

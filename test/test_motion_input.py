@@ -129,9 +129,9 @@ def moved(rig, seconds):
     return np.array(seen)
 
 
-def go_to(rig, positions, time=0.05):
+def go_to(rig, positions):
     """Send a trajectory of one point that is too near in time."""
-    point = TrajectoryPoint(time, tuple(positions))
+    point = TrajectoryPoint(0.05, tuple(positions))
     made = Trajectory(('joint1', 'joint2'), (point,))
     reports = []
     rig.inputs.follow(

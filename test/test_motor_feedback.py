@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from motor_arm import ELASTIC, LEROBOT, RANGES, MotorDriver, loop_of
+from nights import at_night
 
 import blf_dsc_controller as blf
 from blf_dsc_controller import Phase, load_loop
@@ -108,7 +109,7 @@ def test_motors_hold_elastic_gears_that_the_host_cannot_hold():
     assert travel < 0.06
 
 
-@pytest.mark.parametrize('physics', ['own', 'mujoco'])
+@pytest.mark.parametrize('physics', ['mujoco', *at_night('own')])
 def test_yam_of_the_preset_takes_up_its_rated_payload_with_the_gains_of_its_maker(
     physics,
 ):

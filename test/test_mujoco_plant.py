@@ -219,7 +219,7 @@ def beside_a_wall(monkeypatch, config, wall):
     return MujocoPlant(config)
 
 
-@pytest.mark.parametrize('reaction', ['hold', 'none'])
+@pytest.mark.parametrize('reaction', ['hold', *at_night('none')])
 def test_load_is_learned_and_a_wall_is_not(monkeypatch, reaction):
     """Both in one run of a Panda with wrong links; without a reaction the weight is lost.
 

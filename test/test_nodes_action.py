@@ -169,7 +169,7 @@ def loop(shared):
     client.feedback.clear()
     law.status.trajectories._is_stopped = False
     by_the_topic(law, client, START)
-    client.ros.run(arm, 1500)
+    client.ros.run(arm, 1100)
     np.testing.assert_allclose(rests_at(law), START, atol=1e-9)
     return shared
 

@@ -78,19 +78,19 @@ def run_lockstep(ros, plant, controller=None):
 
 
 CASES = {
-    'learning': ({'duration': 4.0}, {}),
+    'learning': ({'duration': 2.0}, {'learning.window': 1.0}),
     'noise, differenced velocity and delay': (
         {'duration': 2.0, 'seed': 5, **NOISY},
         {},
     ),
     'a push against which it holds': (
         {
-            'duration': 8.5,
-            'events.begin': [8.0],
+            'duration': 3.0,
+            'events.begin': [2.5],
             'events.duration': [0.2],
             'events.torque': [2.0, 0.0],
         },
-        {'contact.enabled': True, 'contact.reaction': 'hold'},
+        {'contact.enabled': True, 'contact.reaction': 'hold', 'learning.window': 1.0},
     ),
     'three joints of a URDF with a truth of their own, and a payload': (
         ARM

@@ -31,27 +31,18 @@ SECOND = 1_000_000_000
 FIELDS = ('positions', 'velocities', 'accelerations')
 
 
-def two_tones(t, shift):
-    """Return position, velocity and acceleration (3, 2) at t [s] of two tones on each joint."""
-    rates = np.array([1.0, 2.3])
-    sizes = np.array([[0.2, 0.08], [0.25, -0.05]])
-    tones = sizes * np.exp(1j * (rates * t + [0.2, -0.9]))
-    motion = np.array([(tones * (1j * rates) ** k).sum(axis=1).real for k in range(3)])
-    motion[0] += [1.9, 1.4] + shift * np.ones(2)
-    return motion
-
-
-def trajectory(joints, shift, *, duration, fields=3, stamp=0, spacing=0.05):
-    """Return a trajectory into two tones within a second, at rest a second after them."""
-    sent = JointTrajectory(joint_names=joints)
+def trajectory(*, duration, fields=3, stamp=0, spacing=0.05):
+    """Return a trajectory into a sinusoid within a second, at rest a second after it."""
+    sent = JointTrajectory(joint_names=JOINTS)
     sent.header.stamp = Time(nanoseconds=stamp).to_msg()
     times = 1.0 + spacing * np.arange(round(duration / spacing))
-    points = [two_tones(t, shift) for t in times]
-    rest = np.vstack((points[-1][:1], np.zeros((2, 2))))
+    size = np.array([0.2, -0.25])  # rad
+    sine, cosine = (np.outer(wave(times), size) for wave in (np.sin, np.cos))
+    points = [*zip(np.add(sine, (1.9, 1.4)), cosine, -sine, strict=True)]
+    rest = points[-1][0], 0.0 * size, 0.0 * size
     for t, point in zip((*times, times[-1] + 1.0), (*points, rest), strict=True):
-        values = point[:fields, [JOINTS.index(joint) for joint in joints]]
         at = Duration(nanoseconds=round(t * 1e9)).to_msg()
-        arrays = dict(zip(FIELDS, values, strict=False))
+        arrays = dict(zip(FIELDS, point[:fields], strict=False))
         sent.points.append(JointTrajectoryPoint(**arrays, time_from_start=at))
     return sent
 
@@ -87,7 +78,7 @@ def test_long_chunk_is_followed_from_the_sample_that_was_promised_on(ros):
     arm, law = ros.loop(None, PLANNED['on'] | {'telemetry__decimation': 1})
     ros.run(arm, 200)
     before = law.guard.controller.reference_vector.copy()
-    sent = trajectory(JOINTS, np.zeros(2), duration=10.0, spacing=5e-3)
+    sent = trajectory(duration=10.0, spacing=5e-3)
     assert send(ros, law, sent) == ''
     ros.run(arm, 3000)
     after = law.guard.controller.reference_vector
@@ -127,7 +118,7 @@ def test_rejected_trajectory_changes_nothing(ros, spoil, watchdog):
     arm, law = ros.loop(None, PLANNED[watchdog])
     ros.run(arm, 20)
     before = law.guard.controller.reference_vector.copy()
-    sent = trajectory(JOINTS, np.zeros(2), duration=0.1)
+    sent = trajectory(duration=0.1)
     spoil(sent)
     assert REJECTED[spoil] in send(ros, law, sent)
     assert inputs(law).rejected == 1
@@ -138,9 +129,7 @@ def test_rejected_trajectory_changes_nothing(ros, spoil, watchdog):
 
 @pytest.mark.parametrize('fields', [1, 3])
 def test_trajectory_message_is_decoded_as_by_rclpy(fields):
-    message = trajectory(
-        JOINTS, np.zeros(2), duration=0.2, fields=fields, stamp=5 * SECOND + 7
-    )
+    message = trajectory(duration=0.2, fields=fields, stamp=5 * SECOND + 7)
     message.header.frame_id = 'base'
     message.points[0].effort = [1.0, 2.0, 3.0]
     raw = serialize_message(message)

@@ -107,22 +107,6 @@ def test_target_that_stays_is_reached_and_not_overshot(
     np.testing.assert_allclose(seen[-1], far, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ('amplitude', 'behind', 'off'), [(0.1, 0.09, 0.004), (0.3, 0.15, 0.023)]
-)
-def test_sinusoid_is_followed_as_far_behind_as_the_arm_needs_to_brake(
-    amplitude, behind, off
-):
-    """At 30 Hz and 0.5 Hz; at 0.94 rad/s the Panda brakes in 0.125 rad, 0.13 s behind."""
-    sent = np.arange(120) / 30.0
-    wave = amplitude * (1.0 - np.cos(np.pi * sent))
-    times = np.ceil(1000.0 * sent).astype(int)
-    seen = follow(np.outer(wave, np.ones(7)), times, times[-1])[1000:]
-    t = 1.0 + 1e-3 * np.arange(len(seen)) - behind
-    late = amplitude * (1.0 - np.cos(np.pi * t))
-    assert np.abs(seen - late[:, np.newaxis]).max() < off
-
-
 @pytest.mark.parametrize('held', [True, False])
 def test_target_that_nothing_follows_is_held_or_left_behind_while_braking(held):
     """It is due at 1 s; its line is left at 1.2 s."""

@@ -206,19 +206,6 @@ def test_path_that_is_too_fast_is_stretched_and_passes_its_points_in_order():
     np.testing.assert_allclose(at(motion.vector, motion.end)[0], GOALS[-1], atol=1e-9)
 
 
-def test_point_that_is_too_near_in_time_is_reached_as_soon_as_the_limits_allow():
-    """From rest over 1.5 rad: not before velocity, acceleration and jerk allow, 1.37 s."""
-    at_rest = pack(2, [minimum_jerk(np.zeros(1), np.zeros((1, 2)))])
-    sent = trajectory((np.array([[1.5, 0.3]]),), times=(0.2,))
-    motion = plan(sent, at_rest, 0.0)
-    # 1.5 rad at 1.5 rad/s, 0.25 s of acceleration and half of the 0.05 s to change it,
-    # twice half
-    assert motion.end == pytest.approx(1.0 + 0.25 + 0.05, abs=1e-9)
-    np.testing.assert_allclose(at(motion.vector, motion.end)[0], (1.5, 0.3), atol=1e-8)
-    assert limits_used(motion, 0.0, motion.end) == pytest.approx((1.0, 1.0), abs=1e-6)
-    assert f'{motion.end - 0.2:.3g} s later' in motion.note
-
-
 def test_chunk_whose_first_points_cannot_be_reached_in_time_keeps_the_later_ones():
     """Bare positions of a curve: it is followed with the velocities that these mean."""
     times = 0.05 * np.arange(1, 11)

@@ -93,10 +93,10 @@ def test_bag_of_a_run_begins_with_the_configuration_of_its_plant(tmp_path):
 
 
 def test_memory_of_a_run_into_a_bag_does_not_grow_with_its_length(tmp_path):
-    """All samples of the longer run would be 7 MB."""
+    """All samples of the longer run would be 4 MB."""
     config = build(ControllerConfig, {})
     peaks = []
-    for duration in (2.0, 2.0, 8.0):  # the first imports
+    for duration in (2.0, 2.0, 5.0):  # the first imports
         plant = build(PlantConfig, {'duration': duration} | NOISY)
         tracemalloc.start()
         simulate_into_bag(tmp_path / f'{len(peaks)}', config, plant)

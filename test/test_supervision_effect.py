@@ -13,6 +13,7 @@ import re
 
 import numpy as np
 import pytest
+from nights import at_night
 from scenario import Scenario, carrying, changed, frozen
 
 import blf_dsc_controller as blf
@@ -86,7 +87,7 @@ def test_commands_that_arrive_are_not_said_to_have_no_effect(effort):
 
 
 @pytest.mark.parametrize(
-    ('stiffness', 'reference'), [(3.0, 'hold'), (4.0, 'sinusoids')]
+    ('stiffness', 'reference'), [(4.0, 'sinusoids'), *at_night((3.0, 'hold'))]
 )
 def test_arm_that_oscillates_when_it_is_stopped_keeps_the_load_it_carries(
     stiffness, reference
@@ -180,7 +181,7 @@ def test_commands_that_do_not_arrive_leave_nothing_in_the_safe_torque(preset):
     assert again.speed[-1].max() < again.speed[0].max() + 0.05
 
 
-@pytest.mark.parametrize('preset', ['panda_rigid', 'ur5e_rigid'])
+@pytest.mark.parametrize('preset', ['panda_rigid', *at_night('ur5e_rigid')])
 def test_brakes_in_motion_are_named_after_the_error_has_passed_the_bound(preset):
     """Within 6 to 64 ms: too soon for what tells them from an error at rest."""
     arm = Scenario(preset)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fault_table import Rig
+from nights import at_night
 from plain_law import dynamics
 from scenario import Scenario, changed, every, late, lost, repeated, run
 
@@ -78,7 +79,9 @@ def test_torque_of_a_law_that_is_deactivated_fades_in_a_straight_line():
 
 
 @pytest.mark.parametrize('way', LEAVE)
-@pytest.mark.parametrize(('factor', 'angle'), [(1.0, 0.12), (0.5, 0.2), (1.5, 0.2)])
+@pytest.mark.parametrize(
+    ('factor', 'angle'), [(0.5, 0.2), *at_night((1.0, 0.12), (1.5, 0.2))]
+)
 def test_arm_that_leaves_command_rests_although_its_model_may_be_wrong(
     way, factor, angle
 ):
@@ -134,7 +137,13 @@ GLITCHES = {
 }
 
 
-@pytest.mark.parametrize('glitch', GLITCHES)
+@pytest.mark.parametrize(
+    'glitch',
+    [
+        *('velocity of another arm', 'no position', 'position that jumps'),
+        *at_night('velocity beyond its limit', 'no velocity', 'position of no arm'),
+    ],
+)
 def test_one_wrong_state_hardly_moves_an_arm_that_is_held_in_a_stop(glitch):
     """Neither by damping nor by a load that it would show."""
     arm = arm_of(HALF | HOLDING, QUIET)

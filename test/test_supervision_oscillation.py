@@ -143,7 +143,7 @@ def test_block_that_is_printed_after_a_stop_holds_a_pick_up(soft_ur5e):
     for name, value in yaml.safe_load(block).popitem()[1]['ros__parameters'].items():
         group, _, parameter = name.partition('.')
         law[group][parameter] = value
-    code, told = run('20')
+    code, told = run('9')
     assert code == 0
     assert 'held by every joint' in told
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from nights import at_night
 from scenario import Scenario, carrying, changed, frozen
 
 import blf_dsc_controller as blf
@@ -22,7 +23,7 @@ def arm_of(preset, given=None):
     return arm
 
 
-@pytest.fixture(params=['fr3', 'panda', 'ur5e'])
+@pytest.fixture(params=['fr3', 'ur5e', *at_night('panda')])
 def arm(request):
     return arm_of(request.param)
 

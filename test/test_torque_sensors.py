@@ -119,8 +119,14 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize('failure', FAILURES)
-@pytest.mark.parametrize('preset', ['panda', 'fr3_direct'])
+@pytest.mark.parametrize(
+    ('preset', 'failure'),
+    [
+        *product(['panda'], FAILURES),
+        ('fr3_direct', 'dead'),
+        *at_night(*product(['fr3_direct'], ['wrong sign', 'N mm', 'a tenth'])),
+    ],
+)
 def test_sensors_that_fail_in_motion_are_named_and_the_arm_goes_on(preset, failure):
     """It does not stop for commands without effect, which efforts would tell."""
     arm = Scenario(preset, {POLE: 300.0}, plant=PICK_UP)
@@ -173,9 +179,9 @@ def test_brakes_that_close_still_stop_an_arm_whose_efforts_say_so():
     assert arm.reason in ('commands without effect', 'error past the bound')
 
 
-def warned(given, preset='panda'):
+def warned(given):
     """Return what is warned of the use of torque sensors."""
-    config = Scenario(preset, given).config
+    config = Scenario('panda', given).config
     return [text for text in config_warnings(config) if text.startswith(POLE)]
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from nights import at_night
 from scenario import Scenario, carrying, repeated
 from watched_arm import WatchedArm
 
@@ -51,7 +52,9 @@ def second_sender(offset, every):
 
 
 @pytest.mark.parametrize('preset', ['fr3', 'ur5e_driver'])
-@pytest.mark.parametrize(('offset', 'every'), [(0.5, 1), (-0.05, 1), (0.3, 10)])
+@pytest.mark.parametrize(
+    ('offset', 'every'), [(0.5, 1), (0.3, 10), *at_night((-0.05, 1))]
+)
 def test_second_sender_of_its_joints_does_not_move_a_resting_arm(preset, offset, every):
     """An FR3 was accelerated to 79 rad/s by its safe stop, a UR5e to 47."""
     arm = resting(preset)
@@ -72,7 +75,7 @@ def test_second_sender_leaves_a_moving_arm_its_brakes(preset):
     assert record.speed[-1].max() < 0.05
 
 
-@pytest.mark.parametrize('times', [2, 4])
+@pytest.mark.parametrize('times', [4, *at_night(2)])
 def test_stop_brakes_as_well_if_each_state_arrives_several_times(times):
     """Copies switched the damping off: a Panda went on at 0.6 rad/s."""
 

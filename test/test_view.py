@@ -138,7 +138,7 @@ def test_page_that_is_opened_late_draws_what_it_receives_and_says_from_when(ros)
 
 
 def test_contact_is_on_the_page_and_in_diagnostics(ros):
-    """4 N at 8 s, once the arm has been learned."""
+    """4 N at 2.5 s, once the arm has been learned."""
     view = ros.add(ViewNode, port=18280)
     said = ros.listen(topics.DIAGNOSTICS)
     log = ros.listen(LOG)
@@ -147,10 +147,11 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
         found = [each for message in said for each in message.status]
         return [each for each in found if each.name.endswith('/contact')]
 
-    push = {'events.begin': [8.0], 'events.duration': [60.0], 'events.payload': [0.0]}
+    push = {'events.begin': [2.5], 'events.duration': [60.0], 'events.payload': [0.0]}
     force = {'events.force': [4.0, 0.0, 0.0]}
     arm, law = ros.loop(
-        {**push, **force, 'autostart': False}, {'contact.enabled': True}
+        {**push, **force, 'autostart': False},
+        {'contact.enabled': True, 'learning.window': 1.0},
     )
     ros.until(lambda: view.config)
     assert configure(ros, arm)
@@ -160,7 +161,7 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     assert now.felt_at == 0
     assert abs(now.external[0]) > now.interval[0]
     # the loop does not wait for the page: what it showed before the push
-    *_, before = (each for each in view.past if 7.0 < each.time < 8.0)
+    *_, before = (each for each in view.past if 1.5 < each.time < 2.5)
     assert before.felt_at is None
     ros.until(lambda: contact_statuses()[-1].level == DiagnosticStatus.WARN)
     status = contact_statuses()[-1]
@@ -170,14 +171,14 @@ def test_contact_is_on_the_page_and_in_diagnostics(ros):
     warned = [each.msg for each in log if each.msg.startswith('something touches')]
     assert len(warned) == 1
     (event,) = events_with(view, "N m on joint 'joint1', and model error")
-    assert 8.0 < event[0] < 8.1
+    assert 2.5 < event[0] < 2.6
     # Once it has ended, all of it can be looked at.
     assert view.page.slider is None
     assert deactivate(ros, law)
     assert cleanup(ros, law)
     ros.until(lambda: view.page.slider)
     assert 'the controller has ended normally' in view.page.shown_state[1]
-    assert view.page.slider.max > 8.0
+    assert view.page.slider.max > 2.5
     view.close()
 
 
