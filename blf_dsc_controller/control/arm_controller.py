@@ -14,8 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from blf_dsc_controller.bags.topic_recorder import TopicRecorder
-from blf_dsc_controller.bags.writer import BagWriter
+from blf_dsc_controller.bags.writer import BagWriter, TopicRecorder
 from blf_dsc_controller.compiled.announcement import logged_compilation
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import CONTROLLER, load, locate
