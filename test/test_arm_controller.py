@@ -160,7 +160,7 @@ def test_it_follows_trajectories_and_stops_on_request():
         with pytest.raises(blf.TrajectoryError):
             controller.follow([(2.0, np.array([2.2, 1.6]))], begin=begin)
     for stamp in (float('nan'), 1.7e18, 'now'):
-        with pytest.raises(blf.StateError, match='a time in s is needed'):
+        with pytest.raises(blf.StateError, match='a finite time in s is needed'):
             controller.update(stamp, [2.0, 1.5], [0.0, 0.0])
     (*_, q) = arm.run(2.5).q
     np.testing.assert_allclose(q, (2.2, 1.6), atol=2e-3)  # the bound

@@ -191,7 +191,7 @@ class ArmController:
         self._check_open()
         if not _is_time(stamp):
             raise StateError(
-                f'stamp: got {stamp}, but a time in s is needed; 1 ns is 1e-9 s'
+                f'stamp: got {stamp}, but a finite time in s is needed; 1 ns is 1e-9 s'
             )
         n = len(self.joints)
         values = self._measurement(q, dq, effort)
