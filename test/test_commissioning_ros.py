@@ -129,7 +129,6 @@ def test_arm_is_held_after_the_proof_until_ctrl_c(ros, tmp_path, monkeypatch, ca
     shorten_moves(monkeypatch)
     monkeypatch.setattr(proof, 'SHARES', (1.0,))
     monkeypatch.setattr(proof, '_LAST', 0.5)
-    monkeypatch.setattr(postures, 'HOLD', 0.1)
     rig = Rig(ros, tmp_path, ARM + CHOSEN)
     monkeypatch.setattr(commission, 'robot', lambda *_: nullcontext(rig.robot))
     told, held = '', []
