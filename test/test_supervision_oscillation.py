@@ -17,8 +17,7 @@ from blf_dsc_controller.cli.run import STOPPED
 from blf_dsc_controller.factory.controller import controller_of
 from blf_dsc_controller.law.torque import RATE_CUT
 from blf_dsc_controller.simulation.loop import write_bag
-from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
-from blf_dsc_controller.supervision.stop_cause import StopCause
+from blf_dsc_controller.supervision.stop_cause import saturation_of
 
 LAW, PLANT = 'blf_dsc_controller', 'sim_plant'
 NO_LOOP = {'actuator.loop_gain': 0.0, 'actuator.loop_damping': 0.0}
@@ -206,14 +205,11 @@ def test_arm_that_stops_in_want_of_torque_is_said_to_be_at_its_limit():
 def test_rate_limit_that_delays_the_torque_is_named():
     config = blf.load_loop('recommended').controller
     law = controller_of(config)
-    cause = StopCause(config, law, OscillationCheck(config, law))
-    assert cause.text(0.0) == ''
-    cause.take_limited(1)
+    assert saturation_of(law, config, 1, 0.0) == ''
     law.signals.saturation.cuts[:] = 0.0, RATE_CUT
-    assert cause.text(0.1).startswith(
-        "joint 'joint2' has demanded more than its torque"
-    )
-    assert 'torque.rate_limit delays what it gets' in cause.text(0.1)
+    text = saturation_of(law, config, 1, 0.1)
+    assert text.startswith("joint 'joint2' has demanded more than its torque")
+    assert 'torque.rate_limit delays what it gets' in text
 
 
 def test_chatter_of_coarse_encoders_is_not_taken_for_brakes():

@@ -17,7 +17,7 @@ from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.model_torque import needed_torque
 from blf_dsc_controller.supervision.not_sensors import is_off
 from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
-from blf_dsc_controller.supervision.stop_cause import StopCause
+from blf_dsc_controller.supervision.stop_cause import chatter_of, saturation_of
 from blf_dsc_controller.supervision.supervisor import Fault, Reason
 from blf_dsc_controller.tool.errors import in_words
 
@@ -53,7 +53,8 @@ class SampleCheck:
         self._units = config.units
         self._tool = tool_of(config)
         self._controller = controller
-        self._cause = StopCause(config, controller, oscillation)
+        self._config, self._oscillation = config, oscillation
+        self._limited = 0  # the joint that was last at its torque limit
         self.ratio = controller.checks.ratio
         self._estimates = estimates
         self._saturation = 0  # ns, times _UNSATURATED_RELIEF
@@ -102,6 +103,17 @@ class SampleCheck:
         sample = self._controller.sample
         return self._tool.errors(sample.qr, sample.xi1, sample.bound)
 
+    @property
+    def _vibration(self) -> str:
+        """What oscillates or chatters, and the remedy; empty if nothing does."""
+        return self._oscillation.cause or chatter_of(self._controller, self._config)
+
+    @property
+    def _lack_of_torque(self) -> str:
+        """Which joint has been at its torque limit for long, and the remedy; empty if none has."""
+        time = self.saturated_time
+        return saturation_of(self._controller, self._config, self._limited, time)
+
     def check(self, dt: float) -> Fault | None:
         """Return why the torque of a sample, after `dt` [s], must not be used."""
         flags = self._controller.flags
@@ -141,9 +153,9 @@ class SampleCheck:
         checks = self._controller.checks
         limit = self._controller.settings.torque.limit
         self._estimates.return_to_moved()
-        if vibration := self._cause.vibration:
+        if vibration := self._vibration:
             return Fault(Reason.OSCILLATION, vibration)
-        if saturation := self._cause.saturation(self.saturated_time):
+        if saturation := self._lack_of_torque:
             return Fault(Reason.SATURATED, f'{saturation}; no joint moves any more')
         if checks.effect.short_for[0] > 0.0:
             shortfall = checks.effect.shortfall - checks.effect.shortfall_in_motion
@@ -180,7 +192,7 @@ class SampleCheck:
         """
         settings = self._controller.settings
         checks = self._controller.checks
-        if checks.effect.compares[0] == 0.0 or self._cause.oscillation:
+        if checks.effect.compares[0] == 0.0 or self._oscillation.cause:
             return None
         shortfall = checks.effect.shortfall - checks.effect.mean_shortfall
         present = self._controller.sample.torque - checks.repeats.used[2 * settings.n :]
@@ -222,7 +234,7 @@ class SampleCheck:
         )
         if (at_tool := self.tool_errors) is not None:
             text += f'; {in_words(at_tool)}'
-        if cause := self._cause.text(self.saturated_time):
+        if cause := self._vibration or self._lack_of_torque:
             return Fault(Reason.OUTSIDE_BOUND, f'{cause}; {text}')
         return Fault(Reason.OUTSIDE_BOUND, text + self._imbalance(worst))
 
@@ -262,7 +274,7 @@ class SampleCheck:
         demand, added = signals.demand, signals.saturation.added
         needed = np.maximum(np.abs(demand), np.abs(demand - added))
         worst = int(np.argmax(needed - limit))
-        self._cause.take_limited(worst)
+        self._limited = worst
         self.saturated += 1
         self._saturation += _UNSATURATED_RELIEF * round(dt * 1e9)
         if self.saturated_time <= self._safety.saturation_time:
@@ -273,6 +285,4 @@ class SampleCheck:
             f'its limit of {limit[worst]:g} {unit} for {self.saturated_time:.4g} s (less a quarter '
             'of the time below it)'
         )
-        return Fault(
-            Reason.SATURATED, '; '.join(filter(None, (self._cause.vibration, text)))
-        )
+        return Fault(Reason.SATURATED, '; '.join(filter(None, (self._vibration, text))))
