@@ -129,7 +129,7 @@ def test_a_loop_that_hangs_or_is_killed_is_an_error_and_another_can_be_started(
 ):
     with drive(tmp_path / 'bag') as arm:
         os.kill(arm._loop.pid, signal.SIGSTOP)
-        monkeypatch.setattr(loop_process, '_SILENCE', 0.5)  # s; else a minute
+        monkeypatch.setattr(loop_process, '_SILENCE', 0.5)  # s; else ten
         with pytest.raises(
             blf.LoopEndedError, match=r'said nothing for .* look at the arm'
         ):

@@ -23,7 +23,6 @@ joints, and these the stiffest gains with a margin.
     simulated       the runs of a simulated arm
     postures        the runs of a robot over its driver, from posture to posture
     proof           the chosen gains in three steps along the arm's own reference
-    limit_cycle     whether an arm shakes at rest or in motion
     page            tables and sentences of what was found and chosen
     picture         margins of the gains, and responses of the joints
     files           the parameter files of motions, and with what was chosen

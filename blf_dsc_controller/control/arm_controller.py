@@ -7,6 +7,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from numbers import Real
 from pathlib import Path
 from types import NoneType, TracebackType
 from typing import Any, Literal, NamedTuple
@@ -289,10 +290,11 @@ class ArmController:
         names = tuple(joints) or self.joints
         try:
             given = tuple(_point(*point) for point in points)
-            begin = None if begin is None else float(begin)
         except (TypeError, ValueError) as error:
             expected = 'each point is a time and positions, as in (1.0, [0.1, 0.2])'
             raise TrajectoryError([f'{error}; {expected}']) from error
+        if not isinstance(begin, (Real, NoneType)):
+            raise TrajectoryError([f'begin: got {begin!r}, but a time in s is needed'])
         trajectory = Trajectory(names, given, begin)
         guard = self._loop.guard
         plan = guard.motions.plan(trajectory)
@@ -529,8 +531,8 @@ class ArmController:
 def _is_time(stamp: float) -> bool:
     """Whether a stamp is a time [s] that ROS knows, in whole ns; it may be anything."""
     try:
-        return abs(stamp) < _NEVER
-    except TypeError:
+        return math.isfinite(stamp) and abs(stamp) < _NEVER
+    except (TypeError, OverflowError):
         return False
 
 

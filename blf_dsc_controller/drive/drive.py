@@ -47,8 +47,6 @@ from blf_dsc_controller.messages.tip_load import TAKEN_UP
 if TYPE_CHECKING:
     from blf_dsc_controller.drive.pose import Pose, Poses
 
-_BRAKED = 5.0  # s: longer than braking takes
-
 
 class Drive:
     """A robot, or a simulated arm, that does what a script says.
@@ -435,11 +433,7 @@ class Drive:
         try:
             self._await_result(result, timeout, self._hint)
         except NotInTimeError as error:
-            try:
-                self.stop(_BRAKED)
-            except NotInTimeError:
-                text = 'the loop does not say whether the arm has braked'
-                raise NotInTimeError(f'{error}: {text}') from None
+            self.stop()
             raise NotInTimeError(f'{error}: the arm has braked') from None
         except KeyboardInterrupt:
             # where no block ends with it, as in a notebook, the arm would go on

@@ -30,7 +30,8 @@ from blf_dsc_controller.messages.script_link import ArmState
 
 _MODULE = 'blf_dsc_controller.drive.script_process'
 _POLL = 0.1  # s
-_SILENCE = 60.0  # s without a word of a loop that runs
+_SILENCE = 10.0  # s without a word of a loop that runs
+_CLOSING = 60.0  # s likewise of one that ends, and may write a bag
 _END = 5.0  # s, for a process that was told to end at once
 _LOG = logging.getLogger('blf_dsc_controller')
 
@@ -223,8 +224,8 @@ class LoopProcess:
         self._send(script_link.CLOSE, b'null')
         self._heard = time.monotonic()
         while self._process.poll() is None:
-            if time.monotonic() - self._heard > _SILENCE:
-                _LOG.error(f'the loop does not end: silent for {_SILENCE:g} s, killed')
+            if time.monotonic() - self._heard > _CLOSING:
+                _LOG.error(f'the loop does not end: silent for {_CLOSING:g} s, killed')
                 return
             with self._news:
                 self._news.wait(_POLL)

@@ -104,7 +104,7 @@ class DrivenNode(ControllerNode):
         super()._on_joint_state(raw)
 
     def _report_learning(self, guard: Guard) -> None:
-        """Say nothing of a law that learns nothing, or only on its way."""
+        """Log nothing of a law that learns nothing, or only on its way."""
 
     def _problems(self, config: ControllerConfig) -> list[str]:
         del config

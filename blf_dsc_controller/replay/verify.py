@@ -157,7 +157,8 @@ def _first_difference(
     if run.departure is not None:
         differences.insert(0, run.departure)
     if run.alteration is not None and content.version == __version__:
-        differences.append(run.alteration)
+        journal = content.topics[topics.JOURNAL].name
+        differences.append(run.alteration._replace(topic=journal))
     return min(differences, key=lambda found: found.stamp, default=None)
 
 
