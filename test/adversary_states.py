@@ -66,6 +66,7 @@ def _rounded(state: State, play: Play) -> State:
 CHANGES: dict[str, Callable[[State, Play], Iterable[State]]] = {
     'position': lambda s, p: [_moved(s, p, q=p.size**3)],
     'velocity': lambda s, p: [_moved(s, p, dq=5.0 * p.size**3)],
+    'leap': lambda s, p: [_moved(s, p, q=p.size, dq=1e3 * p.size)],
     'not finite': lambda s, p: [_moved(s, p, q=np.nan if p.size > 0.0 else np.inf)],
     'no velocity': lambda s, p: [_moved(s, p, dq=np.nan)],
     'scaled': lambda s, p: [_scaled(s, p, 1.0 + 0.5 * p.size, 1.0 + 0.5 * p.size)],

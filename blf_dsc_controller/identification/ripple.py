@@ -34,9 +34,7 @@ _PER_HOP = 4  # windows, from one of the fit to the next; fewer in long recordin
 _ENOUGH = 20_000  # windows
 _LARGEST = 300.0  # N that is searched
 _PERIODS = 2.5  # of a ripple in the range of the joint, at least
-_GRID = (
-    1500  # lobes that are searched, at most: 2 pi / range, in which ripples look alike
-)
+_GRID = 1500  # lobes that are searched, at most
 _PER_LOBE = 4.0  # N that are tried in each
 _ROWS = 30  # of each part, at least
 _LIKE = 0.5  # of a ripple, most that a part of the motion may differ by
@@ -105,20 +103,22 @@ def ripples_of(
 def listed_cycles(ripples: Sequence[Ripples]) -> tuple[float, ...]:
     """Return the N of `learning.ripple_cycles`: of all joints, the few that disturb most.
 
-    Ripples of two joints that may have the same N, or look alike in their motion, are one.
+    Ripples of two joints that look alike in the motion of either are one: that of the first.
     """
     found = [
         ((each.amplitude / own.torque) ** 2, each, 0.5 * own.seen[0] / _PERIODS)
         for own in ripples
         for each in own.found
     ]
-    listed: dict[Ripple, float] = {}
-    for worth, each, half_lobe in sorted(found, reverse=True):
-        alike = (one for one in listed if abs(one.cycles - each.cycles) < half_lobe)
-        first = next(alike, each)
-        listed[first] = listed.get(first, 0.0) + worth
-    most = sorted(listed, key=lambda one: -listed[one])[:_MOST]
-    return tuple(map(_rounded, most))
+    listed: list[tuple[float, Ripple, float]] = []
+    for worth, each, lobe in sorted(found, reverse=True):
+        for k, (sum_of_worths, first, own) in enumerate(listed):
+            if abs(first.cycles - each.cycles) < max(lobe, own):
+                listed[k] = sum_of_worths + worth, first, own
+                break
+        else:
+            listed.append((worth, each, lobe))
+    return tuple(_rounded(first) for _, first, _ in sorted(listed)[-_MOST:][::-1])
 
 
 def _rounded(ripple: Ripple) -> float:
@@ -236,7 +236,7 @@ def _of_joint(joint: _Joint, left: Floats) -> Ripples:
     found = [_ripple(joint, left, cycles, N) for N in cycles]
     found.sort(key=lambda each: -each.amplitude)
     told = tuple(each for each in found if each.amplitude > _FELT * torque)
-    least = max(float(np.median(apart)) / _LIKE, _FELT * torque)
+    least = max(float(np.median(apart.max(axis=1))) / _LIKE, _FELT * torque)
     return Ripples(told, joint.seen, least, torque)
 
 

@@ -7,12 +7,12 @@ questions; what follows from the answers is decided where they are asked.
 
 from __future__ import annotations
 
-from math import isfinite
+from math import inf, isfinite
 
 from blf_dsc_controller.compiled.jit import kernel
 from blf_dsc_controller.compiled.layout import Array
 
-NOT_FINITE, FAR, OUT_OF_REACH, NEW, MOVES = 1, 2, 4, 8, 16
+NOT_FINITE, FAR, OUT_OF_REACH, NEW, MOVES, LEAPS = 1, 2, 4, 8, 16, 32
 """Answers of `compare_state`: a sum of them."""
 
 _MOVED_STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
@@ -36,9 +36,10 @@ def compare_state(
 
     NOT_FINITE: a position is not.
     FAR: from the positions `at` (n,) [rad] a joint has gone, in a `step` [s], more than twice
-        as fast as the `fastest` (n,) [rad/s] that it may be, and as its own velocity.
-    OUT_OF_REACH: from the `last` trusted positions (n,) [rad], `elapsed` [s] ago, more than twice
-        as fast as it may be, twice its `speed` (n,) [rad/s] there added.
+        as fast as the `fastest` (n,) [rad/s] that it may be.
+    LEAPS: it has, and more than twice as fast as its own velocity.
+    OUT_OF_REACH: likewise from the `last` trusted positions (n,) [rad], `elapsed` [s] ago,
+        twice its `speed` (n,) [rad/s] there added.
     NEW: it differs from `read`, q and dq (2 n,).
     MOVES: at its velocity the arm has gone farther in `age` [s] than the steps of its sensor,
         with their `resolution` (n,) [rad], hide.
@@ -49,11 +50,12 @@ def compare_state(
         q, dq = measurement[i], measurement[n + i]
         least_step = _MOVED_STEPS * max(resolution[i], _FINEST_STEP)
         reach = 2.0 * fastest[i] * step + least_step
-        by_velocity = 2.0 * abs(dq) * step + least_step
         if not isfinite(q):
             found |= NOT_FINITE
-        if abs(q - at[i]) > reach and not abs(q - at[i]) <= by_velocity:
+        if abs(q - at[i]) > reach:
             found |= FAR
+            if not abs(q - at[i]) <= 2.0 * abs(dq) * step < inf:
+                found |= LEAPS
         if abs(q - last[i]) > reach + 2.0 * speed[i] * elapsed:
             found |= OUT_OF_REACH
         if not (q == read[i] and dq == read[n + i]):

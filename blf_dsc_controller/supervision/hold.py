@@ -162,7 +162,7 @@ class Hold:
 
     def yield_to_contact(self) -> None:
         """Give way, with gravity and damping, until the next ramp; observe no load."""
-        self.stop_observing()
+        self.load[:] = self._known_load
         self._source = Load.YIELDS
 
     def start_observing(self) -> None:
@@ -175,9 +175,10 @@ class Hold:
         self._begin_observing(0.0)
 
     def stop_observing(self) -> None:
-        """Return to the load that was known at the stop, until `observe_again`."""
-        self.load[:] = self._known_load
-        self._source = Load.REFUTED
+        """Return from an observed load to that known at the stop, until `observe_again`."""
+        if self._source is Load.OBSERVED:
+            self.load[:] = self._known_load
+            self._source = Load.REFUTED
 
     def observe_again(self) -> None:
         """Observe the load from what was known at the stop on, of an arm that sped up before."""
@@ -187,10 +188,10 @@ class Hold:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the arm is at rest, as far as its states show, and with it what it holds."""
-        is_over = self._source is not Load.UNTIL_MOVED or self._rested > _RESTED
+        """Whether the arm is at rest, as far as its states show, and its load has had the time."""
+        left_for = self._elapsed - self._duration  # s, since the end of the ramp
         return (
-            is_over
+            (self._source is not Load.UNTIL_MOVED or left_for >= _RESTED)
             and self._last.age == 0.0
             and float(np.abs(self._last.dq).max()) < AT_REST
         )

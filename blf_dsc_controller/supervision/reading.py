@@ -26,6 +26,7 @@ from blf_dsc_controller.law.sensor import restart
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.comparison import (
     FAR,
+    LEAPS,
     MOVES,
     NEW,
     NOT_FINITE,
@@ -149,9 +150,10 @@ class Readings:
         if config.safety.velocity == 'estimated':
             self._velocity = Velocity(n)
         self._seen = self._before = 0  # ns, of the last trusted state, and before it
-        # ns and rad, of the last state, trusted or not, and since when each has followed from
-        # the one before
+        # ns and rad, of the last state, trusted or not, but for repeated readings; since when each
+        # has followed from the one before; and whether it was faster than it may be
         self._arrived = self._alone_since = 0
+        self._runs = False
         self._at = np.zeros(n)
         self._read = np.full(2 * n, nan)  # q and dq as last read
         self._new_at = -1  # ns, stamp of the first state with these
@@ -278,13 +280,15 @@ class Readings:
         Since the last trusted state, a joint may have gone on twice as fast as it was then, and
         since the last of all states twice as fast as its limit.  So of two senders whose states
         alternate, the one that was trusted is, however rare its states are.  Once all states have
-        followed from each other for ALONE, they are trusted again.
+        followed from each other for ALONE, they are trusted again, also those of an arm that is
+        faster than it may be, as its velocities say.
         """
         last, T = self.last, self._sample_time
         if found & NOT_FINITE:
             return Doubt.NOT_FINITE
-        if found & FAR:
+        if found & LEAPS or (found & FAR and not self._runs):
             self._alone_since = stamp
+        self._runs = bool(found & FAR)
         if last.age == inf:
             return None
         elapsed = (stamp - last.stamp) * NANOSECOND

@@ -113,7 +113,9 @@ class RecentMotion:
         order = self._order
         is_new = (np.diff(self._states[order], axis=0) != 0.0).any(axis=1)
         seen = 1 + int(np.flatnonzero(is_new).max(initial=-1))
-        if seen >= self._step:  # else the arm has hardly moved at all
+        if (
+            2 * seen >= self.size
+        ):  # else the arm has hardly moved, and few would be left
             order = order[seen % self._step : seen + 1]
         stamps = self._stamps[order[:: self._step]]
         states = self._states[order[:: self._step]]

@@ -39,12 +39,13 @@ class StopSpeed:
     def observe(self, speed: float, gap: float) -> bool:
         """Take the speed of a state; return whether the arm speeds up.
 
-        That is while it has been faster for long enough.  `speed` [rad/s] is the largest of a
-        joint, `gap` [s] the time since the last one.
+        That is from when it has become faster for long enough until it is as slow again.
+        `speed` [rad/s] is the largest of a joint, `gap` [s] the time since the last one.
         """
         self._peak = max(speed, self._peak)
         is_faster = speed > 2.0 * self._at_stop + _SPED_UP
-        is_growing = speed > _GROWING * self._peak
+        has_grown = self._speeding > _SPEEDS_UP
+        is_growing = has_grown or speed > _GROWING * self._peak
         self._speeding = self._speeding + gap if is_faster and is_growing else 0.0
         return self._speeding > _SPEEDS_UP
 

@@ -68,7 +68,7 @@ class Named(NamedTuple):
 
 
 def split_unit(name: str, kind: str) -> Named:
-    """Return the name of a column of one of KINDS without its unit.
+    """Return the name of a column of time, q, tau or theta without its unit.
 
     Other words in brackets, such as `(measured)`, belong to the name.
     """
@@ -88,7 +88,7 @@ def _is_unit(word: str) -> bool:
 
 
 def factor_of(path: Path, unit: str, kind: str) -> float:
-    """Return the unit of one of KINDS in s, rad (m), N m (N), A or %; empty: 1.
+    """Return the unit of time, q, tau or theta in s, rad (m), N m (N), A or %; empty: 1.
 
     Raises:
         BlfDscError: it is not known.
