@@ -83,9 +83,12 @@ def test_same_pose_without_velocities_beside_the_arm_does_not_throw_it():
     assert record.speed[-1].max() < 0.1
 
 
-@pytest.mark.parametrize(('preset', 'moves'), [('panda_rigid', False), ('panda', True)])
+@pytest.mark.parametrize(
+    ('preset', 'moves'),
+    [('panda_rigid', False), ('panda', True), ('ur5e_rigid', False)],
+)
 def test_arm_whose_states_hang_nearly_always_is_braked_again(preset, moves):
-    """Five states of 105: they threw both, and none was trusted later: 35 and 45 rad/s for ever."""
+    """Five states of 105: they threw Pandas, of which no state was trusted later, to 45 rad/s."""
     play = Play('frozen', 0.0, 0, 5, 100)
     arm, record, _ = played(preset, play, moves=moves, payload=1.0)
     assert record.speed.max() < 4.0

@@ -106,16 +106,17 @@ class RecentMotion:
     def load(self, settings: Settings, estimate: Array) -> Array | None:
         """Return the torque (n,) [N m] that the model lacks; None in the first 0.1 s.
 
-        Torques after the last new state are left out: the law has not seen what they do.
+        Torques since states repeat, although they say that the arm moves, are left out: the law
+        has not seen what they do.
         """
         if self._count < self.size:
             return None
         order = self._order
-        is_new = (np.diff(self._states[order], axis=0) != 0.0).any(axis=1)
-        seen = 1 + int(np.flatnonzero(is_new).max(initial=-1))
-        if (
-            2 * seen >= self.size
-        ):  # else the arm has hardly moved, and few would be left
+        states = self._states[order]
+        hangs = (states[1:] == states[:-1]).all(axis=1)
+        hangs &= states[1:, self._torques.shape[1] :].any(axis=1)
+        seen = 1 + int(np.flatnonzero(~hangs).max(initial=-1))
+        if seen >= self._step:
             order = order[seen % self._step : seen + 1]
         stamps = self._stamps[order[:: self._step]]
         states = self._states[order[:: self._step]]
