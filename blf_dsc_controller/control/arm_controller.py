@@ -41,7 +41,7 @@ from blf_dsc_controller.warnings.table import config_warnings, refuse
 Vector = NDArray[np.float64]
 
 
-_NEVER = 9e9  # s: whole ns have 64 bits
+_NEVER = 9e9  # s: later stamps are no ns in 64 bits
 
 
 class StateError(BlfDscError):

@@ -52,6 +52,7 @@ PATIENCE = 0.25
 _LOWEST_FREQUENCY = 8.0  # Hz
 _TIME_CONSTANT = 0.5 / (pi * _LOWEST_FREQUENCY)  # s, of the lags
 _LONGEST_HALF_WAVE = 0.5 / _LOWEST_FREQUENCY  # s, half period
+_FORGOTTEN = 1.5 * _LONGEST_HALF_WAVE  # s, with the quarter to turn back
 _FAST_FREQUENCY = 20.0  # Hz, from which a velocity may lag far behind its positions
 _MIN_AMPLITUDE = 0.05  # of the torque limit, amplitude of its torque
 # a half wave that is longer is one of the arm: standard deviations of the sensor's
@@ -117,9 +118,7 @@ def watch(
         state.span[i] += dt
         state.present.since[i] += dt
         state.calm[i] += dt
-        if (
-            state.present.since[i] > 1.5 * _LONGEST_HALF_WAVE
-        ):  # with the quarter to turn back
+        if state.present.since[i] > _FORGOTTEN:
             forget(state, i, p)
         back = half_waves.follow(state.present, i, p)
         if back == 0.0:

@@ -35,7 +35,8 @@ from blf_dsc_controller.supervision.swing import Swing
 Vector = NDArray[np.float64]
 
 FADE_TIME = 0.5
-"""Time [s] in which a load that is not sure fades while no state is trusted."""
+"""Time [s] in which a load that is not sure fades while no state is trusted, and without gravity
+what the law held the arm by, once it is deactivated."""
 
 _RESTED = 10.0 / OBSERVER[1]  # s at rest, in which the observed load settles
 _CALM_OBSERVER = 10.0, 10.0  # rad/s: slow against the oscillation of elastic joints
@@ -188,7 +189,7 @@ class Hold:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the arm is at rest, as far as its states show, and its load has had the time."""
+        """Whether the arm rests, as far as its states show, and its load has had time to settle."""
         left_for = self._elapsed - self._duration  # s, since the end of the ramp
         return (
             (self._source is not Load.UNTIL_MOVED or left_for >= _RESTED)

@@ -242,7 +242,7 @@ class InCommand:
             self.readings.follow(reading)
             self._observe_speed(gap)
         else:
-            self.readings.last.skip(T)
+            self.readings.last.skip(reading.stamp, T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
         return self.safe(gap if 0.0 < gap < T else T * max(1, round(gap / T)))
 

@@ -56,7 +56,10 @@ class LastState:
         self.age = inf
         self.gap = 0.0
         self._resumed = 0  # ns, stamp of the state after the last gap
-        self._skipped = 0.0  # s, in which states that are not trusted have come
+        # ns, stamp of the last state, trusted or not; and s, in which others have come since the
+        # last trusted one
+        self._heard = -1
+        self._skipped = 0.0
         self.stamp = -1
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
@@ -125,10 +128,12 @@ class LastState:
         """Whether states have come since the last gap for as long as `slow` takes to settle."""
         return (self.stamp - self._resumed) * 1e-9 >= FILTER
 
-    def skip(self, period: float) -> None:
+    def skip(self, stamp: int, period: float) -> None:
         """Account for a state that is not trusted: after some, the motion is unknown."""
         self.age += period
-        self._skipped += period
+        # of copies, and of a sender that is faster, less time passes
+        self._skipped += min(max(0.0, (stamp - self._heard) * 1e-9), period)
+        self._heard = stamp
         if self.age > LONG_GAP * period:
             self._forget_motion()
 
@@ -158,4 +163,4 @@ class LastState:
                 gap -= self._skipped
                 self.gap = max(self.gap, min(gap, _LONGEST_GAP))
         self._skipped = 0.0
-        self.stamp = stamp
+        self._heard = self.stamp = stamp
