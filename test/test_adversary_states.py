@@ -24,8 +24,11 @@ AFTER = 0.5  # s
 HOLD = {'reference.type': 'hold', 'safety.torque': 'hold_gravity'}
 
 
-def played(preset, play, *, moves, payload=0.0):
-    """Return the record of an arm that is spoilt for 2 s, and how much faster it got [rad/s]."""
+def played(preset, play, *, moves, payload=0.0, resets=False):
+    """Return the record of an arm that is spoilt for 2 s, and how much faster it got [rad/s].
+
+    If it `resets`, the law does so after the first 0.3 s, and the record begins there.
+    """
     arm = Scenario(preset, HOLD, plant=carrying(payload))
     arm.run(0.6)
     q = arm.plant.truth()[-2 * arm.n : -arm.n].copy()
@@ -33,9 +36,13 @@ def played(preset, play, *, moves, payload=0.0):
         arm.controller.follow([(1.0, q + 0.25), (2.0, q)])
         arm.run(0.4)
     spoil = Spoiler(play, 0)
+    if resets:
+        arm.run(0.3, spoil=spoil)
+        arm.controller.reset()
     record = arm.run(2.0, spoil=spoil)
     asked = np.maximum(record.speed[0], np.abs(record.dqr).max(axis=0))
-    judged = record.since(0, spoil.trusted + 1 + round(AFTER / arm.T))
+    last = spoil.trusted + 1 - (round(0.3 / arm.T) if resets else 0)
+    judged = record.since(0, last + round(AFTER / arm.T))
     return arm, record, float((judged.speed - asked).max())
 
 
@@ -45,6 +52,7 @@ FOUND = {
     'another pose for 30 ms: 11': ('fr3', 'swapped', 0.3, 2, 100, 30),
     'an offset in thirty samples of 35: 0.7': ('fr3', 'position', 0.5, 5, 5, 30),
     'zeros beside the arm': ('ur5e_driver', 'of another', 0.5, 0, 1, 1),
+    'another pose in four samples of six: 3': ('panda', 'swapped', -0.6, 3, 2, 4),
     'a pose beside the arm': ('panda', 'of another', -0.3, 3, 2, 4),
     'scaled positions': ('ur5e', 'scaled', 0.4, 1, 20, 4),
     'five states between gaps of thirty: 12': ('openarm', 'not finite', 0.0, 0, 5, 30),
@@ -73,6 +81,25 @@ def test_states_that_have_thrown_an_arm_do_not(case, moves):
     arm, record, faster = played(preset, Play(*play), moves=moves, payload=1.0)
     assert faster < FASTER
     assert not (np.abs(record.torque) > arm.config.torque.limit).any()
+
+
+@pytest.mark.parametrize(
+    'case',
+    [('fr3_direct', 'swapped', -0.6, 2, 2, 4), ('panda', 'swapped', -0.6, 3, 2, 4)],
+)
+def test_reset_beside_another_sender_throws_no_arm(case):
+    """The law began with a pose of the other, which its stop trusted then: 38 and 27 rad/s."""
+    preset, *play = case
+    arm, _, faster = played(preset, Play(*play), moves=False, payload=2.0, resets=True)
+    assert faster < FASTER
+    assert arm.reason == 'position jumped'
+
+
+def test_velocities_that_come_and_go_swing_no_arm_that_stops():
+    """Two observers of its load alternated with them: 4.8 rad/s."""
+    play = Play('no velocity', 0.9, 3, 5, 2)
+    *_, faster = played('openarm', play, moves=False, payload=2.0, resets=True)
+    assert faster < FASTER
 
 
 def test_same_pose_without_velocities_beside_the_arm_does_not_throw_it():

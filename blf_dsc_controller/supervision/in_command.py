@@ -176,6 +176,8 @@ class InCommand:
             return
         if is_in_doubt(reason, Doubtful.ESTIMATES):
             self.estimates.return_to_consistent()
+        if reason is Reason.JUMPED and self.readings.return_home():
+            was_running = False  # the law has not seen its arm
         self.journal.note(EventType.STOP, reason=reason, text=text)
         self.clean = self.reference.resumable = False
         self.safe_stop.begin(

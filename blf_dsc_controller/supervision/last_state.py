@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blf_dsc_controller.law.sensor import FILTER, LONG_GAP
+from blf_dsc_controller.supervision.observed_load import OBSERVER
 from blf_dsc_controller.supervision.recent_motion import is_gap
 
 Vector = NDArray[np.float64]
@@ -56,6 +57,8 @@ class LastState:
         self.age = inf
         self.gap = 0.0
         self._resumed = 0  # ns, stamp of the state after the last gap
+        # s, in which each state beside the law had its velocity
+        self._measured_for = inf
         # ns, stamp of the last state, trusted or not; and s, in which others have come since the
         # last trusted one
         self._heard = -1
@@ -107,7 +110,10 @@ class LastState:
             self.speed = np.abs(differenced) if is_new else self.speed
             differenced = np.clip(differenced, -fastest, fastest)
             self.slow += min(1.0, elapsed / FILTER) * (differenced - self.slow)
-        is_usable = is_measured and bool((np.abs(dq) <= fastest).all())
+        # one that comes and goes is none: the two observers of the load would alternate
+        is_measured &= bool((np.abs(dq) <= fastest).all())
+        self._measured_for = self._measured_for + elapsed if is_measured else 0.0
+        is_usable = self._measured_for >= FILTER
         usable = np.where(np.abs(dq) <= fastest, dq, 0.0)
         if not is_next:
             self.slow[:] = usable
@@ -157,10 +163,11 @@ class LastState:
         gap = (stamp - self.stamp) * 1e-9
         if stamp - self._resumed > _REMEMBERED_NS:
             self.gap = 0.0
-        if gap < 0.0 or gap > LONG_GAP * period:
+        silence, longest = gap - self._skipped, LONG_GAP * period
+        if self.stamp >= 0 and silence > longest:
+            self.gap = max(self.gap, min(silence, _LONGEST_GAP))
+        # a shorter one is a sample of the load's observer
+        if gap < 0.0 or silence > longest or gap > max(longest, 1.0 / OBSERVER[0]):
             self._resumed = stamp
-            if self.stamp >= 0:
-                gap -= self._skipped
-                self.gap = max(self.gap, min(gap, _LONGEST_GAP))
         self._skipped = 0.0
         self._heard = self.stamp = stamp

@@ -155,6 +155,8 @@ class Readings:
         self._arrived = self._alone_since = 0
         self._runs = False
         self._at = np.zeros(n)
+        # stamps of a start elsewhere and of the last trusted state before it, and its measurement
+        self._home: tuple[int, int, Vector] | None = None
         self._read = np.full(2 * n, nan)  # q and dq as last read
         self._new_at = -1  # ns, stamp of the first state with these
         self.set_limits(config.safety)
@@ -187,7 +189,7 @@ class Readings:
         continues = doubt is None
         if begins and not found & NOT_FINITE:
             if doubt is Doubt.OUT_OF_REACH:
-                restart(self.sensor)
+                self._leave_home(stamp)
             doubt = None
         if doubt is None:
             self._trust(stamp, counted, is_new=bool(found & NEW))
@@ -241,6 +243,37 @@ class Readings:
     def speed(self) -> float:
         """Largest speed of a joint [rad/s], as the positions show it."""
         return float(np.abs(self.velocity).max())
+
+    def return_home(self) -> bool:
+        """Trust what was trusted before the start, if states leap soon after one elsewhere.
+
+        Return whether they do: the start was no other episode of a simulation then, but met a
+        state of another sender.
+        """
+        home = self._recent_home
+        if home is None:
+            return False
+        self._home = None
+        _, stamp, measurement = home
+        q, dq, _ = measurement.reshape(3, -1)
+        self.last.take(stamp, measurement, dq)
+        self._wraps.trust(q)
+        return True
+
+    def _leave_home(self, stamp: int) -> None:
+        """Let the law begin elsewhere, by a state with a stamp [ns]."""
+        restart(self.sensor)
+        if self._recent_home is None:
+            self._home = stamp, self.last.stamp, self.last.measurement.copy()
+
+    @property
+    def _recent_home(self) -> tuple[int, int, Vector] | None:
+        """What was trusted before a start elsewhere, if that was short ago; else None."""
+        home = self._home
+        is_recent = (
+            home is not None and 0 <= (self._arrived - home[0]) * NANOSECOND < ALONE
+        )
+        return home if is_recent else None
 
     def _trust(self, stamp: int, measurement: Vector, *, is_new: bool) -> None:
         self._before, self._seen = self._seen, stamp
