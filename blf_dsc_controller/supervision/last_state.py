@@ -160,6 +160,8 @@ class LastState:
 
         `period` [s] is the usual time between two states.
         """
+        # where the clock is set back, no states are missing
+        self._resumed += min(0, stamp - self.stamp)
         gap = (stamp - self.stamp) * 1e-9
         if stamp - self._resumed > _REMEMBERED_NS:
             self.gap = 0.0
@@ -167,7 +169,7 @@ class LastState:
         if self.stamp >= 0 and silence > longest:
             self.gap = max(self.gap, min(silence, _LONGEST_GAP))
         # a shorter one is a sample of the load's observer
-        if gap < 0.0 or silence > longest or gap > max(longest, 1.0 / OBSERVER[0]):
+        if silence > longest or gap > max(longest, 1.0 / OBSERVER[0]):
             self._resumed = stamp
         self._skipped = 0.0
         self._heard = self.stamp = stamp
