@@ -352,6 +352,24 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, suffix, kind, capsys):
     assert len(PANDA) == 7
 
 
+def test_data_sets_of_hdf5_are_read_and_those_of_mat_7_3(tmp_path):
+    """As ALOHA has them, in groups; MATLAB writes the rows of a matrix as columns."""
+    h5py = pytest.importorskip('h5py', reason='needs h5py')
+    with h5py.File(tmp_path / 'a.hdf5', 'w') as file:
+        file['time'] = TIME
+        file['observations/qpos'] = Q
+        file.create_dataset('observations/effort', data=TAU, compression='gzip')
+        file['observations/images'] = np.zeros((len(TIME), 4, 4, 3), np.uint8)
+    is_read(tmp_path / 'a.hdf5')
+    with h5py.File(tmp_path / 'a.mat', 'w', userblock_size=512) as file:
+        for name, values in (('t', TIME[:, np.newaxis]), ('q', Q), ('tau', TAU)):
+            file[name] = values.T
+    head = b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM'
+    raw = (tmp_path / 'a.mat').read_bytes()
+    (tmp_path / 'a.mat').write_bytes(head + raw[len(head) :])
+    is_read(tmp_path / 'a.mat')
+
+
 def test_arrays_that_unpack_to_gigabytes_are_refused(tmp_path):
     """A third of a gigabyte of zeros, in a third of a megabyte."""
     shape = (7_000_000, 6)
@@ -371,12 +389,17 @@ def test_arrays_that_unpack_to_gigabytes_are_refused(tmp_path):
         assert 'write it as several files' in message
 
 
-@pytest.mark.parametrize('suffix', ['npz', 'mat'])
+@pytest.mark.parametrize('suffix', ['npz', 'mat', 'h5'])
 def test_damaged_arrays_are_refused_in_one_line(tmp_path, suffix):
     """Any of 60 flipped or missing bytes: they are refused, or hit what is not read."""
     path = tmp_path / f'a.{suffix}'
     if suffix == 'npz':
         np.savez_compressed(path, t=TIME, q=Q, tau=TAU)
+    elif suffix == 'h5':
+        h5py = pytest.importorskip('h5py', reason='needs h5py')
+        with h5py.File(path, 'w') as file:
+            for name, values in (('t', TIME), ('q', Q), ('tau', TAU)):
+                file.create_dataset(name, data=values, fletcher32=True)
     else:
         savemat(path, {'t': TIME, 'q': Q, 'tau': TAU}, do_compression=True)
     whole = path.read_bytes()

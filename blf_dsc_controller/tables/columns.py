@@ -24,11 +24,11 @@ _WORDS = {
     kind: frozenset(words.split())
     for kind, words in {
         'time': 't time times timestamp stamp secs seconds',
-        'q': 'q pos position positions angle angles jointposition',
+        'q': 'q qpos pos position positions angle angles jointposition',
         'tau': 'tau torque torques effort efforts force trq jointtorque current currents',
         'theta': 'theta motor motors',
         'current': 'current currents',
-        'rate': 'dot ddot vel velocity speed acc acceleration',
+        'rate': 'dot ddot vel qvel velocity speed acc acceleration',
         'unmeasured': 'd des desired target ref reference cmd command '
         'ext external error err offset',
     }.items()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of tables: names of columns, and values that are read when they are asked for.
 
-The columns of npz and mat files are their vectors, and the columns of their matrices, each
+The columns of npz, mat and HDF5 files are their vectors, and the columns of their matrices, each
 named after its matrix and its index.  Only the longest columns are kept.  Lists in the cells
 of Parquet and Feather files are rows of such matrices.
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from math import prod
 from os import SEEK_CUR
 from pathlib import Path
@@ -42,16 +43,23 @@ def open_table(path: Path) -> Table:
     Raises:
         BlfDscError: it cannot be read as such.
     """
-    suffix = path.suffix.lower()
-    try:
+    with _named_errors(path):
         _check_regular(path)
-        return _TABLES[suffix](path)
+        return _TABLES[path.suffix.lower()](path)
+
+
+@contextmanager
+def _named_errors(path: Path) -> Iterator[None]:
+    """Raise each error as a BlfDscError: libraries raise nearly anything on damaged files."""
+    try:
+        yield
     except BlfDscError:
         raise
-    except Exception as error:  # libraries raise nearly anything on damaged files
+    except Exception as error:
         text = getattr(error, 'strerror', '') or str(error)
         reason = ' '.join(text.split()) or type(error).__name__
-        raise BlfDscError(f'{path} cannot be read as {suffix[1:]}: {reason}') from error
+        kind = path.suffix.lower()[1:]
+        raise BlfDscError(f'{path} cannot be read as {kind}: {reason}') from error
 
 
 def _check_regular(path: Path) -> None:
@@ -68,9 +76,13 @@ class _Arrays:
     """
 
     def __init__(
-        self, shapes: Mapping[str, tuple[int, ...]], load: Callable[[str], Any]
+        self,
+        path: Path,
+        shapes: Mapping[str, tuple[int, ...]],
+        load: Callable[[str], Any],
     ) -> None:
         """Take the shapes of arrays by name; others than vectors and matrices are left out."""
+        self._path = path
         self._load = load
         self._columns: dict[str, tuple[str, int]] = {}
         squeezed = {
@@ -93,7 +105,8 @@ class _Arrays:
         for column in columns:
             name, k = self._columns[column]
             if name not in loaded:
-                loaded[name] = _upright(self._load(name))
+                with _named_errors(self._path):
+                    loaded[name] = _upright(self._load(name))
             found.append(loaded[name][:, k])
         return np.column_stack(found)
 
@@ -122,13 +135,10 @@ def _npz(path: Path) -> _Arrays:
 
     def load(name: str) -> Any:
         _check_size(path, _size_of(shapes[name]))
-        try:
-            with np.load(path) as archive:
-                return archive[name]
-        except Exception as error:  # as above
-            raise BlfDscError(f'{path} cannot be read as npz: {error}') from error
+        with np.load(path) as archive:
+            return archive[name]
 
-    return _Arrays(shapes, load)
+    return _Arrays(path, shapes, load)
 
 
 def _header_of_npy(stream: Any) -> tuple[tuple[int, ...], str]:
@@ -156,9 +166,7 @@ def _mat(path: Path) -> _Arrays:
 
     major, _ = matfile_version(path)
     if major == _HDF5:
-        raise BlfDscError(
-            f"{path} is HDF5: write it again by MATLAB's save('FILE', '-v7')"
-        )
+        return _hdf5(path)
     if major == _WITH_COMPRESSION:
         for size in _unpacked_sizes(path):
             _check_size(path, size)
@@ -166,7 +174,32 @@ def _mat(path: Path) -> _Arrays:
         _check_size(path, _size_of(shape))
     arrays = dict(_numbers_in(loadmat(path, simplify_cells=True)))
     shapes = {name: values.shape for name, values in arrays.items()}
-    return _Arrays(shapes, arrays.__getitem__)
+    return _Arrays(path, shapes, arrays.__getitem__)
+
+
+def _hdf5(path: Path) -> _Arrays:
+    """Return the data sets of numbers, in groups or not; none that are in other files."""
+    h5py = import_extra('h5py', 'hdf5', f'reading {path.name}')
+    places: dict[str, str] = {}
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def note(place: str, item: Any) -> None:
+        is_here = isinstance(item, h5py.Dataset) and not (
+            item.external or item.is_virtual
+        )
+        if is_here and item.dtype.kind in 'fiu' and len(shapes) < _MOST_ARRAYS:
+            name = place.replace('/', '_')
+            places[name], shapes[name] = place, item.shape
+
+    with h5py.File(path) as file:
+        file.visititems(note)
+
+    def load(name: str) -> Any:
+        _check_size(path, _size_of(shapes[name]))
+        with h5py.File(path) as file:
+            return file[places[name]][()]
+
+    return _Arrays(path, shapes, load)
 
 
 def _size_of(shape: tuple[int, ...]) -> int:
@@ -227,7 +260,7 @@ def _arrow(path: Path) -> _Arrays:
         if number != field.type:
             first = table.head(1, columns=[field.name]).column(0)
             shapes[field.name] = rows, len(first[0])
-    return _Arrays(shapes, load)
+    return _Arrays(path, shapes, load)
 
 
 _TABLES: dict[str, Callable[[Path], Table]] = {
@@ -236,6 +269,8 @@ _TABLES: dict[str, Callable[[Path], Table]] = {
     '.txt': text_table,
     '.npz': _npz,
     '.mat': _mat,
+    '.h5': _hdf5,
+    '.hdf5': _hdf5,
     '.parquet': _arrow,
     '.feather': _arrow,
 }
