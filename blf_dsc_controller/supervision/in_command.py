@@ -27,7 +27,7 @@ from blf_dsc_controller.supervision.held_torque import HeldTorque
 from blf_dsc_controller.supervision.hold import FADE_TIME, Hold
 from blf_dsc_controller.supervision.kept_estimates import KeptEstimates
 from blf_dsc_controller.supervision.oscillation_check import OscillationCheck
-from blf_dsc_controller.supervision.reading import Reading, Readings
+from blf_dsc_controller.supervision.reading import Doubt, Reading, Readings
 from blf_dsc_controller.supervision.running_reference import RunningReference
 from blf_dsc_controller.supervision.safe_stop import SafeStop
 from blf_dsc_controller.supervision.sample_check import SampleCheck
@@ -43,6 +43,8 @@ from blf_dsc_controller.supervision.supervisor import (
 
 Vector = NDArray[np.float64]
 _MANY = 0.5  # states missed for each that came
+# stops of a law that may have begun with a state of another sender
+_NOT_ITS_ARM = (Reason.JUMPED, Reason.START_REJECTED)
 
 
 class InCommand:
@@ -176,8 +178,8 @@ class InCommand:
             return
         if is_in_doubt(reason, Doubtful.ESTIMATES):
             self.estimates.return_to_consistent()
-        if reason is Reason.JUMPED and self.readings.return_home():
-            was_running = False  # the law has not seen its arm
+        if reason in _NOT_ITS_ARM and self.readings.return_home():
+            was_running = False
         self.journal.note(EventType.STOP, reason=reason, text=text)
         self.clean = self.reference.resumable = False
         self.safe_stop.begin(
@@ -244,6 +246,8 @@ class InCommand:
             self.readings.follow(reading)
             self._observe_speed(gap)
         else:
+            if reading.doubt is Doubt.OUT_OF_REACH:
+                self.readings.return_home()
             self.readings.last.skip(reading.stamp, T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
         return self.safe(gap if 0.0 < gap < T else T * max(1, round(gap / T)))

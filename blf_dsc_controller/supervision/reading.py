@@ -245,10 +245,10 @@ class Readings:
         return float(np.abs(self.velocity).max())
 
     def return_home(self) -> bool:
-        """Trust what was trusted before the start, if states leap soon after one elsewhere.
+        """Trust what was trusted before a start elsewhere, if that was short ago.
 
-        Return whether they do: the start was no other episode of a simulation then, but met a
-        state of another sender.
+        It was no other episode of a simulation then, but met a state of another sender: call it
+        if states leap, or the law cannot start there.  Return whether it was short ago.
         """
         home = self._recent_home
         if home is None:
