@@ -10,7 +10,11 @@ from blf_dsc_controller import ControllerConfig, change, load_loop
 from blf_dsc_controller.arms.model import inertia_matrices
 from blf_dsc_controller.factory.settings import settings_of_config
 from blf_dsc_controller.law import columns
-from blf_dsc_controller.supervision.braking import braking_matrix, within_gap
+from blf_dsc_controller.supervision.braking import (
+    braking_matrix,
+    known_inertia,
+    within_gap,
+)
 from blf_dsc_controller.supervision.model_torque import friction_torque
 
 PANDA = load_loop('panda_rigid').controller
@@ -35,21 +39,21 @@ def test_damping_that_is_held_for_a_gap_reverses_no_motion_of_the_model(
     q = draw.uniform(-1.5, 1.5, settings.n)
     M = inertia(settings, q)
     damping = draw.uniform(5.0, 40.0, settings.n) * np.diagonal(M)
-    coupled = braking_matrix(settings, damping, q, gap)
-    alone = np.diag(within_gap(settings, damping, q, gap))
+    coupled = braking_matrix(M, damping, gap)
+    alone = np.diag(within_gap(M, damping, gap))
     for D in (coupled, alone):
         kept = np.linalg.eigvals(np.eye(settings.n) - gap * np.linalg.solve(M, D))
         assert kept.real.min() > -1e-9
         assert kept.real.max() <= 1.0
     borne = np.minimum(damping, np.diagonal(M) / 0.03)
-    np.testing.assert_allclose(within_gap(settings, damping, q, 0.0), borne)
+    np.testing.assert_allclose(within_gap(M, damping, 0.0), borne)
 
 
 def test_without_an_estimate_each_joint_brakes_alone():
     unknown = settings_of_config(
         change(ControllerConfig(), {'two_link.initial_estimate': [0.0, 0.0, 0.0]})
     )
-    D = braking_matrix(unknown, np.array([2.0, 1.0]), np.zeros(2))
+    D = braking_matrix(known_inertia(unknown, np.zeros(2)), np.array([2.0, 1.0]))
     np.testing.assert_array_equal(D, [[2.0, 0.0], [0.0, 1.0]])
 
 

@@ -13,10 +13,8 @@ from blf_dsc_controller.law.state import Settings
 Array = NDArray[np.float64]
 
 
-def braking_matrix(
-    settings: Settings, damping: Array, q: Array, gap: float = 0.0
-) -> Array:
-    """Return D(q) (n, n) [N m s/rad] with the `damping` (n,) of each joint on its diagonal.
+def braking_matrix(M: Array | None, damping: Array, gap: float = 0.0) -> Array:
+    """Return D (n, n) [N m s/rad] with the `damping` (n,) of each joint on its diagonal.
 
     Joints that brake by themselves drag those behind them along: a wrist of a Panda gets
     three times as fast as it was.  With the rate r_i = damping_i / M0_ii of each joint,
@@ -27,17 +25,16 @@ def braking_matrix(
     itself.  Else a joint in front acts on a faster one behind it as it does in M0, and the
     other way round with less.  D is the product, entry by entry, of two matrices that are
     symmetric and positive semidefinite, and so it is one, too (Schur's product theorem): it
-    takes energy out of any motion, that of elastic joints included.  M0 is of the initial
-    estimate; without one, D is diagonal.  `gap` [s] bounds it as `within_gap` does.
+    takes energy out of any motion, that of elastic joints included.  M0 is `known_inertia`;
+    without one, D is diagonal.  `gap` [s] bounds it as `within_gap` does.
     """
-    M = known_inertia(settings, q)
     if M is None:
         return np.diag(damping)
     rate = _limited_rate(damping / np.diagonal(M), gap)
     return _without_reversal(np.minimum.outer(rate, rate) * M, M, gap)
 
 
-def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Array:
+def within_gap(M: Array | None, damping: Array, gap: float) -> Array:
     """Return the `damping` (n,) [N m s/rad] of joints that low pass and gap allow them.
 
     Behind the low pass of v no rate D/M0 is above 1/tau (`Swing`).  A torque -D v that is held
@@ -46,7 +43,6 @@ def within_gap(settings: Settings, damping: Array, q: Array, gap: float) -> Arra
     above 1/h, and what the coupling of the joints adds to that divides D.  Without a gap, `gap`
     is 0.
     """
-    M = known_inertia(settings, q)
     if M is None:
         return damping
     inertia = np.diagonal(M)

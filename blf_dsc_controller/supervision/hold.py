@@ -213,16 +213,18 @@ class Hold:
         if last.age == inf:
             return None
         self.missed_change = None
+        M = known_inertia(self._settings, last.q)
         kind = 'hold_gravity' if self._source is Load.YIELDS else safety.torque
         self._keep_load_once_moved(dt)
         if kind == 'hold_gravity':
-            self._observe_if_answered(dt)
+            self._observe_if_answered(dt, M)
         if last.age > 0.0:
             self._swing.forget()
         elif dt > 0.0:
             noise = self._sensor.noise[: self.load.size]
             self._swing.observe(last.slow, noise, self._sensor.resolution, dt)
-        goal = limited(self._goal(kind, np.array(safety.damping)), None, limit, limit)
+        goal = self._goal(kind, np.array(safety.damping), M)
+        goal = limited(goal, None, limit, limit)
         self._elapsed += dt
         if self._elapsed < self._duration:
             goal = self._start + self._elapsed / self._duration * (goal - self._start)
@@ -237,9 +239,10 @@ class Hold:
         self._swing.begin()
         needed = self._needed()
         if needed is not None:
-            self._update_load(needed, dt)
+            M = known_inertia(self._settings, self._last.q)
+            self._update_load(needed, dt, M)
 
-    def _goal(self, kind: str, damping: Vector) -> Vector:
+    def _goal(self, kind: str, damping: Vector, M: Vector | None) -> Vector:
         """Return the torque (n,) [N m] of a `kind` that the ramp leads to.
 
         The `damping` (n,) [N m s/rad] is that of the configuration; with gravity held D is that
@@ -251,10 +254,10 @@ class Hold:
         torque = np.zeros(settings.n)
         with np.errstate(over='ignore', invalid='ignore'):  # the caller limits it
             if kind == 'damping':
-                borne = within_gap(settings, damping, last.q, last.gap)
+                borne = within_gap(M, damping, last.gap)
                 torque -= borne * last.slow
             if kind == 'hold_gravity':
-                D = braking_matrix(settings, damping, last.q, last.gap)
+                D = braking_matrix(M, damping, last.gap)
                 torque -= D @ last.slow
                 torque += self.gravity(self._estimate) + kept * self.load
                 torque -= added_torque(settings.torque, last.q)
@@ -280,7 +283,7 @@ class Hold:
             self.load[:] = self._known_load
             self._source = Load.KEPT
 
-    def _observe_if_answered(self, dt: float) -> None:
+    def _observe_if_answered(self, dt: float, M: Vector | None) -> None:
         """Observe the load as far as the arm answers to commands, or find that it does not."""
         needed = self._needed() if self._source in _ANSWERING else None
         if needed is None:
@@ -296,7 +299,7 @@ class Hold:
             elif self._effect.await_effect(change, limit, dt):
                 self.missed_change = change
         if self._source in _OBSERVED:
-            self._update_load(needed, dt)
+            self._update_load(needed, dt, M)
 
     def _needed(self) -> Vector | None:
         """Return the command (n,) [N m] behind the last motion; None if unknown."""
@@ -308,26 +311,25 @@ class Hold:
         )
         return needed if np.isfinite(needed).all() else None
 
-    def _update_load(self, needed: Vector, dt: float) -> None:
+    def _update_load(self, needed: Vector, dt: float, M: Vector | None) -> None:
         """Update the load, once the arm answers to the damping that a gap had switched off."""
         if not self._last.has_settled:
             return
         limit = self._settings.torque.limit
         lacking = self.commanded - needed
-        noise = self._noise_of_steps()
+        noise = self._noise_of_steps(M)
         for each in (self._usual, self._calm):
             each.update(lacking, limit, dt, noise)
         is_calm = self._oscillates | self._swing.has_swung | (self._rested > _RESTED)
         is_calm |= not self._last.is_measured
         self.load[:] = np.where(is_calm, self._calm.load, self._usual.load)
 
-    def _noise_of_steps(self) -> Vector | float:
+    def _noise_of_steps(self, M: Vector | None) -> Vector | float:
         """Return the torque (n,) [N m] of the accelerations that the steps of encoders show.
 
         They are of differences of velocities, and these of positions; 0 without a model.
         """
         last = self._last
-        M = known_inertia(self._settings, last.q)
         if M is None:
             return 0.0
         averaged = last.interval if last.is_measured else FILTER
