@@ -27,10 +27,18 @@ _HERE = Path(__file__).parent
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
+    parser.add_argument(
+        'groups', nargs='*', type=_group, metavar='GROUP', help=', '.join(_GROUPS)
+    )
     parser.add_argument(
         '--out', type=Path, default=_HERE, help='folder for the results'
     )
+
+
+def _group(name: str) -> str:
+    if name not in _GROUPS:
+        raise argparse.ArgumentTypeError(f'got {name}: give of {", ".join(_GROUPS)}')
+    return name
 
 
 def main(options: argparse.Namespace) -> None:
