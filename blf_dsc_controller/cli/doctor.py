@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc doctor`: what is installed, what this computer is like, and what to mend."""
+"""`blf_dsc doctor`: what is installed, what this computer is like, and what to correct."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class ArmController:
     state that fails to arrive is noticed with the next one.  A recorded bag is that of
     a run over ROS: `blf_dsc` reports, plots, replays and identifies from it.  If it
     cannot be written any further, as on a full disk, the loop goes on without it:
-    `output_problem`.  Whether somebody has measured that the arm bears its gains is
+    `output_problem`.  Whether the arm was measured to be stable with its gains is
     logged at level INFO, since the arm may be simulated.
 
     Attributes:
@@ -115,7 +115,7 @@ class ArmController:
         Raises:
             ArgumentTypeError: `config`, `record` or `stamps` is none of these.
             ConfigurationError: with all problems of the file.
-            StartError: no arm bears the gains.
+            StartError: no arm is stable with the gains.
             BagError: there is such a folder.
             OSError: the folder cannot be made.
         """
