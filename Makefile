@@ -92,7 +92,7 @@ test-nightly: ## Run all tests, those left out by make test as well, at length a
 changes: $(READY)-monte-carlo ## Simulate 14,000 randomly changing arms, each with and without learning, into out/changes
 	@$(RUN) -m benchmark changes --out out/changes
 
-bench: $(READY)-bench ## Run the benchmarks (GROUPS=offline for one group), into benchmark/RESULTS.md
+bench: $(READY)-bench ## Run the benchmarks into benchmark/RESULTS.md (GROUPS=offline: only print one group)
 	@$(RUN) -m benchmark bench $(GROUPS)
 
 soak: $(READY)-test ## Run half an hour of plant time (MINUTES) with a fault every few seconds

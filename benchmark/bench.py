@@ -27,15 +27,25 @@ _HERE = Path(__file__).parent
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument('groups', nargs='*', metavar='GROUP', help=', '.join(_GROUPS))
     parser.add_argument(
-        '--out', type=Path, default=_HERE, help='folder for the results'
+        'groups', nargs='*', type=_group, metavar='GROUP', help=', '.join(_GROUPS)
     )
+    parser.add_argument(
+        '--out',
+        type=Path,
+        help='folder for RESULTS.md (benchmark, if all are measured)',
+    )
+
+
+def _group(name: str) -> str:
+    if name not in _GROUPS:
+        raise argparse.ArgumentTypeError(f'got {name}: give of {", ".join(_GROUPS)}')
+    return name
 
 
 def main(options: argparse.Namespace) -> None:
     """Run the groups and write RESULTS.md."""
-    options.out.mkdir(parents=True, exist_ok=True)
+    out = options.out or (None if options.groups else _HERE)
     rows: list[Ratio] = []
     for name in options.groups or _GROUPS:
         print(f'measuring: {name}', flush=True)
@@ -46,8 +56,15 @@ def main(options: argparse.Namespace) -> None:
                 flush=True,
             )
             rows.append(row)
+    if out is not None:
+        _write(rows, out)
+
+
+def _write(rows: list[Ratio], out: Path) -> None:
+    """Write RESULTS.md into a folder, which loses what it had."""
+    out.mkdir(parents=True, exist_ok=True)
     today = dt.datetime.now(dt.timezone.utc).date()
-    with (options.out / 'RESULTS.md').open('w', encoding='utf-8') as file:
+    with (out / 'RESULTS.md').open('w', encoding='utf-8') as file:
         file.write(
             '# Results of the benchmarks\n\n'
             f'Written by `make bench` on {today}. Every figure is a ratio of two things measured '

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the presets err by with learning, and without it but with all else equal.
+"""Errors of the presets with and without learning, all else equal.
 
     python -m benchmark presets [PRESET ...]
     python -m benchmark presets fr3_direct panda ur5e --arms 10
+    python -m benchmark presets fr3_direct panda ur5e --picture doc/pick_up.png
 
 Each runs for 60 s; by default those with elastic gears, which pick up 2 kg at 20 s, in full motion,
 and put them down at 45 s.  A cell has the largest error of any joint [mrad], with learning /
@@ -13,6 +14,8 @@ pick-up.
 
 With `--arms` that many arms of each preset, which differ in masses, centres and noise, run until
 the load is put down: a cell has the median of the errors and, in brackets, that of the worst arm.
+
+With `--picture` nothing is printed, but the errors around the pick-up are drawn.
 """
 
 from __future__ import annotations
@@ -20,10 +23,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import numpy as np
 
 from benchmark.harness import print_table
+from blf_dsc_controller.analysis.figures import Picture, head
+from blf_dsc_controller.analysis.panels import BLUE, INK, ORANGE
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.nodes import PLANT, load_loop
 from blf_dsc_controller.configuration.plant import PlantConfig
@@ -48,6 +54,7 @@ LOAD = 2.0  # kg
 AFTER = 4000  # samples, in which the errors of a change show
 SECONDS = 60.0
 WEIGHED = 25.0  # s
+DRAWN = (15.0, 30.0)  # s
 
 
 def without_learning(controller: ControllerConfig) -> ControllerConfig:
@@ -154,15 +161,42 @@ def rows(presets: list[str]) -> Iterator[list[str]]:
         yield [name, *cells]
 
 
+def draw(presets: list[str], path: Path) -> None:
+    """Draw the largest error of any joint around the pick-up, with and without learning."""
+    title = 'Largest tracking error of any joint, with and without learning'
+    picture = Picture(len(presets), 1, title, (9.5, 2.0))
+    for axes, preset in zip(picture.axes[:, 0], presets, strict=True):
+        loop = load_loop(preset, {PLANT: {'duration': DRAWN[1]}})
+        for label, colour, controller in (
+            ('without learning', ORANGE, without_learning(loop.controller)),
+            ('with learning', BLUE, loop.controller),
+        ):
+            run = simulate(controller, loop.plant).run()
+            shown = run.time >= DRAWN[0]
+            error = 1e3 * np.abs(np.asarray(run.error)[shown]).max(axis=1)
+            axes.plot(run.time[shown], error, color=colour, lw=0.9, label=label)
+        at = SPANS['at the pick-up'][0]
+        axes.axvline(at, color=INK, ls=':', lw=1.3, label=f'{LOAD:g} kg are picked up')
+        axes.set_ylim(bottom=0.0)
+        axes.set_ylabel('[mrad]')
+        head(axes, f'{preset}, bound {1e3 * min(loop.controller.barrier.bound):g} mrad')
+    picture.save(path)
+
+
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument('presets', nargs='*', metavar='PRESET', default=list(PRESETS))
     about = 'medians of this many arms of each preset'
     parser.add_argument('--arms', type=int, default=0, help=about)
+    about = 'only draw the errors around the pick-up into this PNG'
+    parser.add_argument('--picture', type=Path, help=about)
 
 
 def main(options: argparse.Namespace) -> None:
-    """Print the table."""
+    """Print the table, or draw its errors."""
+    if options.picture:
+        draw(options.presets, options.picture)
+        return
     found = (
         rows_of_arms(options.presets, options.arms)
         if options.arms

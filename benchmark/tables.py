@@ -21,7 +21,7 @@ GROUPS = {
         'many-arms': 'a thousand of them with this law: what is rare',
     },
     'gains': {
-        'presets': 'what the presets err by, with and without learning',
+        'presets': 'errors of the presets, with and without learning',
         'pick-and-place': 'what the same box costs that comes again, announced or not',
         'commissioning': 'random arms, commissioned and put to work',
     },

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The site of the documentation: `make docs`, plain `sphinx-build doc out/docs`, or rosdoc2."""
 
+import os
 import re
 import sys
 import xml.etree.ElementTree as ET
@@ -52,6 +53,9 @@ nitpicky = True
 nitpick_ignore_regex = [('py:.*', '.*')]
 
 html_theme = 'furo'
+if shown := os.environ.get('SITE_VERSION'):  # in a folder beside those of others
+    others = '<a href="../index.html">Other versions</a>'
+    html_theme_options = {'announcement': f'Version {shown}. {others}'}
 html_title = f'BLF-DSC {release}'
 html_show_copyright = False
 # Drawn when the site is made: no script, no font, no request, in any browser.

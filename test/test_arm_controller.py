@@ -289,3 +289,15 @@ def test_recording_of_a_loop_that_was_killed_is_not_said_to_be_whole(tmp_path, c
     recover(tmp_path / 'bag', tmp_path / 'saved')
     assert main(['replay', str(tmp_path / 'saved')]) == 4  # partial
     assert 'MISSING in the bag: the end of the run' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('q', 'says'), [([math.nan] * 2, 'positions'), ([126.0, 92.0], 'reference')]
+)
+def test_why_it_commands_nothing_is_logged_once(caplog, q, says):
+    """As for angles in degrees: a loop that only looks at torques would not show it."""
+    with blf.ArmController(LOOP.controller) as controller:
+        for step in range(5):
+            controller.update(1.0 + step * LOOP.plant.sample_time, q, (0.0, 0.0))
+    (text,) = (each.message for each in caplog.records if each.levelname == 'WARNING')
+    assert says in text

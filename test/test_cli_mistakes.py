@@ -14,6 +14,7 @@ import recorded_run
 from command import finished
 from recorded_run import Synthetic, limited_files
 
+from blf_dsc_controller.cli import main as cli_main
 from blf_dsc_controller.cli.main import main
 from blf_dsc_controller.compiled.announcement import COMPILING
 
@@ -44,6 +45,13 @@ def bag(tmp_path_factory):
     return recorded_run.write_made(path, Synthetic(100).messages())
 
 
+NODES = [
+    'sim_plant',
+    'blf_dsc_controller',
+    'bag_recorder',
+    'torque_watchdog',
+    'arm_view',
+]
 COMMANDS = 'run --offline, report, recover, export, excite, arms, monte-carlo'
 
 
@@ -170,6 +178,23 @@ def test_offline_run_needs_no_ros(tmp_path):
     assert run.returncode == 0, run.stderr
     assert 'wrote       closed_loop:' in run.stdout
     assert (tmp_path / 'closed_loop/bag/metadata.yaml').is_file()
+
+
+def test_home_is_found_behind_an_equals_sign_too(tmp_path, monkeypatch):
+    """Shells leave the ~ of --out=~/run as it is."""
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'my.yaml').write_text('/**: {ros__parameters: {sample_time: 0.002}}\n')
+    words = ['--offline', '--duration=0.1', '--config=~/my.yaml', '--out=~/run']
+    assert main(['run', *words]) == 0
+    assert {each.name for each in tmp_path.iterdir()} == {'my.yaml', 'run'}
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_node_tells_how_it_is_started(name, monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', [f'/opt/{name}', '--help'])
+    assert getattr(cli_main, name)() == 0
+    assert f'ros2 run blf_dsc_controller {name} --ros-args' in capsys.readouterr().out
 
 
 def test_exit_code_shows_that_the_controller_stopped(tmp_path, capsys):

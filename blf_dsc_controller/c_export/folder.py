@@ -53,7 +53,7 @@ def export(config: ControllerConfig, folder: Path) -> None:
     """Write the law of a configuration into an existing folder.
 
     Raises:
-        StartError: no arm bears the gains.
+        StartError: no arm is stable with the gains.
         BlfDscError: it cannot be exported.
         OSError: a file cannot be written.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,10 +62,18 @@ _finite = _number(math.isfinite, 'a number')
 _share = _number(lambda x: 0.0 < x < 1.0, 'a number above 0 and below 1')
 _magnitude = _number(lambda x: 0.0 <= x < math.inf, 'a number of at least 0')
 _size = _number(lambda x: 0.0 < x < math.inf, 'a number above 0')
+_travel = _number(
+    lambda x: 0.0 < x <= 0.5, 'm above 0, and 0.5 at most: 10 mm are 0.01'
+)
+
+
+def _path(text: str) -> Path:
+    """Return a path; shells leave the ~ of --out=~/run and of quoted words."""
+    return Path(os.path.expanduser(text))  # noqa: PTH111 - Path's fails without a home
 
 
 def _parameter_file(text: str) -> Path:
-    path = Path(text)
+    path = _path(text)
     if path.suffix not in ('.yaml', '.yml'):
         raise argparse.ArgumentTypeError(
             f'got {text}, but it will be a parameter file: give a name in .yaml'
@@ -119,7 +128,7 @@ _RUN = Command(
             action='store_true',
         ),
         option(
-            '--out', 'new folder (closed_loop)', type=Path, default=Path('closed_loop')
+            '--out', 'new folder (closed_loop)', type=_path, default=Path('closed_loop')
         ),
         option('--view', 'show the run on a page in the browser', action='store_true'),
     ),
@@ -145,7 +154,7 @@ _DRIVE = Command(
         ),
         option('--duration', 'time [s]; 0: until Ctrl-C (0)', type=float, default=0.0),
         option(
-            '--out', 'new folder for a bag (without it nothing is recorded)', type=Path
+            '--out', 'new folder for a bag (without it nothing is recorded)', type=_path
         ),
         option(
             '--ros',
@@ -165,7 +174,7 @@ _REPLAY = Command(
     example='run1/bag',
     options=(
         *_NAMES,
-        option('bag', _BAG, type=Path),
+        option('bag', _BAG, type=_path),
         option(
             '--law',
             'law to run if the recorded one is a Python file, which no bag can choose: its path, '
@@ -185,13 +194,13 @@ _REPORT = Command(
     options=(
         *_NAMES,
         _FORCE,
-        option('bags', _BAG, type=Path, nargs='+', metavar='BAG'),
-        option('--out', 'file (report.html)', type=Path, default=Path('report.html')),
+        option('bags', _BAG, type=_path, nargs='+', metavar='BAG'),
+        option('--out', 'file (report.html)', type=_path, default=Path('report.html')),
         option(
             '--png',
             'write no page, but the pictures (tracking.png, ...) and summary.json of a bag into '
             'this folder, and print the summary',
-            type=Path,
+            type=_path,
             metavar='FOLDER',
         ),
     ),
@@ -203,8 +212,8 @@ _RECOVER = Command(
     'damaged bag is not changed. Exit code: 1 if nothing could be recovered.',
     example='run1/bag --out rescued',
     options=(
-        option('bag', 'folder of the bag, or its .mcap file', type=Path),
-        option('--out', 'new folder (BAG_recovered)', type=Path),
+        option('bag', 'folder of the bag, or its .mcap file', type=_path),
+        option('--out', 'new folder (BAG_recovered)', type=_path),
     ),
 )
 _EXPORT = Command(
@@ -215,8 +224,8 @@ _EXPORT = Command(
     options=(
         *_NAMES,
         _FORCE,
-        option('bag', _BAG, type=Path),
-        option('--out', 'FILE.csv or FILE.parquet', type=Path, required=True),
+        option('bag', _BAG, type=_path),
+        option('--out', 'FILE.csv or FILE.parquet', type=_path, required=True),
     ),
 )
 _EXPORT_C = Command(
@@ -228,7 +237,7 @@ _EXPORT_C = Command(
     example='--config my.yaml --out law',
     options=(
         option('--config', _CONFIG, default='recommended'),
-        option('--out', 'new folder', type=Path, required=True),
+        option('--out', 'new folder', type=_path, required=True),
     ),
 )
 _COMMISSION = Command(
@@ -248,7 +257,7 @@ _COMMISSION = Command(
     '  blf_dsc commission run1/bag run2/bag run3/bag --config my.yaml --out commissioned.yaml',
     options=(
         _FORCE,
-        option('bags', 'runs of the motions', type=Path, nargs='*', metavar='BAG'),
+        option('bags', 'runs of the motions', type=_path, nargs='*', metavar='BAG'),
         option('--config', _OF_URDF, required=True),
         option(
             '--out',
@@ -285,7 +294,7 @@ _COMMISSION = Command(
         option(
             '--record',
             'new folder for the bags of the robot (commissioned_bags)',
-            type=Path,
+            type=_path,
             metavar='FOLDER',
         ),
         option(
@@ -311,7 +320,7 @@ _COMMISSION = Command(
         option(
             '--travel',
             'farthest that the tool travels from its middle [m] (0.01)',
-            type=_size,
+            type=_travel,
             default=0.01,
         ),
         option(
@@ -374,7 +383,7 @@ _IDENTIFY = Command(
         option(
             'bags',
             f'{_BAG}, or a table (.csv, .txt, .npz, .mat, .parquet)',
-            type=Path,
+            type=_path,
             nargs='+',
             metavar='RECORDING',
         ),
@@ -386,7 +395,7 @@ _IDENTIFY = Command(
         option(
             '--out',
             'file to write: .urdf, .yaml (our parameters); can be repeated',
-            type=Path,
+            type=_path,
             action='append',
             default=[],
             metavar='FILE',
@@ -394,13 +403,13 @@ _IDENTIFY = Command(
         option(
             '--report',
             'page with measured and predicted torques and the tables',
-            type=Path,
+            type=_path,
         ),
         option(
             '--payload',
             'weigh the load that the arm carries in this bag and not in the first; without BAG, '
             'the load that it picks up in the first',
-            type=Path,
+            type=_path,
             nargs='?',
             const=True,
             metavar='BAG',
@@ -458,7 +467,7 @@ _ARMS = Command(
             default=[],
             metavar='LAW',
         ),
-        option('--out', 'new folder for the figures', type=Path, default=Path('arms')),
+        option('--out', 'new folder for the figures', type=_path, default=Path('arms')),
     ),
 )
 _MONTE_CARLO = Command(
@@ -487,7 +496,7 @@ _MONTE_CARLO = Command(
         option(
             '--report',
             'compare the studies of pairs in these folders, into --out (changes)',
-            type=Path,
+            type=_path,
             nargs='+',
             metavar='DIR',
         ),
@@ -497,7 +506,7 @@ _MONTE_CARLO = Command(
             nargs=2,
             metavar=('DIR', 'RUN'),
         ),
-        option('--out', 'folder of the study (monte_carlo)', type=Path),
+        option('--out', 'folder of the study (monte_carlo)', type=_path),
     ),
 )
 _DOCTOR = Command(

@@ -175,7 +175,7 @@ def _check(options: Namespace) -> None:
 def _prove_on_robot(
     options: Namespace, path: Path, commissioning: Commissioning
 ) -> int:
-    """Raise the gains of a file step by step on a robot, and say how far it errs."""
+    """Raise the gains of a file step by step on a robot, and print its errors."""
     config = commissioning.config
     planned = proof.steps(config)
     with robot(options, path, commissioning) as arm:
@@ -207,7 +207,7 @@ def _write_motions(
 
 
 def _simulated(path: Path, commissioning: Commissioning) -> tuple[Runs, list[str]]:
-    """Return the runs of the motions on the simulated arm, and what it did not bear."""
+    """Return the runs of the motions on the simulated arm, and with what it was unstable."""
     loop = load_loop(path)
     planned = commissioning.motions_from(loop.plant.initial.position)
     for k, each in enumerate(planned, 1):

@@ -229,8 +229,8 @@ def _of_repeats(
     if commissioning.anew_left:
         yield (
             'of this arm only the URDF is known: where friction hides an inertia, posture 1 is '
-            f'measured anew, up to {commissioning.anew_left} times, with half of the gains that it '
-            'bears by then and the friction that it showed'
+            f'measured anew, up to {commissioning.anew_left} times, with half of the gains that '
+            'are stable by then and the friction that it showed'
         )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`blf_dsc doctor`: what is installed, what this computer is like, and what to mend."""
+"""`blf_dsc doctor`: what is installed, what this computer is like, and what to correct."""
 
 from __future__ import annotations
 
@@ -138,7 +138,10 @@ def _ros() -> Iterator[Finding]:
     yield from _domain()
     if importlib.util.find_spec('control_msgs') is None:
         text = 'control_msgs is not installed: no action for MoveIt'
-        yield note('ROS 2', text, 'sudo apt install ros-jazzy-control-msgs')
+        remedy = 'send trajectories to ~/joint_trajectory; wheels have no control_msgs'
+        if distribution:
+            remedy = 'sudo apt install ros-jazzy-control-msgs'
+        yield note('ROS 2', text, remedy)
 
 
 def _domain() -> Iterator[Finding]:

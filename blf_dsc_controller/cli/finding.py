@@ -37,5 +37,5 @@ def note(subject: str, text: str, remedy: str) -> Finding:
 
 
 def problem(subject: str, text: str, remedy: str = '') -> Finding:
-    """Return a finding that must be mended first."""
+    """Return a finding that must be corrected first."""
     return Finding(Level.PROBLEM, subject, text, remedy)

@@ -29,6 +29,10 @@ from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.nodes.ros_check import require_ros
 
+_USAGE = """\
+usage: ros2 run blf_dsc_controller {} --ros-args [--params-file FILE.yaml] [-p NAME:=VALUE]
+`ros2 param describe` and doc/parameters.md tell its parameters, doc/topics.md its topics."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a sub-command and return its exit code.
@@ -172,6 +176,9 @@ def make_room(*paths: Path, force: bool, try_out: bool = True) -> None:
 
 
 def _node(module: str) -> int:
+    if {'-h', '--help'} & {*sys.argv[1:]}:
+        print(_USAGE.format(Path(sys.argv[0]).name))
+        return 0
     keep_to_one_thread()
     # until the node installs its own handlers
     for number in (signal.SIGINT, signal.SIGTERM):

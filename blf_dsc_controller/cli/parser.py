@@ -15,7 +15,10 @@ from blf_dsc_controller import __version__
 from blf_dsc_controller.cli.commands import COMMANDS, Command
 
 _WIDTH = 88
-_OTHERS = {'view': 'blf_dsc run --view shows a run, arm_view a running loop'}
+_OTHERS = {
+    'view': 'blf_dsc run --view shows a run, arm_view a running loop',
+    'presets': 'blf_dsc run --config list lists them',
+}
 """What is meant by words that are no command."""
 
 

@@ -186,7 +186,7 @@ def _turned_reference(config: LoopConfig) -> str:
 
 
 def notes_on_ideal_arm(config: LoopConfig) -> Iterator[str]:
-    """Yield why a simulated arm of a URDF errs less than a real one."""
+    """Yield why a simulated arm of a URDF has smaller errors than a real one."""
     plant = config.plant
     if plant.truth == Truth() and not any(plant.joint.stiffness):
         yield (

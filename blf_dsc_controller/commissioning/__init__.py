@@ -2,11 +2,11 @@
 """Measure an arm before it is controlled, and choose its gains by what was measured.
 
 The stiffness of gears, the inertia of motors and the lags of drives are rarely specified,
-and all gains depend on them.  Here the arm is held with soft gains and shaken a little by
+and all gains depend on them.  Here the arm is held with soft gains and excited a little by
 its reference.  The torques sent and the positions measured give the responses of its
 joints, and these the stiffest gains with a margin.
 
-    motion          the reference that shakes all joints at once
+    motion          the reference that excites all joints at once
     planned         the motions in some postures, and the gains of the arm meanwhile
     run_parameters  what else such runs have in common, and those of moves and proofs
     measurement     a run of it, with the configuration that it had

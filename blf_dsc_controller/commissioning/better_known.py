@@ -3,8 +3,8 @@
 
 If only the URDF is known, motors are guessed, friction is unknown, and the gains are soft enough
 for any arm.  Joints then stick, and show neither their inertia nor how late torques are; gains for
-the guessed inertia may be a tenth of what the arm bears.  So the first posture is measured again:
-with half of the gains that the arm bears by the first run, and with the friction of that run
+the guessed inertia may be a tenth of what is stable.  So the first posture is measured again:
+with half of the gains that are stable by the first run, and with the friction of that run
 compensated.  The joints slide, and show more.
 
 Gains that a configuration gives, or that follow from the stiffness of its gears, stay.
@@ -33,7 +33,7 @@ FAR_ABOVE = 5.0
 ABOVE_IF_HIDDEN = 2.5
 """The same, where friction hides an inertia: half of such gains may show it."""
 
-_SHARE = 0.5  # of the gains that an arm bears, to measure it with
+_SHARE = 0.5  # of the gains with which an arm is stable, to measure it with
 _OF_STUCK = 2.0  # times those of the measurement: friction damps what is measured
 _NAMES = (
     'robot.coulomb',

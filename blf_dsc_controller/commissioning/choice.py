@@ -13,7 +13,7 @@ lag stay, since lighter joints may be limited by what is faster than the motion 
 that gives next to nothing is none.
 
 A rigid joint of the measured inertia and lags must have the margin, too (`RigidArm`).  What is
-measured bears more only where friction damps it, or where it is not seen.
+measured is stable with more only where friction damps it, or where it is not seen.
 """
 
 from __future__ import annotations

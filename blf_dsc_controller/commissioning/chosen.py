@@ -176,10 +176,10 @@ def _check_bound(config: ControllerConfig, least: Floats) -> None:
         config.joints, config.units, least, np.maximum(given, [*widest]), strict=True
     ):
         if needed > most:
-            far = f'by up to {needed / _EXCESS:.2g} {unit}'
+            error = f'up to {needed / _EXCESS:.2g} {unit}'
             if np.isinf(needed):
-                far = 'without end'
+                error = 'unlimited'
             raise BlfDscError(
-                f'the gains that have the margin are too soft for any bound: {joint} would be off '
-                f'{far}. {_SOFT[0].upper()}{_SOFT[1:]}'
+                f'the gains that have the margin are too soft for any bound: the error of {joint} '
+                f'would be {error}. {_SOFT[0].upper()}{_SOFT[1:]}'
             )

@@ -101,7 +101,7 @@ class Commissioning:
         Raises:
             BlfDscError: torque or travel is not above 0.
             ConfigurationError: with all problems of the file.
-            StartError: no arm bears its gains.
+            StartError: no arm is stable with its gains.
         """
         for name, given in (('torque', torque), ('travel', travel)):
             if not 0.0 < given < inf:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion that shakes an arm: a sum of many tones, of which each belongs to one joint.
+"""The motion that excites an arm: a sum of many tones, of which each belongs to one joint.
 
 All joints move at once.  The period holds whole waves of every tone, so the spectrum of a
 period has one line for each.  Lines of the joints alternate,

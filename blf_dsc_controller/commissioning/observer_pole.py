@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pole of the load observer: the fastest one that the measured arm bears, in every posture.
+"""The pole of the load observer: the fastest stable one of the measured arm, in every posture.
 
 An arm with joint torque sensors has a second loop, r (`law.load_observer`).  At the torques of
 all joints, with the measured response G_e of the efforts and the inertia M_l of the model's links,
@@ -8,7 +8,7 @@ all joints, with the measured response G_e of the efforts and the inertia M_l of
 
 F_L is the pole, F_s the lag of velocities, which efforts wait for, and D the difference quotient
 of a sample.  As r is faster, I + L comes nearer to being singular where gears resonate: an arm
-whose r shakes has next to no modulus margin there.  So poles are tried from slow to fast as long as
+whose r oscillates has hardly a modulus margin there.  So poles are tried from slow to fast while
 `ENOUGH` is left, and `BARELY` with noise counted against it.  That is less than the gains alone
 must have, since r that oscillates all the same is left out, and a slow r costs accuracy.
 

@@ -288,14 +288,14 @@ def _of_bound(found: Commissioned) -> Iterator[str]:
     for name, wider in _wider(found).items():
         if wider:
             yield (
-                f'{name} is widened for these errors: {"; ".join(wider)}. With less '
-                'robot.payload less will do'
+                f'{name} is widened for these errors: {"; ".join(wider)}; a smaller '
+                'robot.payload needs less'
             )
     share = found.choice.gains.stiffness / found.start.stiffness
     if share.min() < _SOFTER:
         yield (
             f'the gains are down to {share.min():.2g} of the stiffness that it was measured with '
-            f'({found.joints[int(share.argmin())]}): errors that nobody expects, such as by more '
+            f'({found.joints[int(share.argmin())]}): unexpected errors, such as by more '
             'friction, grow by as much; a bound that was given for the stiffer gains may be too '
             'narrow'
         )

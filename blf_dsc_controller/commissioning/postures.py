@@ -281,7 +281,7 @@ class PostureByPosture:
         return planned, bag
 
     def _run_motion(self, name: str) -> tuple[Planned, Path]:
-        """Shake the arm where it rests, softer if it oscillates; return the motion and its bag."""
+        """Excite the arm where it rests, softer if it oscillates; return the motion and its bag."""
         while True:
             with named(name):
                 planned = self.aside(self._commissioning.motion, self.position())

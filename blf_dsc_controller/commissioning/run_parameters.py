@@ -20,7 +20,7 @@ _WIDE_BOUND = 0.1  # rad, bound of the errors
 def shaking_parameters(
     config: ControllerConfig, excitation: Excitation, posture: Floats
 ) -> dict[str, object]:
-    """Return the parameters that hold an arm by its own gains and shake it.
+    """Return the parameters that hold an arm by its own gains and excite it.
 
     The law learns nothing, so that it is the same at the end as at the beginning.  Torques limit
     the motion, not accelerations: those of fast tones are high, but hardly move a light wrist.

@@ -35,7 +35,7 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 _TRUE = ('Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON')
 _FALSE = ('N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF')
 _INTEGER = re.compile(
-    r'[+-]?(?:0[xX](?P<hex>[0-9a-fA-F]+)|(?P<octal>0[0-7]*)|[1-9][0-9]*)'
+    r'[+-]?(?:0[xX](?P<hex>[0-9a-fA-F]+)|(?P<octal>0[0-7]*)|[1-9][0-9]{0,18})'
 )
 _DECIMAL = re.compile(r'[+-]?(?P<digits>[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _SPECIAL = re.compile(
@@ -52,6 +52,22 @@ _ABOVE = Path(__file__).resolve().parents[2:]  # the source tree, or below the p
 _LARGEST = 1 << 24  # bytes of a parameter file, a URDF or a metadata.yaml
 _MOST_NODES = 50_000
 _DEEPEST = 50
+_REMEDIES = (  # of problems of YAML that contain these words
+    ('another document', 'leave out the line ---'),
+    (
+        "found '<block mapping start>'",
+        'begin this line in the column of the other lines of its group',
+    ),
+    (
+        'mapping values',
+        'the line before lacks its colon, or this one is indented too far or has two',
+    ),
+    ("expected ':'", 'the line before has to be NAME: VALUE, with a colon and a space'),
+    ("expected ',' or", 'a bracket before is not closed'),
+    ('unexpected end of stream', 'a quote before is not closed'),
+    ('that cannot start any token', 'write the text in quotes'),
+    ('escape', "write the text in single quotes, as in 'C:\\arm.urdf'"),
+)
 
 
 class Entry(NamedTuple):
@@ -109,7 +125,7 @@ def parse(text: str) -> tuple[Section, ...]:
         pattern = f'/{"/".join(names[:at]).removeprefix("/")}'
         name = '.'.join(names[at + 1 :])
         if not all(_PART.fullmatch(part) for part in pattern.split('/')[1:]):
-            raise _error(node, f'{pattern} is not a valid node name')
+            raise _error(node if at else root, _misnamed(pattern))
         entries = sections.setdefault(
             names[:at], Section(pattern, _line(node), {})
         ).entries
@@ -118,7 +134,9 @@ def parse(text: str) -> tuple[Section, ...]:
         if name:
             entries[name] = Entry(_value(node, name), _line(node))
         elif not isinstance(node, yaml.MappingNode):
-            raise _error(node, f'{_MARK} of {pattern} has no parameters')
+            raise _error(
+                node, f'{_MARK} of {pattern} has no parameters: {_no_names(node)}'
+            )
     return tuple(sections.values())
 
 
@@ -136,11 +154,24 @@ def _remedy(text: str, error: yaml.MarkedYAMLError) -> str:
     mark = error.problem_mark
     if mark is not None and mark.buffer and mark.buffer[mark.pointer :][:1] == '\t':
         return ': indent with spaces, not with tabs'
-    if error.problem and 'another document' in error.problem:
-        return ': leave out the line ---'
-    if error.problem and error.problem.endswith("found '<block mapping start>'"):
-        return ': begin this line in the column of the other lines of its group'
-    return ''
+    return next(
+        (f': {what}' for of, what in _REMEDIES if of in (error.problem or '')), ''
+    )
+
+
+def _misnamed(pattern: str) -> str:
+    if pattern == '/':
+        return f'write /**: above {_MARK}, and indent all below it'
+    return f'{pattern} is not a valid node name: write one like /**/{_PACKAGE}'
+
+
+def _no_names(node: yaml.Node) -> str:
+    """Return how to write what stands in the place of parameters by name."""
+    if not isinstance(node, yaml.ScalarNode):
+        return 'write NAME: VALUE, without dashes or brackets'
+    if not node.value:
+        return 'indent them below it, with spaces'
+    return f'write NAME: VALUE, with a space behind the colon, not {node.value!a}'
 
 
 def _outside(names: tuple[str, ...]) -> str:
@@ -234,6 +265,8 @@ def _scalar(node: yaml.Node, name: str) -> object:
         return node.value
     if not node.value:
         hint = f': {DECIMAL_POINT}' if name.rpartition('.')[2].isdigit() else ''
+        if ':' in name:
+            hint = ': write a space behind the colon'
         raise _error(node, f'{name} has no value{hint}')
     return parse_scalar(node.value)
 

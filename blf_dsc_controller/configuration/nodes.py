@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -130,7 +131,7 @@ def locate(given: str | Path) -> Path:
     presets = {
         path.stem: path for path in sorted((share_folder() / 'config').glob('*.yaml'))
     }
-    name, path = str(given), Path(given)
+    name, path = str(given), Path(os.path.expanduser(given))  # noqa: PTH111
     if path.is_file() and name not in presets:
         return path
     stem = name.removesuffix('.yaml')

@@ -131,9 +131,11 @@ class Parameter:
 
     def _as_list(self, given: Any) -> str:
         """Return the remedy for a single value in the place of a list."""
-        example = self.default or ((given,) if isinstance(given, self.type) else ())
-        each = '' if self.default else ', an entry for each'
-        return f': write a list, like {format_value(example)}{each}'
+        default = self.default if isinstance(self.default, tuple) else ()
+        example = (given,) if isinstance(given, self.type) else default[:1]
+        unit = f' in {self.unit}' if self.unit and isinstance(given, str) else ''
+        each = ', an entry for each' if self.length or not self.default else ''
+        return f': write a list{unit}, like {format_value(example)}{each}'
 
     def _of_type(self, entries: Sequence[Any]) -> str:
         """Return the remedy for entries of another type, or nothing."""

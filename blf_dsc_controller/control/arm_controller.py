@@ -91,7 +91,7 @@ class ArmController:
     state that fails to arrive is noticed with the next one.  A recorded bag is that of
     a run over ROS: `blf_dsc` reports, plots, replays and identifies from it.  If it
     cannot be written any further, as on a full disk, the loop goes on without it:
-    `output_problem`.  Whether somebody has measured that the arm bears its gains is
+    `output_problem`.  Whether the arm was measured to be stable with its gains is
     logged at level INFO, since the arm may be simulated.
 
     Attributes:
@@ -115,7 +115,7 @@ class ArmController:
         Raises:
             ArgumentTypeError: `config`, `record` or `stamps` is none of these.
             ConfigurationError: with all problems of the file.
-            StartError: no arm bears the gains.
+            StartError: no arm is stable with the gains.
             BagError: there is such a folder.
             OSError: the folder cannot be made.
         """
@@ -143,6 +143,7 @@ class ArmController:
         self._is_on_wall = stamps == 'wall'
         self._shift: int | None = None  # ns, of the stamps
         self._logged_turns: set[str] = set()
+        self._logged = (Phase.STARTING, False)  # phase, and whether for a reason
         self._is_closed = False
         self._loop.guard.starting.activate()
         for text in config_warnings(config, When.ROBOT):
@@ -209,6 +210,7 @@ class ArmController:
             self._loop.guard.perceive()
             self._loop.write_state(nanoseconds, values, of_motors, torque)
             self._log_turns('the reference', self._loop.guard.reference.turned)
+            self._log_reason()
         return answer
 
     def prepare(self, q: ArrayLike) -> None:
@@ -256,7 +258,7 @@ class ArmController:
         try:
             array = np.asarray(values, dtype=np.float64)
             got = f'an array of shape {array.shape}'
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             array, got = np.empty(0), 'what is no array of numbers'
         if array.shape != needed:
             raise StateError(
@@ -306,6 +308,15 @@ class ArmController:
         if turned and what not in self._logged_turns:
             self._logged_turns.add(what)
             logging.getLogger(__name__).warning('%s %s', what, turned)
+
+    def _log_reason(self) -> None:
+        """Log why it stops or does not start, once: numbers in it may change at each state."""
+        reason = self.reason
+        now = self.phase, bool(reason)
+        if now != self._logged:
+            self._logged = now
+            if reason:
+                logging.getLogger(__name__).warning('%s: %s', self.phase, reason)
 
     def load_to_tell(self) -> TipLoad | None:
         """Return the load to declare to the drives next, a step at a time.

@@ -48,7 +48,7 @@ class DamiaoDriver(Driver):
 
     @classmethod
     def facts_for(cls, controller: ControllerConfig) -> Facts:
-        """Return the facts; what the motors bear is known once they have answered."""
+        """Return the facts; the limits of the motors are known once they have answered."""
         n = len(controller.joints)
         return Facts(
             joints=n,

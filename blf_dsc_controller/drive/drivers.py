@@ -91,6 +91,9 @@ def _ros() -> type[RosDriver]:
 
 def _check_kind(address: str, path: Path, settings: DriveConfig) -> None:
     """Raise BlfDscError if a CAN bus is given to the driver of a Franka, or no bus to motors'."""
+    if '://' in address:
+        alone = address.split('/')[2]
+        raise BlfDscError(f'{address} is a web page: give the address alone, {alone}')
     is_bus = _BUS.match(address) is not None
     if is_bus and settings.driver == FRANKA:
         raise BlfDscError(

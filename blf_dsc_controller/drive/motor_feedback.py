@@ -48,7 +48,7 @@ def robot_warnings(config: ControllerConfig, *, in_motors: bool) -> list[str]:
 def closed_in_motors(config: ControllerConfig) -> ControllerConfig:
     """Return a configuration whose gains are not those of a loop over the bus.
 
-    They are as high as the motors bear.
+    They are as high as is stable in the motors.
     """
     return change(config, {'insist': (*config.insist, STIFFNESS)})
 

@@ -62,7 +62,7 @@ class Ripples(NamedTuple):
     seen: tuple[float, float]
     least: float  # amplitude that would have been found for most N, N m or N
     torque: float  # rms of what model and friction leave, N m or N
-    # whether the motion repeats: then whatever errs alike each time looks like a ripple
+    # whether the motion repeats: then any error that repeats looks like a ripple
     repeats: bool = False
 
     @property

@@ -41,7 +41,7 @@ _ALL_WRONG = 1.0  # of the torque, error of a joint that the model does not expl
 _NOTHING = 1e-3  # of half of its interval, value that is printed as 0 ...
 _ROUNDING = 1e-9  # ... and value of a URDF
 _OF_REPEATED = (
-    'the motion repeats, and with it whatever model and friction err by, which may look like a '
+    'the motion repeats, and with it the error of model and friction, which may look like a '
     'ripple: use only what a minute of motion that does not repeat shows, too'
 )
 _FELT = 0.005  # of the torque, and of the largest: what the model leaves out is told
@@ -354,7 +354,7 @@ def _stiffness_notes(found: Identified) -> Iterator[str]:
         i = int(np.argmax(compliance.largest))
         yield (
             f'the position of the motor of {names[i]} differs by up to {compliance.largest[i]:.2g} '
-            f"from its link's, more than the {LARGEST_TWIST:g} by which gears give way: are "
+            f"from its link's, more than the {LARGEST_TWIST:g} by which elastic gears twist: are "
             'positions of motors divided by the ratios of their gears? The stiffness of joints '
             'was not computed'
         )

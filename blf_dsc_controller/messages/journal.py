@@ -52,7 +52,7 @@ class EventType(str, Enum):
     CONTACT = 'contact'  # something touches the arm
     OSCILLATION = 'oscillation'  # the arm oscillates
     TORQUE_SENSORS = (
-        'torque sensors'  # efforts are not those of sensors, or shake the arm
+        'torque sensors'  # efforts are not those of sensors, or make the arm oscillate
     )
     STOP = 'stop'
     SILENCE = 'silence'  # of the joint states, in which the watchdog commanded

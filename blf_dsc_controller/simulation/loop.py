@@ -78,9 +78,9 @@ def simulate(
     The plant's duration must not be 0.  If not `supervised`, the law runs alone, past
     its limits too.  A run whose law has been stopped for `after_stop` [s] may end early.
 
-    Raises StartError if no arm bears the gains, or if the law cannot take over or stops before its
-    first torque, MotionError if there is no approach within the limits, ArgumentTypeError if
-    the configurations are others, and BlfDscError if they are of other joints.
+    Raises StartError if no arm is stable with the gains, or if the law cannot take over or stops
+    before its first torque, MotionError if there is no approach within the limits,
+    ArgumentTypeError if the configurations are others, and BlfDscError if they are of other joints.
     """
     remedy = 'simulate(loop.controller, loop.plant) runs what load_loop returns'
     check_type('controller_config', controller_config, ControllerConfig, remedy)

@@ -5,7 +5,7 @@ The loop of an arm from a URDF, in a few postures, without and with its payload,
 `arms.linear_loop`.  Gears are rigid where `robot.joint_stiffness` is not given.  Drives whose
 inertia is a guess may be some times as heavy, which makes the loop of the same gains slower.
 Gains that make errors grow with every one of these drives or gears are refused: nothing holds the
-arm but its friction.  Gains that do with some of them are warned of.  What the arm bears instead
+arm but its friction.  Gains that do with some of them are warned of.  What is stable instead
 are the gains that would follow if its gears were known (`arms.known_gears`).
 """
 
@@ -53,7 +53,7 @@ def _oscillation(loop: Loop) -> _Oscillation:
 
 
 def _all_grow(case: Case) -> Iterator[Excess]:
-    """Refuse gains that no arm bears."""
+    """Refuse gains with which no arm is stable."""
     found = [_oscillation(loop) for loop in case.loops]
     least = min(each.growth for each in found)
     if least > 1.0:
@@ -66,7 +66,7 @@ def _all_grow(case: Case) -> Iterator[Excess]:
 
 
 def _some_grow(case: Case) -> Iterator[Excess]:
-    """Warn of gains that some of the arms that are possible do not bear."""
+    """Warn of gains with which some of the possible arms are unstable."""
     robot = case.config.robot
     found = next(
         (each for each in map(_oscillation, case.loops) if each.growth > 1.0), None

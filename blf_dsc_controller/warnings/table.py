@@ -257,7 +257,7 @@ RULES = (
 
 
 def refuse(config: ControllerConfig) -> None:
-    """Raise StartError if no arm bears the gains, unless they are insisted on."""
+    """Raise StartError if no arm is stable with the gains, unless they are insisted on."""
     refused = findings(
         RULES, case_of(config), When.START, Severity.REFUSE, config.insist
     )
@@ -273,7 +273,7 @@ def config_warnings(
 ) -> list[str]:
     """Return the warnings, each beginning with the parameter to change first.
 
-    Raises StartError if no arm bears the gains.
+    Raises StartError if no arm is stable with the gains.
     """
     if When.START in when:
         refuse(config)
