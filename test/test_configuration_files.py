@@ -341,3 +341,22 @@ def test_arm_may_be_named_by_the_url_of_a_file(file, tmp_path):
     )
     arm = f'robot: {{urdf: "file://{tmp_path}/mine.urdf", tip: tool0}}'
     assert len(load_plant(file(section('sim_plant', arm))).joints) == 6
+
+
+def test_file_may_be_based_on_a_preset(tmp_path):
+    """Its values take precedence, those of the base are found in its file."""
+    path = tmp_path / 'mine.yaml'
+    head = '/**:\n  ros__parameters:\n    base: panda\n'
+    bound = [0.03] * 7
+    path.write_text(
+        f'{head}/**/blf_dsc_controller:\n  ros__parameters:\n    barrier.bound: {bound}\n'
+    )
+    preset, mine = load_loop('panda'), load_loop(path)
+    assert mine.controller == change(preset.controller, {'barrier.bound': bound})
+    assert mine.plant == preset.plant
+    path.write_text(f'{head}    robot.tip: panda_link4\n')
+    with pytest.raises(
+        ConfigurationError,
+        match=r'line \d+ of panda.yaml: robot.coulomb: got 7, but 4 entries are needed',
+    ):
+        load_loop(path)

@@ -56,6 +56,13 @@ def test_parameters_have_descriptors(node):
     )
 
 
+def test_node_may_be_based_on_a_preset(ros):
+    node = ros.add(ControllerNode, autostart=False, base='ur5e', robot__payload=1.0)
+    given = {'robot.payload': 1.0, 'autostart': False}
+    wanted = blf.load_loop('ur5e', {'blf_dsc_controller': given}).controller
+    assert node.config == wanted
+
+
 def test_empty_list_keeps_its_type_and_description(ros, tmp_path):
     recorder = ros.add(BagRecorderNode, output=str(tmp_path / 'bag'))
     assert recorder.get_parameter('topics').value == []

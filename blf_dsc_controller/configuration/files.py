@@ -71,10 +71,16 @@ _REMEDIES = (  # of problems of YAML that contain these words
 
 
 class Entry(NamedTuple):
-    """A value with its line number."""
+    """A value with its line, and the file of that if it is not the one that is read."""
 
     value: object
     line: int
+    file: str = ''
+
+    @property
+    def place(self) -> str:
+        """Where the value was written, for messages."""
+        return f'line {self.line} of {self.file}' if self.file else f'line {self.line}'
 
 
 class Section(NamedTuple):

@@ -48,6 +48,7 @@ STUDY = 'monte_carlo'
 
 _SWITCHES_OF_ROS = ('use_sim_time', 'start_type_description_service')
 _QOS = 'qos_overrides.'
+_BASE = 'base'  # in a file: a preset or file that it changes
 _ARM = 'robot.urdf'  # a file, which may be beside the one that names it
 _PATH = 4096  # characters; longer ones are texts
 Config = TypeVar('Config')
@@ -152,30 +153,62 @@ def read(path: str | Path, based: tuple[Path, ...] = ()) -> Sequence[Section]:
 
     ConfigurationError names the file and the line.
 
-    Those of the preset or file that it names as `base` under `monte_carlo`, if any,
-    come first; `based` are the files that are based on it.
+    Those of the preset or file that it names as `base`, under `/**` or `monte_carlo`, come
+    first; `based` are the files that are based on it.
     """
     try:
         sections = _beside(parse(read_text(Path(path))), Path(path).parent)
-        named = (each for each in sections if each.pattern.endswith(f'/{STUDY}'))
-        base = next(
-            (each.entries['base'].value for each in named if 'base' in each.entries),
-            None,
-        )
-        if base is None:
+        bases = [
+            section.entries[_BASE].value for section in sections if _is_based(section)
+        ]
+        if not bases:
             return sections
-        below = _based_on(str(base), Path(path).parent)
+        below = _based_on(str(bases[0]), Path(path).parent)
         above = (*based, Path(path).resolve())
     except OSError as error:
         raise ConfigurationError([str(error)], str(path)) from error
     except ConfigurationError as error:
         raise ConfigurationError(error.problems, str(path)) from error
     if below.resolve() in above:
-        problem = (
-            f'monte_carlo: base: {base!r} leads back to a file that is based on it'
-        )
+        problem = f'base: {bases[0]!r} leads back to a file that is based on it'
         raise ConfigurationError([problem], str(path))
-    return [*read(below, above), *sections]
+    below_it = (_of(below.name, each) for each in read(below, above))
+    return [*below_it, *map(_without_base, sections)]
+
+
+def _is_based(section: Section) -> bool:
+    """Whether a section names what its file is based on."""
+    may = section.is_wildcard or section.pattern.endswith(f'/{STUDY}')
+    return may and _BASE in section.entries
+
+
+def _without_base(section: Section) -> Section:
+    if not _is_based(section):
+        return section
+    entries = {name: e for name, e in section.entries.items() if name != _BASE}
+    return section._replace(entries=entries)
+
+
+def _of(file: str, section: Section) -> Section:
+    """Return a section whose entries know their file."""
+    entries = {
+        name: entry._replace(file=entry.file or file)
+        for name, entry in section.entries.items()
+    }
+    return section._replace(entries=entries)
+
+
+def with_base(given: Mapping[str, Any], node: str, cls: type) -> dict[str, Any]:
+    """Return the values that a node is given, with those of the `base` among them below.
+
+    `node` is its full name.
+    """
+    values = dict(given)
+    base = values.pop(_BASE, None)
+    if base is None:
+        return values
+    entries = _entries_of(read(_based_on(str(base), Path())), node, cls)
+    return {name: entry.value for name, entry in entries.items()} | values
 
 
 def _based_on(name: str, folder: Path) -> Path:
@@ -336,7 +369,7 @@ def _wrong_for_ros(sections: Iterable[Section], nodes: Iterable[str]) -> Iterato
             entry = section.entries.get(name)
             if entry is not None and not isinstance(entry.value, bool):
                 yield (
-                    f'line {entry.line}: {name}: got {format_value(entry.value)}, but a bool is '
+                    f'{entry.place}: {name}: got {format_value(entry.value)}, but a bool is '
                     f'expected: write true or false, without quotes'
                 )
 
@@ -361,7 +394,7 @@ def _located(
     if name in chosen:
         return f'{problem} (given as an override)'
     if name in entries:
-        return f'line {entries[name].line}: {problem}'
+        return f'{entries[name].place}: {problem}'
     return problem
 
 

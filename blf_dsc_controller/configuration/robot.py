@@ -37,8 +37,10 @@ from blf_dsc_controller.configuration.schema import (
     PerJoint,
     Vector,
     format_value,
+    length_problems,
     non_negative,
     parameter,
+    parameters,
     suggestion,
 )
 from blf_dsc_controller.errors import BlfDscError, ConfigurationError
@@ -426,6 +428,15 @@ def given_robot(given: Mapping[str, Any]) -> tuple[Robot, Chain]:
     except BlfDscError as error:
         name = 'joints' if _has_chain(robot) else 'robot.urdf'
         raise ConfigurationError([f'{name}: {error}']) from error
+    counted = {**values, 'joints': chain.joints}
+    problems = [
+        f'robot.{problem}'
+        for param in parameters(Robot)
+        if param.name in values and param.length == ('joints',)
+        for problem in length_problems(param, counted)
+    ]
+    if problems:
+        raise ConfigurationError(problems)
     if 'robot.gravity' not in given:
         gravity = gravity_of(robot.text, chain, robot.gravity)
         robot = replace(robot, gravity=gravity)

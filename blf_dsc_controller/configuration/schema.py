@@ -285,7 +285,7 @@ def build(cls: type[Config], given: Mapping[str, Any], source: str = '') -> Conf
     lengths = [
         problem
         for param in known.values()
-        for problem in _length_problems(param, values)
+        for problem in length_problems(param, values)
     ]
     problems += lengths
     if not lengths:
@@ -440,10 +440,11 @@ def _assemble(cls: Any, values: Mapping[str, Value], prefix: str = '') -> Any:
 def _fits(param: Parameter, value: Any) -> bool:
     """Whether a value has its length, where that depends on no other parameter."""
     is_fixed = all(each.isdigit() for each in param.length)
-    return not (is_fixed and any(_length_problems(param, {param.name: value})))
+    return not (is_fixed and any(length_problems(param, {param.name: value})))
 
 
-def _length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
+def length_problems(param: Parameter, values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield why a list has another length than `values` by name ask for."""
     if not param.length:
         return
     counts = [

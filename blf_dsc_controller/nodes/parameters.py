@@ -22,6 +22,7 @@ from blf_dsc_controller.configuration.nodes import (
     is_gain_of_law,
     is_of_node,
     known_names,
+    with_base,
 )
 from blf_dsc_controller.configuration.received import check_arm
 from blf_dsc_controller.configuration.robot import TOPIC
@@ -244,6 +245,7 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     overrides = node._parameter_overrides  # noqa: SLF001 - those in start files and arguments
     given = {name: parameter.value for name, parameter in overrides.items()}
     given |= assigned(sys.argv)
+    given = with_base(given, node.get_fully_qualified_name(), cls)
     lists = _lists(cls, given)
     return {
         name: [] if value is None and name in lists else value

@@ -223,7 +223,7 @@ def _problems_of_duration(duration: float, settled_after: float) -> Iterator[str
 def _located(problem: str, entries: Mapping[str, Entry]) -> str:
     """Return a problem of the section with the line of its parameter, if it has one."""
     name = problem.split(':', 1)[0]
-    where = f'line {entries[name].line}: ' if name in entries else ''
+    where = f'{entries[name].place}: ' if name in entries else ''
     return f'{_NODE}: {where}{problem}'
 
 
@@ -234,7 +234,6 @@ def _section(path: str | Path) -> dict[str, Entry]:
         for section in read(path)
         if section.matches(f'/{_NODE}') and not section.is_wildcard
         for name, entry in section.entries.items()
-        if name != 'base'  # which `read` has followed
     }
     if not entries:
         problem = (
