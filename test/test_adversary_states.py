@@ -108,6 +108,13 @@ def test_velocities_that_come_and_go_swing_no_arm_that_stops():
     assert faster < FASTER
 
 
+def test_load_between_states_of_another_is_that_of_all_torques_sent_meanwhile():
+    """By the last of them alone, an OpenArm was sped up to 2 rad/s."""
+    play = Play('scaled', -0.45, 2, 5, 4)
+    *_, faster = played('openarm', play, moves=True, payload=1.0)
+    assert faster < FASTER
+
+
 def test_same_pose_without_velocities_beside_the_arm_does_not_throw_it():
     """0.1 ms later, to 11 rad/s; the law itself uses these velocities until it oscillates."""
     play = Play('of another', 0.0, 1, 1, 1)

@@ -109,6 +109,9 @@ class Hold:
         self._calm = ObservedLoad(n, _CALM_OBSERVER)
         self._oscillates = False
         self._known_load = np.zeros(n)
+        # N m, mean of the torques since the last trusted state, and s, for which they were sent
+        self._sent = np.zeros(n)
+        self._sent_for = 0.0
         self._effect = CommandEffect(n)
         self._swing = Swing(n)
         self._source = Load.OBSERVED
@@ -156,7 +159,7 @@ class Hold:
         self._oscillates = oscillates
         self._swing.begin()
         self._source = source
-        self._rested = self._moved = 0.0
+        self._rested = self._moved = self._sent_for = 0.0
         self._start[:] = self.commanded
         self._duration = ramp
         self._elapsed = 0.0
@@ -213,14 +216,16 @@ class Hold:
         if last.age == inf:
             return None
         self.missed_change = None
+        self._count_torque(dt)
         M = known_inertia(self._settings, last.q)
         kind = 'hold_gravity' if self._source is Load.YIELDS else safety.torque
         self._keep_load_once_moved(dt)
-        if kind == 'hold_gravity':
-            self._observe_if_answered(dt, M)
+        if kind == 'hold_gravity' and last.age == 0.0:
+            self._observe_if_answered(M)
         if last.age > 0.0:
             self._swing.forget()
         elif dt > 0.0:
+            self._sent_for = 0.0
             noise = self._sensor.noise[: self.load.size]
             self._swing.observe(last.slow, noise, self._sensor.resolution, dt)
         goal = self._goal(kind, np.array(safety.damping), M)
@@ -240,7 +245,16 @@ class Hold:
         needed = self._needed()
         if needed is not None:
             M = known_inertia(self._settings, self._last.q)
+            self._sent[:] = self.commanded
             self._update_load(needed, dt, M)
+
+    def _count_torque(self, dt: float) -> None:
+        """Average the torques since the last trusted state: the last was sent `dt` [s] ago."""
+        self._sent_for += dt
+        if self._sent_for == dt:
+            self._sent[:] = self.commanded
+        else:
+            self._sent += dt / self._sent_for * (self.commanded - self._sent)
 
     def _goal(self, kind: str, damping: Vector, M: Vector | None) -> Vector:
         """Return the torque (n,) [N m] of a `kind` that the ramp leads to.
@@ -283,11 +297,12 @@ class Hold:
             self.load[:] = self._known_load
             self._source = Load.KEPT
 
-    def _observe_if_answered(self, dt: float, M: Vector | None) -> None:
+    def _observe_if_answered(self, M: Vector | None) -> None:
         """Observe the load as far as the arm answers to commands, or find that it does not."""
         needed = self._needed() if self._source in _ANSWERING else None
         if needed is None:
             return
+        dt = self._last.interval
         if self._source is Load.AWAITED:
             limit = self._settings.torque.limit
             still = self.gravity(self._estimate)
@@ -316,7 +331,7 @@ class Hold:
         if not self._last.has_settled:
             return
         limit = self._settings.torque.limit
-        lacking = self.commanded - needed
+        lacking = self._sent - needed
         noise = self._noise_of_steps(M)
         for each in (self._usual, self._calm):
             each.update(lacking, limit, dt, noise)

@@ -241,16 +241,17 @@ class InCommand:
 
         A state in doubt is used for no motion, and a copy or two of the last one change nothing.
         """
-        T, gap = self.config.sample_time, reading.gap
-        if reading.doubt is None:
-            self.readings.follow(reading)
-            self._observe_speed(gap)
-        else:
+        T, last = self.config.sample_time, self.readings.last
+        if reading.doubt is not None:
             if reading.doubt is Doubt.OUT_OF_REACH:
                 self.readings.return_home()
-            self.readings.last.skip(reading.stamp, T)
+            last.skip(reading.stamp, T)
+            return self.safe(T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
-        return self.safe(gap if 0.0 < gap < T else T * max(1, round(gap / T)))
+        passed = reading.gap - min(last.age, reading.gap)  # without torques sent since
+        self.readings.follow(reading)
+        self._observe_speed(reading.gap)
+        return self.safe(passed if 0.0 < passed < T else T * max(1, round(passed / T)))
 
     def safe_without_state(self, dt: float) -> Vector | None:
         """Return the safe torque, `dt` [s] later, by the last state."""

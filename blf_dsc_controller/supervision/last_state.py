@@ -56,7 +56,8 @@ class LastState:
         self.interval = inf
         self.age = inf
         self.gap = 0.0
-        self._resumed = 0  # ns, stamp of the state after the last gap
+        # ns, stamps of the states after the last gap, and the last one in which states were missing
+        self._resumed = self._missed = 0
         # s, in which each state beside the law had its velocity
         self._measured_for = inf
         # ns, stamp of the last state, trusted or not; and s, in which others have come since the
@@ -161,15 +162,18 @@ class LastState:
         `period` [s] is the usual time between two states.
         """
         # where the clock is set back, no states are missing
-        self._resumed += min(0, stamp - self.stamp)
+        back = min(0, stamp - self.stamp)
+        self._resumed += back
+        self._missed += back
         gap = (stamp - self.stamp) * 1e-9
-        if stamp - self._resumed > _REMEMBERED_NS:
+        if stamp - self._missed > _REMEMBERED_NS:
             self.gap = 0.0
         silence, longest = gap - self._skipped, LONG_GAP * period
         if self.stamp >= 0 and silence > longest:
+            self._missed = stamp
             self.gap = max(self.gap, min(silence, _LONGEST_GAP))
         # a shorter one is a sample of the load's observer
-        if silence > longest or gap > max(longest, 1.0 / OBSERVER[0]):
+        if gap > max(longest, 1.0 / OBSERVER[0]):
             self._resumed = stamp
         self._skipped = 0.0
         self._heard = self.stamp = stamp
