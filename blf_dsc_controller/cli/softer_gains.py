@@ -59,7 +59,7 @@ def print_softer_gains(text: str, config: ControllerConfig) -> None:
     section = {'/**/blf_dsc_controller': {'ros__parameters': listed}}
     print(
         'put these parameters in the place of those in the file, whose others stay: gains with a '
-        'margin of 0.5 at the frequency of the oscillation, by how fast it grew, and the bounds '
+        'margin of about 0.5 at the frequency of the oscillation, by how fast it grew, and bounds '
         'that they keep. Halve the gains if the arm stops again, or commission it. Errors to '
         f'expect: {expectation(change(softer, values))}\n'
         f'{yaml.safe_dump(section, default_flow_style=None, sort_keys=False, width=1000)}',
