@@ -35,6 +35,9 @@ Complex = NDArray[np.complex128]
 SLOWEST = 5.0
 """Frequency [Hz] from which on margins count: below, the damping ratio is the better measure."""
 
+DAMPING_RATIO = 0.03
+"""Damping ratio of motor and link on the spring between them, both free."""
+
 _SHORTEST = 1e-5  # s, of a lag that is not left out
 _FREQUENCIES = 120
 _FASTEST = 0.48  # of the sample rate
@@ -54,7 +57,7 @@ class Joints(NamedTuple):
     motors: Floats  # B (n,), kg m^2, reflected to the joints
     viscous: Floats  # F (n,), N m s/rad
     stiffness: Floats | None = None  # K (n,), N m/rad; None: rigid
-    damping_ratio: float = 0.03  # of motor and link on the spring, both free
+    damping_ratio: float = DAMPING_RATIO
     torque_loop: TorqueLoop | None = None
     motor_side: bool = False  # the encoders are at the motors
 

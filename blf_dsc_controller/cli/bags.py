@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from blf_dsc_controller.analysis.recorded import recorded_run
 from blf_dsc_controller.bags import recovery, table
-from blf_dsc_controller.bags.content import NameMap, read_content
+from blf_dsc_controller.bags.content import Content, NameMap, read_content
 from blf_dsc_controller.cli.main import make_room
 from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.progress import announce_reading
@@ -35,6 +35,7 @@ def report(options: Namespace) -> None:
         _draw(options)
         return
     from blf_dsc_controller.analysis.report import read_bag, write_report
+    from blf_dsc_controller.cli.softer_gains import print_softer_gains_of
 
     if options.out.suffix not in _PAGES:
         raise BlfDscError(f'{options.out}: the report is a page: give a name in .html')
@@ -43,6 +44,8 @@ def report(options: Namespace) -> None:
     announce_reading(options.bags, 'drawn')
     bags = [read_bag(path, options.namespace, names) for path in options.bags]
     write_report(bags, options.out)
+    for bag in bags:
+        print_softer_gains_of(bag.run, bag.content)
     print(f'wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB)')
 
 
@@ -52,6 +55,7 @@ def _draw(options: Namespace) -> None:
     from blf_dsc_controller.analysis.metrics import measure
     from blf_dsc_controller.analysis.metrics_table import format_table
     from blf_dsc_controller.analysis.output import write_json
+    from blf_dsc_controller.cli.softer_gains import print_softer_gains_of
 
     if len(options.bags) > 1:
         raise BlfDscError('--png draws one bag: give one, or leave out --png')
@@ -59,22 +63,23 @@ def _draw(options: Namespace) -> None:
     paths = [folder / name for name in ('summary.json', *figures.NAMES)]
     make_room(*paths, force=options.force, try_out=False)
     announce_reading(options.bags, 'drawn')
-    run = _run(options, options.bags[0])
+    run, content = _run(options, options.bags[0])
     metrics = measure(run)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(metrics, paths[0])
     written = [paths[0], *figures.draw(run, folder, metrics)]
     print(format_table(metrics))
+    print_softer_gains_of(run, content)
     print('wrote', ', '.join(str(path) for path in written))
 
 
-def _run(options: Namespace, bag: Path) -> Run:
-    """Read the run of a bag, and print what is left out."""
-    names = NameMap.parse(options.map)
-    run = recorded_run(read_content(bag, options.namespace, names))
+def _run(options: Namespace, bag: Path) -> tuple[Run, Content]:
+    """Read a bag and the run in it, and print what is left out."""
+    content = read_content(bag, options.namespace, NameMap.parse(options.map))
+    run = recorded_run(content)
     for note in run.notes:
         print(f'note: {note}')
-    return run
+    return run, content
 
 
 def export(options: Namespace) -> None:
@@ -82,7 +87,7 @@ def export(options: Namespace) -> None:
     table.check_format(options.out)  # before a large bag is read
     make_room(options.out, force=options.force)
     announce_reading([options.bag], 'written as a table')
-    run = _run(options, options.bag)
+    run, _ = _run(options, options.bag)
     columns = table.export(run, options.out)
     print(f'wrote {options.out}: {run.stamp.size} rows of {columns} columns')
 

@@ -15,10 +15,9 @@ from blf_dsc_controller.analysis.recorded import recorded_run
 from blf_dsc_controller.bags.content import read_content
 from blf_dsc_controller.cli.domains import check_network
 from blf_dsc_controller.cli.result_folder import BAG, make_folder, refuse_existing
-from blf_dsc_controller.cli.softer_gains import print_softer_gains
+from blf_dsc_controller.cli.softer_gains import print_softer_gains_of
 from blf_dsc_controller.cli.start import INTERRUPTED
 from blf_dsc_controller.compiled.announcement import announced_compilation
-from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.configuration.drive import DriveConfig
 from blf_dsc_controller.configuration.nodes import (
     CONTROLLER,
@@ -68,7 +67,7 @@ def run(options: Namespace) -> int:
     print_notice(_begun(config.plant, offline=options.offline))
     completed = _run_loop(config, out, options)
     try:
-        stopped = _report(out, config.controller)
+        stopped = _report(out)
     except BlfDscError as error:
         if completed:
             raise
@@ -203,7 +202,7 @@ def notes_on_ideal_arm(config: LoopConfig) -> Iterator[str]:
         )
 
 
-def _report(out: Path, controller: ControllerConfig) -> bool:
+def _report(out: Path) -> bool:
     """Draw and summarise the bag of a run; return whether the controller stopped in it."""
     # slow: the libraries of the pictures
     from blf_dsc_controller.analysis.figures import draw
@@ -218,8 +217,7 @@ def _report(out: Path, controller: ControllerConfig) -> bool:
     write_json(metrics, out / 'summary.json')
     pictures = draw(recorded, out, metrics)
     print(format_table(metrics))
-    for stop in recorded.stops[:1]:
-        print_softer_gains(stop.text, controller)
+    print_softer_gains_of(recorded, content)
     for topic, text in content.losses.items():
         print(f'warning: messages of {topic} are missing in the bag: {text}')
     print(

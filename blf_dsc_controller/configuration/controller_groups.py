@@ -92,8 +92,8 @@ class Safety:
     )
     oscillation: Literal['stop', 'warn', 'ignore'] = parameter(
         'stop',
-        'what is done about an arm that oscillates; warn: stop only if torques reach half of '
-        'their limit',
+        'what is done about an arm that oscillates; warn: stop only if torques reach a fifth '
+        'of their limit',
     )
     torque: Literal['zero', 'damping', 'hold_gravity'] = parameter(
         'zero',

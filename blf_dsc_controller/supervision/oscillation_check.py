@@ -7,15 +7,18 @@ of others.
 
 from __future__ import annotations
 
-from math import inf
+import re
+from math import inf, log, pi
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from blf_dsc_controller.arms.known_gears import MARGIN
+from blf_dsc_controller.arms.linear_loop import DAMPING_RATIO
 from blf_dsc_controller.configuration.controller import ControllerConfig
 from blf_dsc_controller.law.controller import Controller
-from blf_dsc_controller.law.oscillation import PATIENCE, oscillates
+from blf_dsc_controller.law.oscillation import FEW, PATIENCE, oscillates
 from blf_dsc_controller.law.torque_sensors import NONE
 from blf_dsc_controller.numerics.digits import two_digits
 from blf_dsc_controller.supervision.not_sensors import fault_of
@@ -24,13 +27,16 @@ from blf_dsc_controller.supervision.not_sensors import fault_of
 # looked like an oscillation of up to 0.16
 _TOLERATED = 0.2
 
-LOWER = 0.5
-"""Part of the present gains that is advised after an oscillation."""
-
-OSCILLATES = ' oscillates at '
-"""In the text of each stop of an arm that oscillates."""
+_OSCILLATES = ' oscillates at '
+_ADVICE = 'give a feedback.stiffness of '
 
 _LATELY = 0.1  # s
+
+
+def advised_stiffness(text: str) -> float | None:
+    """Return the `feedback.stiffness` that the text of a stop advises; None if it does not."""
+    found = re.search(rf'{_OSCILLATES}.*{_ADVICE}([\d.e-]*\d)', text)
+    return float(found[1]) if found else None
 
 
 class JointOscillation(NamedTuple):
@@ -45,7 +51,7 @@ class JointOscillation(NamedTuple):
     def text(self) -> str:
         """A sentence with the numbers, without its end."""
         return (
-            f'joint {self.joint!r}{OSCILLATES}{two_digits(self.frequency)} Hz with '
+            f'joint {self.joint!r}{_OSCILLATES}{two_digits(self.frequency)} Hz with '
             f'+-{two_digits(self.torque)} {self.unit}'
         )
 
@@ -130,11 +136,11 @@ class OscillationCheck:
         oscillation = self._worst((state.calm < _LATELY) & (state.half > 0.0))
         if oscillation is None:
             return ''
-        return f'{oscillation.text}: {self._remedy}'
+        worst = self._config.joints.index(oscillation.joint)
+        return f'{oscillation.text}: {self._remedy(worst)}'
 
-    @property
-    def _remedy(self) -> str:
-        """What to do about an oscillation: which gains to lower, or what may be wrong."""
+    def _remedy(self, worst: int) -> str:
+        """Return what to do if the `worst` joint oscillates: lower gains, or what may be wrong."""
         config = self._config
         too_stiff = 'the gains are too high for this arm or its base'
         if config.observes_load and fault_of(self._controller) == NONE:
@@ -148,6 +154,21 @@ class OscillationCheck:
                 'two_link.feedback_gain'
             )
         return (
-            f'{too_stiff}; commission it (`blf_dsc commission`), or give a feedback.stiffness of '
-            f'{LOWER * config.feedback.stiffness:.2g}'
+            f'{too_stiff}; commission it (`blf_dsc commission`), or {_ADVICE}'
+            f'{self._part_with_margin(worst) * config.feedback.stiffness:.2g} with the bounds that '
+            '`blf_dsc report` of the bag prints'
         )
+
+    def _part_with_margin(self, i: int) -> float:
+        """Return the part of the gains with which the resonance of joint i has the MARGIN.
+
+        The heights of its half waves grow by exp(g) in a period.  Without feedback they decay
+        by exp(-2 pi D), so the gains are g / (2 pi D) + 1 times those with which they last.
+        """
+        state = self._state
+        k = int(state.waves[i])
+        if k < FEW:
+            return MARGIN
+        last, before = (state.travel[(k - n) % len(state.travel), i] for n in (1, 3))
+        growth = max(0.0, log(last / before))
+        return MARGIN / (1.0 + growth / (2.0 * pi * DAMPING_RATIO))
