@@ -150,8 +150,8 @@ class Readings:
         if config.safety.velocity == 'estimated':
             self._velocity = Velocity(n)
         self._seen = self._before = 0  # ns, of the last trusted state, and before it
-        # ns and rad, of the last state, trusted or not, but for repeated readings; since when each
-        # has followed from the one before; and whether it was faster than it may be
+        # ns and rad, of the last state, trusted or not, that showed where the arm was; since when
+        # each has followed from the one before; and whether it was faster than it may be
         self._arrived = self._alone_since = 0
         self._runs = False
         self._at = np.zeros(n)
@@ -182,9 +182,9 @@ class Readings:
         counted, wrapped = self._wraps.count(measurement, gap, self.fastest)
         found = self._says(stamp, counted)
         doubt = self._doubt(stamp, found)
-        if doubt is not Doubt.REPEATED:  # which does not show where the arm is by now
-            if not found & NOT_FINITE:
-                self._at[:] = counted[: self._at.size]
+        # neither of the others shows where the arm is by now
+        if doubt not in (Doubt.NOT_FINITE, Doubt.REPEATED):
+            self._at[:] = counted[: self._at.size]
             self._arrived = stamp
         continues = doubt is None
         if begins and not found & NOT_FINITE:

@@ -245,9 +245,10 @@ class Page:
     def state(self, level: str, text: str) -> None:
         """Show the state: level (OK, WARN, ERROR or STALE) and description."""
         self.shown_state = level, text
+        word = '' if level == 'STALE' else level  # nothing has come yet
         self._header.content = (
             f'{_SHEET}<div style="margin:4px 12px;padding:6px 10px;border-radius:6px;color:white;'
-            f'background:{_LEVELS[level]}"><b>{level}</b> {escape(text)}</div>'
+            f'background:{_LEVELS[level]}"><b>{word}</b> {escape(text)}</div>'
         )
 
     def events(self, events: Sequence[tuple[float, str, str]]) -> None:
