@@ -56,6 +56,7 @@ FOUND = {
     'a pose beside the arm': ('panda', 'of another', -0.3, 3, 2, 4),
     'scaled positions': ('ur5e', 'scaled', 0.4, 1, 20, 4),
     'five states between gaps of thirty: 12': ('openarm', 'not finite', 0.0, 0, 5, 30),
+    'one good state of 101: 5': ('fr3', 'not finite', 0.04, 3, 1, 100),
     'readings that hang again and again: 8': ('fr3', 'frozen', 0.1, 0, 20, 60),
     'glitches': ('panda', 'position', -0.8, 2, 100, 1),
     'glitches whose velocities are their differences': (
@@ -131,7 +132,7 @@ def test_arm_whose_states_hang_nearly_always_is_braked_again(preset, moves):
     """Five states of 105: they threw Pandas, of which no state was trusted later, to 45 rad/s."""
     play = Play('frozen', 0.0, 0, 5, 100)
     arm, record, _ = played(preset, play, moves=moves, payload=1.0)
-    assert record.speed.max() < 4.0
+    assert record.speed.max() < 1.0
     assert arm.run(1.0).speed[-1].max() < 0.05
 
 

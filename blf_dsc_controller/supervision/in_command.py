@@ -239,13 +239,13 @@ class InCommand:
     def safe_at(self, reading: Reading) -> Vector | None:
         """Return the safe torque for a state that the law has not used.
 
-        A state in doubt is used for no motion, and a copy or two of the last one change nothing.
+        A state in doubt is as good as one that is missing.
         """
         T, last = self.config.sample_time, self.readings.last
         if reading.doubt is not None:
             if reading.doubt is Doubt.OUT_OF_REACH:
                 self.readings.return_home()
-            last.skip(reading.stamp, T)
+            last.miss(T)
             return self.safe(T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
         passed = reading.gap - min(last.age, reading.gap)  # without torques sent since
@@ -257,6 +257,7 @@ class InCommand:
         """Return the safe torque, `dt` [s] later, by the last state."""
         self.has_sample = False
         self.readings.last.miss(dt)
+        self.readings.last.forget_motion()
         return self.safe(dt)
 
     def _observe_speed(self, gap: float) -> None:

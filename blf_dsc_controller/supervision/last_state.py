@@ -40,8 +40,8 @@ class LastState:
         ddq: acceleration since the state before (n,) [rad/s^2], None if it is unknown.
         interval: time [s] since the state before, which ddq is over.
         age: time without a trusted state [s]; infinite before the first.
-        gap: longest time [s] between two states in which states were missing, at most 0.25 s;
-            0 once none were for a quarter of a second.
+        gap: longest time [s] between two trusted states between which others were missing or not
+            trusted, at most 0.25 s; 0 once none were for a quarter of a second.
         stamp: of the last state [ns]; -1 before the first.
         speed: of each joint (n,) [rad/s], as measured with the law, and beside it as the last
             two positions showed it.
@@ -60,10 +60,6 @@ class LastState:
         self._resumed = self._missed = 0
         # s, in which each state beside the law had its velocity
         self._measured_for = inf
-        # ns, stamp of the last state, trusted or not; and s, in which others have come since the
-        # last trusted one
-        self._heard = -1
-        self._skipped = 0.0
         self.stamp = -1
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
@@ -135,21 +131,16 @@ class LastState:
         """Whether states have come since the last gap for as long as `slow` takes to settle."""
         return (self.stamp - self._resumed) * 1e-9 >= FILTER
 
-    def skip(self, stamp: int, period: float) -> None:
-        """Account for a state that is not trusted: after some, the motion is unknown."""
-        self.age += period
-        # of copies, and of a sender that is faster, less time passes
-        self._skipped += min(max(0.0, (stamp - self._heard) * 1e-9), period)
-        self._heard = stamp
-        if self.age > LONG_GAP * period:
-            self._forget_motion()
-
     def miss(self, period: float) -> None:
-        """Account for `period` [s] without a state."""
-        self._forget_motion()
-        self.age += period
+        """Account for `period` [s] without a trusted state.
 
-    def _forget_motion(self) -> None:
+        The motion is unknown once the gap is longer than its damping allows for.
+        """
+        self.age += period
+        if self.age > max(FILTER, self.gap):
+            self.forget_motion()
+
+    def forget_motion(self) -> None:
         """Take the motion for unknown: v and dq are zero until the next state."""
         if self._known is None:
             self._known = self.dq.copy()
@@ -168,12 +159,11 @@ class LastState:
         gap = (stamp - self.stamp) * 1e-9
         if stamp - self._missed > _REMEMBERED_NS:
             self.gap = 0.0
-        silence, longest = gap - self._skipped, LONG_GAP * period
-        if self.stamp >= 0 and silence > longest:
+        longest = LONG_GAP * period
+        if self.stamp >= 0 and gap > longest:
             self._missed = stamp
-            self.gap = max(self.gap, min(silence, _LONGEST_GAP))
+            self.gap = max(self.gap, min(gap, _LONGEST_GAP))
         # a shorter one is a sample of the load's observer
         if gap > max(longest, 1.0 / OBSERVER[0]):
             self._resumed = stamp
-        self._skipped = 0.0
-        self._heard = self.stamp = stamp
+        self.stamp = stamp
