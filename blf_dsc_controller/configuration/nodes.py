@@ -198,16 +198,18 @@ def _of(file: str, section: Section) -> Section:
     return section._replace(entries=entries)
 
 
-def with_base(given: Mapping[str, Any], node: str, cls: type) -> dict[str, Any]:
+def with_base(
+    given: Mapping[str, Any], node: str, cls: type, folder: Path
+) -> dict[str, Any]:
     """Return the values that a node is given, with those of the `base` among them below.
 
-    `node` is its full name.
+    `node` is its full name; the base is a preset, or a file in the current folder or this one.
     """
     values = dict(given)
     base = values.pop(_BASE, None)
     if base is None:
         return values
-    entries = _entries_of(read(_based_on(str(base), Path())), node, cls)
+    entries = _entries_of(read(_based_on(str(base), folder)), node, cls)
     return {name: entry.value for name, entry in entries.items()} | values
 
 

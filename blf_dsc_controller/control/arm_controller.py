@@ -143,7 +143,8 @@ class ArmController:
         self._is_on_wall = stamps == 'wall'
         self._shift: int | None = None  # ns, of the stamps
         self._logged_turns: set[str] = set()
-        self._logged = (Phase.STARTING, False)  # phase, and whether for a reason
+        # stops so far, phase, and whether for a reason
+        self._logged = (0, Phase.STARTING, False)
         self._is_closed = False
         self._loop.guard.starting.activate()
         for text in config_warnings(config, When.ROBOT):
@@ -312,7 +313,7 @@ class ArmController:
     def _log_reason(self) -> None:
         """Log why it stops or does not start, once: numbers in it may change at each state."""
         reason = self.reason
-        now = self.phase, bool(reason)
+        now = self._loop.guard.supervisor.stops, self.phase, bool(reason)
         if now != self._logged:
             self._logged = now
             if reason:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -38,7 +39,11 @@ from blf_dsc_controller.errors import BlfDscError, ConfigurationError
 from blf_dsc_controller.messages.topics import ROBOT_DESCRIPTION
 from blf_dsc_controller.nodes import process
 from blf_dsc_controller.nodes.endpoints import qos_profile
-from blf_dsc_controller.nodes.ros_arguments import assigned, check_sections
+from blf_dsc_controller.nodes.ros_arguments import (
+    assigned,
+    check_sections,
+    parameter_files,
+)
 
 Config = TypeVar('Config')
 _PREPARED = 8  # changes kept
@@ -245,7 +250,8 @@ def _overrides(node: Node, cls: type[Config]) -> dict[str, Any]:
     overrides = node._parameter_overrides  # noqa: SLF001 - those in start files and arguments
     given = {name: parameter.value for name, parameter in overrides.items()}
     given |= assigned(sys.argv)
-    given = with_base(given, node.get_fully_qualified_name(), cls)
+    folder = Path(next(iter(parameter_files(sys.argv)), '')).parent
+    given = with_base(given, node.get_fully_qualified_name(), cls, folder)
     lists = _lists(cls, given)
     return {
         name: [] if value is None and name in lists else value

@@ -15,6 +15,9 @@ from blf_dsc_controller.compiled.layout import Array
 NOT_FINITE, FAR, OUT_OF_REACH, NEW, MOVES, LEAPS = 1, 2, 4, 8, 16, 32
 """Answers of `compare_state`: a sum of them."""
 
+ALONE = 0.5
+"""Time [s] after which states that follow from each other are trusted, wherever they began."""
+
 _MOVED_STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
 _FINEST_STEP = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
 
@@ -39,7 +42,8 @@ def compare_state(
         as fast as the `fastest` (n,) [rad/s] that it may be.
     LEAPS: it has, and more than twice as fast as its own velocity.
     OUT_OF_REACH: likewise from the `last` trusted positions (n,) [rad], `elapsed` [s] ago,
-        twice its `speed` (n,) [rad/s] there added.
+        with twice its `speed` (n,) [rad/s] there added, and an acceleration that takes it to
+        twice the `fastest` within ALONE.
     NEW: it differs from `read`, q and dq (2 n,).
     MOVES: at its velocity the arm has gone farther in `age` [s] than the steps of its sensor,
         with their `resolution` (n,) [rad], hide.
@@ -56,7 +60,8 @@ def compare_state(
             found |= FAR
             if not abs(q - at[i]) <= 2.0 * abs(dq) * step < inf:
                 found |= LEAPS
-        if abs(q - last[i]) > reach + 2.0 * speed[i] * elapsed:
+        gone_on = 2.0 * speed[i] * elapsed + fastest[i] * elapsed**2 / ALONE
+        if abs(q - last[i]) > reach + gone_on:
             found |= OUT_OF_REACH
         if not (q == read[i] and dq == read[n + i]):
             found |= NEW

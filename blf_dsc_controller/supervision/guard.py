@@ -130,7 +130,7 @@ class Guard(InCommand):
                 self._wait_for_valid(reading)
                 return self._safe_at(reading)
             self.starting.forget_load_after_gap(reading)
-            self.readings.use(reading)
+            self.readings.begin(reading)
             if not self.starting.start(reading):
                 return self.safe(self.config.sample_time)
         elif self.held.after_gap is not None and not self.starting.rejoin(reading):
@@ -214,7 +214,8 @@ class Guard(InCommand):
     def observe(self, stamp: int, measurement: Vector) -> None:
         """Compare velocities with positions for a state that is held back."""
         reading = self.readings.take(stamp, measurement, begins=True)
-        self.findings.compare_velocities(reading)
+        if reading.doubt is None:
+            self.findings.compare_velocities(reading)
 
     def _safe_at(self, reading: Reading) -> Vector | None:
         """Return the safe torque for a state that the law has not used."""

@@ -109,6 +109,7 @@ class Hold:
         self._calm = ObservedLoad(n, _CALM_OBSERVER)
         self._oscillates = False
         self._known_load = np.zeros(n)
+        self._seen = -1  # ns, stamp of the last trusted state that has been observed
         # N m, mean of the torques since the last trusted state, and s, for which they were sent
         self._sent = np.zeros(n)
         self._sent_for = 0.0
@@ -220,14 +221,17 @@ class Hold:
         M = known_inertia(self._settings, last.q)
         kind = 'hold_gravity' if self._source is Load.YIELDS else safety.torque
         self._keep_load_once_moved(dt)
-        if kind == 'hold_gravity' and last.age == 0.0:
+        is_new = last.stamp != self._seen
+        self._seen = last.stamp
+        if kind == 'hold_gravity' and is_new:
             self._observe_if_answered(M)
         if last.age > 0.0:
             self._swing.forget()
         elif dt > 0.0:
-            self._sent_for = 0.0
             noise = self._sensor.noise[: self.load.size]
             self._swing.observe(last.slow, noise, self._sensor.resolution, dt)
+        if is_new:
+            self._sent_for = 0.0
         goal = self._goal(kind, np.array(safety.damping), M)
         goal = limited(goal, None, limit, limit)
         self._elapsed += dt

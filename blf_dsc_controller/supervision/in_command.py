@@ -245,7 +245,7 @@ class InCommand:
         if reading.doubt is not None:
             if reading.doubt is Doubt.OUT_OF_REACH:
                 self.readings.return_home()
-            last.miss(T)
+            last.skip(reading.stamp, T)
             return self.safe(T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
         passed = reading.gap - min(last.age, reading.gap)  # without torques sent since
@@ -257,7 +257,6 @@ class InCommand:
         """Return the safe torque, `dt` [s] later, by the last state."""
         self.has_sample = False
         self.readings.last.miss(dt)
-        self.readings.last.forget_motion()
         return self.safe(dt)
 
     def _observe_speed(self, gap: float) -> None:

@@ -61,6 +61,7 @@ class LastState:
         # s, in which each state beside the law had its velocity
         self._measured_for = inf
         self.stamp = -1
+        self._heard = -1  # ns, stamp of the last state, trusted or not
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
         self.is_measured = True
@@ -74,6 +75,7 @@ class LastState:
         self.age = 0.0
         self.stamp = stamp
         self._known = None
+        self._measured_for = inf  # the law uses no others
 
     def follow(
         self,
@@ -109,7 +111,8 @@ class LastState:
             self.slow += min(1.0, elapsed / FILTER) * (differenced - self.slow)
         # one that comes and goes is none: the two observers of the load would alternate
         is_measured &= bool((np.abs(dq) <= fastest).all())
-        self._measured_for = self._measured_for + elapsed if is_measured else 0.0
+        passed = max(0.0, elapsed)
+        self._measured_for = self._measured_for + passed if is_measured else 0.0
         is_usable = self._measured_for >= FILTER
         usable = np.where(np.abs(dq) <= fastest, dq, 0.0)
         if not is_next:
@@ -131,16 +134,22 @@ class LastState:
         """Whether states have come since the last gap for as long as `slow` takes to settle."""
         return (self.stamp - self._resumed) * 1e-9 >= FILTER
 
-    def miss(self, period: float) -> None:
-        """Account for `period` [s] without a trusted state.
+    def skip(self, stamp: int, period: float) -> None:
+        """Account for a state that is not trusted, with its stamp [ns].
 
-        The motion is unknown once the gap is longer than its damping allows for.
+        Of copies, and of a sender that is faster than a `period` [s], less time passes.
         """
-        self.age += period
-        if self.age > max(FILTER, self.gap):
-            self.forget_motion()
+        self.age += min(max(0.0, (stamp - self._heard) * 1e-9), period)
+        self._heard = stamp
+        if self.age > max(FILTER, self.gap):  # longer than its damping allows for
+            self._forget_motion()
 
-    def forget_motion(self) -> None:
+    def miss(self, period: float) -> None:
+        """Account for `period` [s] without a state: the motion is unknown."""
+        self.age += period
+        self._forget_motion()
+
+    def _forget_motion(self) -> None:
         """Take the motion for unknown: v and dq are zero until the next state."""
         if self._known is None:
             self._known = self.dq.copy()
@@ -166,4 +175,4 @@ class LastState:
         # a shorter one is a sample of the load's observer
         if gap > max(longest, 1.0 / OBSERVER[0]):
             self._resumed = stamp
-        self.stamp = stamp
+        self._heard = self.stamp = stamp

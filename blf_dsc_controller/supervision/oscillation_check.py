@@ -35,7 +35,7 @@ _LATELY = 0.1  # s
 
 def advised_stiffness(text: str) -> float | None:
     """Return the `feedback.stiffness` that the text of a stop advises; None if it does not."""
-    found = re.search(rf'{_OSCILLATES}.*{_ADVICE}([\d.e-]*\d)', text)
+    found = re.search(rf'{_OSCILLATES}.*{_ADVICE}([\d.e+-]*\d)', text)
     return float(found[1]) if found else None
 
 

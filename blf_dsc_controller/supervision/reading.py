@@ -25,6 +25,7 @@ from blf_dsc_controller.law.sensor import State as Sensor
 from blf_dsc_controller.law.sensor import restart
 from blf_dsc_controller.run import NANOSECOND
 from blf_dsc_controller.supervision.comparison import (
+    ALONE,
     FAR,
     LEAPS,
     MOVES,
@@ -39,9 +40,6 @@ from blf_dsc_controller.supervision.supervisor import Fault
 from blf_dsc_controller.supervision.wraps import Wraps
 
 Vector = NDArray[np.float64]
-
-ALONE = 0.5
-"""Time [s] after which states that follow from each other are trusted, wherever they began."""
 
 # of a sample time: of two states in less, one is a copy, or of another sender, and their
 # difference shows no acceleration
@@ -173,7 +171,7 @@ class Readings:
     def take(self, stamp: int, measurement: Vector, *, begins: bool = False) -> Reading:
         """Return the next state, of a stamp [ns], with [q, dq, effort] (3 n,) as measured.
 
-        `begins`: the law waits for a state to start from, which need not come from the last.
+        `begins`: the law waits for a state to start from, which may repeat the last.
         """
         gap = (stamp - self._seen) * NANOSECOND
         is_after_gap = is_gap(gap, self._sample_time)
@@ -186,15 +184,15 @@ class Readings:
         if doubt not in (Doubt.NOT_FINITE, Doubt.REPEATED):
             self._at[:] = counted[: self._at.size]
             self._arrived = stamp
+        if begins and doubt is Doubt.OUT_OF_REACH and self.return_home():
+            doubt = self._doubt(stamp, self._says(stamp, counted))
         continues = doubt is None
-        if begins and not found & NOT_FINITE:
-            if doubt is Doubt.OUT_OF_REACH:
-                self._leave_home(stamp)
+        if begins and doubt in (Doubt.COPY, Doubt.REPEATED):
             doubt = None
         if doubt is None:
             self._trust(stamp, counted, is_new=bool(found & NEW))
-            if begins and wrapped is not None:
-                self._wraps.restart()
+        if begins and wrapped is not None:
+            self._wraps.restart()
         return Reading(stamp, counted, gap, is_after_gap, continues, doubt, wrapped)
 
     def follow(self, reading: Reading) -> None:
@@ -209,6 +207,13 @@ class Readings:
             is_new=not 0.0 < age < BRIDGED * self._sample_time,
             is_measured=self._velocity is None,
         )
+
+    def begin(self, reading: Reading) -> None:
+        """Let a reading that the law starts from be the last one, also if it is elsewhere."""
+        if reading.doubt is not None:
+            self._leave_home(reading.stamp)
+            self._trust(reading.stamp, reading.measurement, is_new=True)
+        self.use(reading)
 
     def use(self, reading: Reading) -> None:
         """Let a reading that the law uses be the last one."""
@@ -258,13 +263,15 @@ class Readings:
         q, dq, _ = measurement.reshape(3, -1)
         self.last.take(stamp, measurement, dq)
         self._wraps.trust(q)
+        restart(self.sensor)
+        if self._velocity is not None:
+            self._velocity.begin(stamp, q)
         return True
 
     def _leave_home(self, stamp: int) -> None:
         """Let the law begin elsewhere, by a state with a stamp [ns]."""
         restart(self.sensor)
-        if self._recent_home is None:
-            self._home = stamp, self.last.stamp, self.last.measurement.copy()
+        self._home = stamp, self.last.stamp, self.last.measurement.copy()
 
     @property
     def _recent_home(self) -> tuple[int, int, Vector] | None:
@@ -310,11 +317,11 @@ class Readings:
     def _doubt(self, stamp: int, found: int) -> Doubt | None:
         """Return why a state is not trusted; None: it comes from the last one.
 
-        Since the last trusted state, a joint may have gone on twice as fast as it was then, and
-        since the last of all states twice as fast as its limit.  So of two senders whose states
-        alternate, the one that was trusted is, however rare its states are.  Once all states have
-        followed from each other for ALONE, they are trusted again, also those of an arm that is
-        faster than it may be, as its velocities say.
+        Since the last trusted state, a joint may have gone on twice as fast as it was then, or
+        have sped up, and since the last of all states twice as fast as its limit.  So of two
+        senders whose states alternate, the one that was trusted is, however rare its states are.
+        Once all states have followed from each other for ALONE, they are trusted again, also
+        those of an arm that is faster than it may be, as its velocities say.
         """
         last, T = self.last, self._sample_time
         if found & NOT_FINITE:

@@ -187,8 +187,14 @@ def _hdf5(path: Path) -> _Arrays:
         is_here = isinstance(item, h5py.Dataset) and not (
             item.external or item.is_virtual
         )
-        if is_here and item.dtype.kind in 'fiu' and len(shapes) < _MOST_ARRAYS:
+        if (
+            is_here
+            and item.dtype.kind in 'fiu'
+            and item.shape
+            and len(shapes) < _MOST_ARRAYS
+        ):
             name = place.replace('/', '_')
+            name = place if name in places else name
             places[name], shapes[name] = place, item.shape
 
     with h5py.File(path) as file:
