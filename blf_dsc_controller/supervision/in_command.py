@@ -245,7 +245,7 @@ class InCommand:
         if reading.doubt is not None:
             if reading.doubt is Doubt.OUT_OF_REACH:
                 self.readings.return_home()
-            last.skip(reading.stamp, T)
+            last.skip(T)
             return self.safe(T)
         # a gap counts as the states that are missing in it, else the ramp would last longer
         passed = reading.gap - min(last.age, reading.gap)  # without torques sent since

@@ -61,7 +61,6 @@ class LastState:
         # s, in which each state beside the law had its velocity
         self._measured_for = inf
         self.stamp = -1
-        self._heard = -1  # ns, stamp of the last state, trusted or not
         self.speed = np.zeros(n)
         self._known: Vector | None = None  # dq, while it is forgotten
         self.is_measured = True
@@ -134,13 +133,9 @@ class LastState:
         """Whether states have come since the last gap for as long as `slow` takes to settle."""
         return (self.stamp - self._resumed) * 1e-9 >= FILTER
 
-    def skip(self, stamp: int, period: float) -> None:
-        """Account for a state that is not trusted, with its stamp [ns].
-
-        Of copies, and of a sender that is faster than a `period` [s], less time passes.
-        """
-        self.age += min(max(0.0, (stamp - self._heard) * 1e-9), period)
-        self._heard = stamp
+    def skip(self, period: float) -> None:
+        """Account for a state that is not trusted, as of a `period` [s], whatever its stamp."""
+        self.age += period
         if self.age > max(FILTER, self.gap):  # longer than its damping allows for
             self._forget_motion()
 
@@ -175,4 +170,4 @@ class LastState:
         # a shorter one is a sample of the load's observer
         if gap > max(longest, 1.0 / OBSERVER[0]):
             self._resumed = stamp
-        self._heard = self.stamp = stamp
+        self.stamp = stamp
