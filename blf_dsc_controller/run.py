@@ -16,6 +16,9 @@ Stamps = NDArray[np.int64]
 NANOSECOND = 1e-9
 """In seconds."""
 
+LATEST = 9e9
+"""Time [s] below which each stamp fits into 64 bits in ns: 2**63 ns are 9.22e9 s."""
+
 FIRST_STAMP = 1_000_000_000
 """Stamp of the first sample [ns] where no clock gives it: in ROS, zero means 'not set'."""
 

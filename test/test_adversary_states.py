@@ -103,6 +103,13 @@ def test_reset_beside_another_sender_throws_no_arm(case, moves, reason):
     assert arm.reason == reason
 
 
+def test_arm_that_sped_up_unseen_is_trusted_and_braked():
+    """It was "out of reach" of where it had rested 0.1 s before, and reached 12 rad/s."""
+    play = Play('leap', -0.638, 1, 20, 100)
+    *_, faster = played('panda_rigid', play, moves=False, payload=1.0, resets=True)
+    assert faster < 2.0
+
+
 def test_velocities_that_come_and_go_swing_no_arm_that_stops():
     """Two observers of its load alternated with them: 4.8 rad/s."""
     play = Play('no velocity', 0.9, 3, 5, 2)

@@ -33,15 +33,12 @@ from blf_dsc_controller.messages.named_values import disturbance_names
 from blf_dsc_controller.messages.tip_load import TAKEN_UP, TipLoad
 from blf_dsc_controller.reference.retargeting import TrajectoryError
 from blf_dsc_controller.reference.trajectory import Trajectory, TrajectoryPoint
-from blf_dsc_controller.run import FIRST_STAMP
+from blf_dsc_controller.run import FIRST_STAMP, LATEST
 from blf_dsc_controller.supervision.guard import Guard
 from blf_dsc_controller.supervision.supervisor import Phase
 from blf_dsc_controller.warnings.table import config_warnings, refuse
 
 Vector = NDArray[np.float64]
-
-
-_NEVER = 9e9  # s: later stamps are no ns in 64 bits
 
 
 class StateError(BlfDscError):
@@ -543,7 +540,7 @@ class ArmController:
 def _is_time(stamp: float) -> bool:
     """Whether a stamp is a time [s] that ROS knows, in whole ns; it may be anything."""
     try:
-        return math.isfinite(stamp) and abs(stamp) < _NEVER
+        return math.isfinite(stamp) and abs(stamp) < LATEST
     except (TypeError, OverflowError):
         return False
 

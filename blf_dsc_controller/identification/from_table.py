@@ -19,7 +19,7 @@ from blf_dsc_controller.errors import BlfDscError
 from blf_dsc_controller.identification.bad_values import stand_ins
 from blf_dsc_controller.identification.motion import Group, Motion
 from blf_dsc_controller.identification.recording import LONGEST_PERIOD
-from blf_dsc_controller.run import Floats, Stamps
+from blf_dsc_controller.run import LATEST, Floats, Stamps
 from blf_dsc_controller.tables.columns import (
     KINDS,
     Column,
@@ -34,7 +34,6 @@ _EXPORTED = ('stamp [ns]', 'received [ns]', 'time [s]')
 _LEAST = 2  # rows
 _BETWEEN = 1.0  # s, least pause between runs in one table
 _MOST_RUNS = 100
-_LATEST = 9e9  # s: later ones are no ns in 64 bits
 _BACK = 10.0  # intervals that the time falls back where another run begins
 # s since 1970, of stamps whose unit is not named: years 2001 to 2096
 _EPOCH = (1e9, 4e9)
@@ -202,7 +201,7 @@ def _one_clock(path: Path, time: Floats) -> tuple[Stamps, int]:
     continued = time[known].copy()
     for start in starts:
         continued[start:] += continued[:start].max() + pause - continued[start]
-    if continued.max() > _LATEST:
+    if continued.max() > LATEST:
         raise BlfDscError(
             f'{path}: the time reaches {continued.max():.3g} s: is its column the time?'
         )

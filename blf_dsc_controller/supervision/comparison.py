@@ -16,7 +16,10 @@ NOT_FINITE, FAR, OUT_OF_REACH, NEW, MOVES, LEAPS = 1, 2, 4, 8, 16, 32
 """Answers of `compare_state`: a sum of them."""
 
 ALONE = 0.5
-"""Time [s] after which states that follow from each other are trusted, wherever they began."""
+"""Time [s] after which states that follow from each other are trusted, wherever they began.
+
+In it, a joint that nobody sees is taken to reach twice its largest speed from rest.
+"""
 
 _MOVED_STEPS = 3.0  # of the sensor: an arm that has moved by more reads otherwise
 _FINEST_STEP = 1e-4  # rad, a count of an encoder of 16 bits: no step counts as less
